@@ -218,7 +218,7 @@ def driven(seconds: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "device.json"
         device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")
-        while live.is_simulation_halted or link.is_device_silent(clock()):  # until it runs
+        while live.is_halted or link.is_device_silent(clock()):  # until it runs
             live.tick(clock)
             time.sleep(1e-3)
         live.join(1, clock())

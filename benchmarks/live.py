@@ -66,7 +66,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         if now >= next_message:
             next_message += FRAME_PERIOD_S
             live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
-        if not live.is_simulation_halted and live.pace.time_to_next_slice(now) <= 0:
+        if not live.is_halted and live.pace.time_to_next_slice(now) <= 0:
             late.append(-live.pace.time_to_next_slice(now))
         frame = live.tick(clock)
         if frame is not None:

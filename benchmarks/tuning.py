@@ -36,7 +36,7 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
-    is_rendered_share_accepted,
+    is_share_accepted,
     settings_from_values,
 )
 from drake_teleop.lab.tuning.search import meets_requirements
@@ -107,7 +107,7 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
             search.share_in_one_axis(axis, settings, gamma, p["hand"], p["wall"], 100 + k)
             for k, p in enumerate(points)
         ]
-        return float(np.mean([not is_rendered_share_accepted(share) for share in shares]))
+        return float(np.mean([not is_share_accepted(share) for share in shares]))
 
     inside = drawn_walls(*stated.walls, asked.station_draws)
     for point in inside:

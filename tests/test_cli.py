@@ -169,6 +169,22 @@ def test_option_of_an_experiment_requires_one(capsys, option):
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        ("drive", "--study", "x.yaml", "--record", "x"),
+        ("drive", "--study", "x.yaml", "--simulated", "1", "--participant", "2"),
+        ("drive", "--study", "x.yaml", "--simulated", "1", "--no-browser"),
+        ("excite", "--until", "mass 1 %", "--period", "5"),
+    ],
+)
+def test_option_without_effect_in_this_mode_is_refused(capsys, words):
+    option = next(word for word in reversed(words) if word.startswith("--"))
+    status, _, err = run_main(capsys, *words)
+    assert status == 2
+    assert err.startswith(f"error: {option}: has no effect here; remove it")
+
+
+@pytest.mark.parametrize(
     "option", [("--out", "x"), ("--rate", "3"), ("--cutoff", "30"), ("--range", "3", "4")]
 )
 def test_printed_export_refuses_options_of_a_controller(capsys, option):

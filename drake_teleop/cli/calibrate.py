@@ -65,14 +65,13 @@ def calibrate_command(
         stream.close()
     last = looks[-1]
     summary = identify_command(path, out, quiet=True, **processing)
-    write_picture(out / "settling.png", draw_uncertainty_over_time(looks, tolerance))
+    write_picture(out / "settling.png", draw_settling(looks, tolerance))
+    names = tolerance.required_entry_names
     summary |= {
         "tolerance": str(tolerance),
-        "known": dict(zip(tolerance.required_entry_names, last.is_known.tolist(), strict=True)),
+        "known": dict(zip(names, last.is_known.tolist(), strict=True)),
         "all_known": bool(last.is_known.all()),
-        "half_widths_95": dict(
-            zip(tolerance.required_entry_names, last.relative_half_widths.tolist(), strict=True)
-        ),
+        "half_widths_95": dict(zip(names, last.relative_half_widths.tolist(), strict=True)),
         "doubts": list(last.doubts),
         "advice": last.advice,
         "seconds": last.record_length_s,
@@ -103,10 +102,8 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: Tolerance) -> G
     values = sizes = np.full(len(units), np.nan)
     if evaluation.identified_log is not None:
         phi = evaluation.identified_log.identification.phi
-        values, sizes = (
-            display_values_of_required_entries(tolerance, phi),
-            tolerances_in_display_units(tolerance, phi),
-        )
+        values = display_values_of_required_entries(tolerance, phi)
+        sizes = tolerances_in_display_units(tolerance, phi)
     for k, entry in enumerate(tolerance.required_entry_names):
         half = evaluation.relative_half_widths[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
@@ -115,22 +112,15 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: Tolerance) -> G
             _make_progress_bar(half, bool(evaluation.is_known[k])),
             _parameter_verdict(evaluation, k),
         )
-    lines = [
-        Text(line, style="red")
-        for line in (*evaluation.doubts, *([evaluation.failure] if evaluation.failure else []))
-    ]
+    lines = [Text(line, style="red") for line in (*evaluation.doubts, evaluation.failure) if line]
     if evaluation.advice:
         lines.append(Text(f"-> {evaluation.advice}", style="bold"))
     return Group(table, *lines)
 
 
 def _make_progress_bar(relative_half_width: float, known: bool) -> Text:
-    share = (
-        1.0 - np.log10(max(relative_half_width, 1.0)) / _PROGRESS_DECADES
-        if np.isfinite(relative_half_width)
-        else 0.0
-    )
-    cells = int(np.clip(share, 0.0, 1.0) * _PROGRESS_CELLS)
+    share = 1.0 - np.log10(np.clip(relative_half_width, 1.0, None)) / _PROGRESS_DECADES
+    cells = int(np.clip(np.nan_to_num(share), 0.0, 1.0) * _PROGRESS_CELLS)
     return Text("█" * cells + "·" * (_PROGRESS_CELLS - cells), style="green" if known else "yellow")
 
 
@@ -144,7 +134,7 @@ def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
     return "almost" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
 
 
-def draw_uncertainty_over_time(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
+def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()
@@ -159,21 +149,11 @@ def draw_uncertainty_over_time(looks: list[RecordEvaluation], tolerance: Toleran
         last = ""
         for at in looks:
             if at.advice and at.advice != last:
-                axes.axvline(at.record_length_s, color=GREY, linewidth=0.6)
+                x, last, transform = at.record_length_s, at.advice, axes.get_xaxis_transform()
+                axes.axvline(x, color=GREY, linewidth=0.6)
                 words = at.advice.split(",")[0].split(":")[0].replace(" the wrist", "")
-                axes.text(
-                    at.record_length_s,
-                    0.02,
-                    words,
-                    rotation=90,
-                    size=7,
-                    transform=axes.get_xaxis_transform(),
-                )
-                last = at.advice
-        axes.set(
-            title="Half-width of the 95 % interval over the tolerance",
-            xlabel="length of the record [s]",
-            yscale="log",
-        )
+                axes.text(x, 0.02, words, rotation=90, size=7, transform=transform)
+        axes.set_title("Half-width of the 95 % interval over the tolerance")
+        axes.set(xlabel="length of the record [s]", yscale="log")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
+from drake_teleop.cli.options import refuse_without_model
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
     make_folder,
@@ -79,14 +81,15 @@ def excite_command(
     with show_progress(progress and not quiet) as stage:
         read = stage("Read the robot")
         if model is None:
-            _refuse_options_without_model(sensor_frame, package_paths, acceleration, payload)
+            refuse_without_model({
+                "--sensor-frame": sensor_frame, "--package-path": package_paths,
+                "--acceleration": acceleration, "--payload": payload,
+            })  # fmt: skip
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
-            raise DrakeTeleopError(
-                "is required with --model, which does not contain the sensor's position",
-                where="--sensor-frame",
-                remedy="name the frame or link at which it measures",
-            )
+            what = "is required with --model, which does not contain the sensor's position"
+            remedy = "name the frame or link at which it measures"
+            raise DrakeTeleopError(what, where="--sensor-frame", remedy=remedy)
         else:
             robot = RobotFromModel(
                 model,
@@ -99,7 +102,7 @@ def excite_command(
                 payload=payload,
             )
         read(1.0)
-        reached = {}
+        reached: dict[str, Any] = {}
         if tolerance is None:
             found = excite(
                 robot,
@@ -121,18 +124,9 @@ def excite_command(
             )
             report(1.0)
             found = result.excitation
-            shares = dict(
-                zip(
-                    tolerance.required_entry_names,
-                    result.errors_over_tolerances.tolist(),
-                    strict=True,
-                )
-            )
-            reached = {
-                "until": str(tolerance),
-                "reached": shares,
-                "reliable": PROBABILITY_ALL_WITHIN_TOLERANCE,
-            }
+            names, shares = tolerance.required_entry_names, result.errors_over_tolerances.tolist()
+            reached = {"until": str(tolerance), "reached": dict(zip(names, shares, strict=True))}
+            reached |= {"reliable": PROBABILITY_ALL_WITHIN_TOLERANCE}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.design_cpu_time_s}
     with output_folder(out):
@@ -145,15 +139,6 @@ def excite_command(
     if not quiet:
         _print_summary(summary, out)
     return summary | session
-
-
-def _refuse_options_without_model(*options: object) -> None:
-    names = ("--sensor-frame", "--package-path", "--acceleration", "--payload")
-    for name, value in zip(names, options, strict=True):
-        if value not in (None, ()):
-            raise DrakeTeleopError(
-                "requires --model", where=name, remedy="add --model or remove it"
-            )
 
 
 def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
@@ -207,23 +192,19 @@ def draw_trajectory(excitation: Excitation) -> Figure:
         progress.step(*excitation.criterion_history.T, where="post", color=BLUE)
         # With --until, the criterion is the period.
         least = excitation.values.get(excitation.criterion, excitation.trajectory.period)
-        progress.set(
-            title=f"{excitation.criterion} down to {least:.4g}",
-            xlabel="evaluations",
-            yscale="log",
-        )
+        progress.set_title(f"{excitation.criterion} down to {least:.4g}")
+        progress.set(xlabel="evaluations", yscale="log")
     return figure
 
 
 def _draw_joints(axes: Axes, excitation: Excitation) -> None:
-    t = np.linspace(0, excitation.trajectory.period, 1000)
+    period = excitation.trajectory.period
+    t = np.linspace(0, period, 1000)
     q = np.degrees(excitation.trajectory.evaluate(t)[0])
     for k, name in enumerate(excitation.robot.arm.joint_names):
         colour, style = COLOURS[k % len(COLOURS)], ("-", "--")[k // len(COLOURS) % 2]
         axes.plot(t, q[:, k], style, color=colour, label=name)
-    axes.set(
-        title=f"Joints of {excitation.robot.name} [deg]", xlim=(0, excitation.trajectory.period)
-    )
+    axes.set(title=f"Joints of {excitation.robot.name} [deg]", xlim=(0, period))
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
@@ -239,10 +220,8 @@ def _draw_heaviest_load_wrench(forces: Axes, torques: Axes, excitation: Excitati
         axes.plot(t, part, linewidth=0.9, label=list("xyz"))
         axes.plot(t, np.linalg.norm(part, axis=1), color=GREY, label="norm")
         axes.axhline(limit, color=BLACK, linestyle=":", label="limit")
-        axes.set(
-            title=f"{'Force' if unit == 'N' else 'Torque'} at the sensor, heaviest load [{unit}]",
-            xlim=(0, excitation.trajectory.period),
-        )
+        title = f"{'Force' if unit == 'N' else 'Torque'} at the sensor, heaviest load [{unit}]"
+        axes.set(title=title, xlim=(0, excitation.trajectory.period))
     forces.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     torques.set_xlabel("t [s]")
 
@@ -251,7 +230,7 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    show = partial(Console().print, highlight=False, markup=False)
     values = Table("criterion", "value", "what it is")
     for name, meaning in summary["meaning"].items():
         marked = f"[bold]{name}[/]" if name == summary["criterion"] else name
@@ -263,18 +242,12 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     for name, value in summary["predicted_std"].items():
         deviations.add_row(name.replace("[", r"\["), f"{value:.2g}")
     for part in (values, uses, deviations):
-        console.print(part)
+        show(part)
     if "until" in summary:
-        console.print(
+        show(
             f"{summary['period_s']:.3g} s reach {summary['until']}"
-            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone",
-            highlight=False,
-            markup=False,
+            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone"
         )
     for words in summary["assumed"]:
-        console.print(f"assumed: {words}", highlight=False, markup=False)
-    console.print(
-        f"written to {out}; watch {out / 'excitation.html'} before a robot runs it",
-        highlight=False,
-        markup=False,
-    )
+        show(f"assumed: {words}")
+    show(f"written to {out}; watch {out / 'excitation.html'} before a robot runs it")

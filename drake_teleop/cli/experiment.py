@@ -56,11 +56,8 @@ def next_participant(
             return number
     number = max(known, default=0) + 1
     if number > MAX_PARTICIPANT_NUMBER:
-        raise DrakeTeleopError(
-            f"all participant numbers from 1 to {MAX_PARTICIPANT_NUMBER} are used",
-            where=str(store.folder),
-            remedy="choose another folder",
-        )
+        what = f"all participant numbers from 1 to {MAX_PARTICIPANT_NUMBER} are used"
+        raise DrakeTeleopError(what, where=str(store.folder), remedy="choose another folder")
     return number
 
 
@@ -68,11 +65,11 @@ def _simulate_participants(
     experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
 ) -> None:
     from drake_teleop.live.experiment.simulated import (
-        make_apparatus_by_task_and_condition,
+        make_apparatuses,
         simulate_participant,
     )
 
-    stations = make_apparatus_by_task_and_condition(experiment, scenarios)
+    stations = make_apparatuses(experiment, scenarios)
 
     def print_progress(done: int, trials: int) -> None:
         print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)

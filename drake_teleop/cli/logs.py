@@ -227,7 +227,6 @@ def _detection_table(found: DetectedLog) -> pl.DataFrame:
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTIC_NAMES)}
-    columns |= {
-        f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH_COLUMNS)
-    }
+    contact = found.eliminated.contact
+    columns |= {f"contact_{c}": contact[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})

@@ -157,6 +157,10 @@ def drive(
 
         run_drive_command(scenario, record=record, **options)
         return
+    option.refuse_given_options("record", remedy="remove it: --results contains the recording")
+    if simulated:
+        unused = ("participant", "port", "no_browser", "device")
+        option.refuse_given_options(*unused, remedy="remove it or --simulated")
     from drake_teleop.cli.experiment import experiment_command
 
     experiment_command(study, results, participant=participant, simulated=simulated, **options)
@@ -371,13 +375,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=option.POSITIVE_TYPE,
-    metavar="HZ",
-    help="Rate of the wrenches; not needed for replay:, rtde:// and netft://.",
-)
+@option.rate_hz("Rate of the wrenches; not needed for replay:, rtde:// and netft://.")
 @click.option("--predicted", is_flag=True, help="Extrapolate the results over the low-pass lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @click.option(
@@ -416,8 +414,7 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
-@click.option("--rate", "rate_hz", type=option.POSITIVE_TYPE, required=True, metavar="HZ",
-              help="Rate of the wrenches.")  # fmt: skip
+@option.rate_hz("Rate of the wrenches.", required=True)
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @option.stream_options
 @option.output_folder("ros2")
@@ -436,15 +433,13 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
         words += ["--out", str(out)]
         given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
         given |= {"--sensor-frame": "sensor_frame", "--motion": "motion"}
+        given |= {"--range": "largest", "--sensor-pose": "sensor_pose"}
         for name, parameter in given.items():
             if (value := ctx.params[parameter]) is not None:
-                words += [name, str(value)]
-        for name, parameter in (("--range", "largest"), ("--sensor-pose", "sensor_pose")):
-            if (numbers := ctx.params[parameter]) is not None:
-                words += [name, *map(str, numbers)]
-        return words + [
-            x for path in ctx.params["package_paths"] for x in ("--package-path", str(path))
-        ]
+                words += [name, *map(str, value if isinstance(value, tuple) else [value])]
+        for path in ctx.params["package_paths"]:
+            words += ["--package-path", str(path)]
+        return words
 
     run_ros2_command(source, load, sink, out, calibrate=calibrate_arguments, **options)
 
@@ -500,13 +495,7 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
     show_default=True,
     help="As in the log description: -1 if the sensor measures the wrench of the load on it.",
 )
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=option.POSITIVE_TYPE,
-    metavar="HZ",
-    help="Rate of the sensor's readings; required by c99, fmu and ros2_filter.",
-)
+@option.rate_hz("Rate of the sensor's readings; required by c99, fmu and ros2_filter.")
 @option.cutoff_hz
 @option.sensor_range
 @option.output_folder("export")
@@ -606,14 +595,9 @@ def compare_passivity(
     degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
     pictures and report.html.
     """
-    from drake_teleop.lab.comparison import compare_passivity as comparison
+    from drake_teleop.lab.comparison.compare_passivity import NETWORKS, compare_command
 
-    comparison.compare_command(
-        out,
-        networks=networks or comparison.NETWORKS,
-        methods=methods,
-        **options,
-    )
+    compare_command(out, networks=networks or NETWORKS, methods=methods, **options)
 
 
 @cli.command()
@@ -755,6 +739,9 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     It is a Fourier series from rest to rest, optimised and checked against every limit and for
     collisions. Check the 3D replay, excitation.html, before a robot runs the motion.
     """
+    if options["until"] is not None:
+        remedy = "remove it or --until"
+        option.refuse_given_options("criterion", "period", "seconds", remedy=remedy)
     from drake_teleop.cli.excitation import excite_command
 
     excite_command(scenario, out, **options)
@@ -821,19 +808,17 @@ def _run_with_exit_status(arguments: list[str] | None) -> Any:
         click.echo(error.format_message())
         return 2
     except click.ClickException as error:
-        return _print_error_and_return_status(error.format_message())
+        return _print_error(error.format_message())
     except DrakeTeleopError as error:
-        return _print_error_and_return_status(str(error))
+        return _print_error(str(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click raises Abort from a KeyboardInterrupt, which contains the message.
         click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
         return 130
     except OSError as error:
-        return _print_error_and_return_status(
-            f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        )
+        return _print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
 
 
-def _print_error_and_return_status(message: str) -> int:
+def _print_error(message: str) -> int:
     click.echo(to_one_line(f"error: {message}"), err=True)
     return 2

@@ -22,7 +22,7 @@ from drake_teleop.common.registry import REGISTRIES
 class Utf8Path(click.Path):
     """Parameter type of paths with UTF-8 names, which all libraries accept."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
         if value == "":  # a variable of the shell without value, not the working directory
             self.fail("the path is empty", param, ctx)
@@ -40,9 +40,7 @@ class ShippedOrPath(Utf8Path):
         super().__init__(path_type=path_type)
         self._folder = folder
 
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
+    def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[CompletionItem]:
         names = sorted(path.stem for path in self._folder.glob("*.yaml"))
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting + super().shell_complete(ctx, param, incomplete)
@@ -54,10 +52,7 @@ STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
 
 
 def _fail_if_outside_range(
-    kind: click.FloatRange | click.IntRange,
-    number: float,
-    param: click.Parameter | None,
-    ctx: click.Context | None,
+    kind: click.FloatRange | click.IntRange, number: float, param: Any, ctx: Any
 ) -> None:
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
@@ -73,9 +68,7 @@ class FiniteNumber(click.FloatRange):
 
     name = "number"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
@@ -88,20 +81,18 @@ class IntegerInRange(click.IntRange):
 
     name = "integer"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+    def convert(self, value: Any, param: Any, ctx: Any) -> int:
         number: int = click.INT.convert(value, param, ctx)
         _fail_if_outside_range(self, number, param, ctx)
         return number
 
 
 class DelayOrAuto(click.ParamType):
-    """Parameter type of a number of seconds, or "auto"."""
+    """Parameter type: seconds or "auto"."""
 
     name = "auto|SECONDS"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | str:
+    def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
         return "auto" if value == "auto" else FiniteNumber(-10, 10).convert(value, param, ctx)
 
 
@@ -115,9 +106,7 @@ class CommaSeparated(click.ParamType):
     def __init__(self, name: str, item: click.ParamType) -> None:
         self.name, self._item = f"{name},...", item
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[Any, ...]:
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[Any, ...]:
         if isinstance(value, tuple):
             return value
         return tuple(self._item.convert(part.strip(), param, ctx) for part in value.split(","))
@@ -248,6 +237,14 @@ def refuse_given_options(*names: str, remedy: str) -> None:
             raise DrakeTeleopError("has no effect here", where=parameter.opts[0], remedy=remedy)
 
 
+def refuse_without_model(options: dict[str, object]) -> None:
+    """Raise DrakeTeleopError for the first of these options (name -> value) that has a value."""
+    for name, value in options.items():
+        if value not in (None, ()):
+            remedy = "add --model or remove it"
+            raise DrakeTeleopError("requires --model", where=name, remedy=remedy)
+
+
 def confirm_at_terminal(question: str) -> bool:
     """Return the answer of a user at a terminal, True for yes; False without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
@@ -276,6 +273,11 @@ def separate_sigmas(command: Any) -> Any:
         option = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))
         command = option(command)
     return command
+
+
+def rate_hz(text: str, *, required: bool = False) -> Callable[[Any], Any]:
+    names = ("--rate", "rate_hz")
+    return click.option(*names, type=POSITIVE_TYPE, required=required, metavar="HZ", help=text)
 
 
 def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
@@ -333,18 +335,11 @@ def _read_arm_kinematics_from_options(
     model: Path | None, sensor_frame: str | None, package_paths: tuple[Path, ...]
 ) -> Any:
     if model is None:
-        if sensor_frame is not None or package_paths:
-            name = "--package-path" if sensor_frame is None else "--sensor-frame"
-            raise DrakeTeleopError(
-                "requires --model", where=name, remedy="add --model or remove it"
-            )
+        refuse_without_model({"--sensor-frame": sensor_frame, "--package-path": package_paths})
         return None
     if sensor_frame is None:
-        raise DrakeTeleopError(
-            "is required with --model",
-            where="--sensor-frame",
-            remedy="name the frame or link at which the sensor measures",
-        )
+        remedy = "name the frame or link at which the sensor measures"
+        raise DrakeTeleopError("is required with --model", where="--sensor-frame", remedy=remedy)
     from drake_teleop.station.slave.plant import read_arm_without_default_limits
 
     return read_arm_without_default_limits(model, sensor_frame, package_paths)

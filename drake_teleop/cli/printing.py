@@ -15,7 +15,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
     for heading in ("", "value", "std", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    _add_parameter_rows(table, _rows_of_load_parameters(summary), summary["identifiable"])
+    _add_parameter_rows(table, _load_rows(summary), summary["identifiable"])
     rows = [
         (name, value, std, 1.0, "N" if i < 3 else "N m", name)
         for i, (name, value, std) in enumerate(
@@ -25,9 +25,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     _add_parameter_rows(table, rows, summary["identifiable"])
     if "object" in summary:
         table.add_section()
-        rows = [
-            (f"object: {row[0]}", *row[1:]) for row in _rows_of_load_parameters(summary["object"])
-        ]
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
         _add_parameter_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         "com from, and inertia about, the origin So of the sensor frame S\n"
@@ -44,7 +42,7 @@ _ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _rows_of_load_parameters(load: dict[str, Any]) -> list[_ParameterRow]:
+def _load_rows(load: dict[str, Any]) -> list[_ParameterRow]:
     rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")

@@ -17,7 +17,7 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
-#: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
+#: Contact force at the slave that the page shows as contact [N]; noise and motion remain below.
 MIN_CONTACT_FORCE_N = 2.0
 _WARNED_LIMIT_FRACTION = 0.999
 _WARNED_HAND_FORCE_N = 59.0  # N; the limit of a hand is 60 N
@@ -25,7 +25,8 @@ _WARNED_PACKET_SILENCE_S = 0.05  # s
 
 
 @njit(cache=True)
-def smallest_and_largest_force_into(vectors, origins, out):
+def force_range_into(vectors, origins, out):
+    """Write the smallest and largest norm of the rows' first three elements minus `origins`."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -37,6 +38,7 @@ def smallest_and_largest_force_into(vectors, origins, out):
 
 @njit(cache=True)
 def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
+    # `energy` [J]: work of the hand on the stylus, and of the tool's force on its contacts.
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -72,36 +74,28 @@ class PageValueCalculator:
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
-        smallest_and_largest_force_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        smallest_and_largest_force_into(contact_S, zeros, contact)
-        smallest_and_largest_force_into(rows["force_to_master"], zeros, rendered)
-        in_contact = (
-            rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
-        )
+        force_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        force_range_into(contact_S, zeros, contact)
+        force_range_into(rows["force_to_master"], zeros, rendered)
+        touches = rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         self._forces[:2] *= inputs.force_scales["force_scale"]
+        t, states, hand, twist = (
+            rows[name] for name in ("t", "slave_state", "hand_wrench_E", "twist_master")
+        )
         _integrate_hand_and_contact_work(
-            self._table,
-            rows["t"],
-            rows["slave_state"],
-            contact_S,
-            rows["hand_wrench_E"],
-            rows["twist_master"],
-            self._last_row,
-            self._energy,
+            self._table, t, states, contact_S, hand, twist, self._last_row, self._energy
         )
         return {
             "f": [_rounded_or_zero(pair, 4) for pair in self._forces],
-            "contact": bool(in_contact),
+            "contact": bool(touches),
             "energy": _rounded_or_zero(self._energy, 5),
-            "words": list(dict.fromkeys(self._present_warnings(rows, inputs, zeros))),
+            "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
             "tool": _rounded_or_zero(self._last_row[1:], 5),
             "stylus": _rounded_or_zero(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _present_warnings(
-        self, rows: dict[str, Array], inputs: Inputs, zeros: Array
-    ) -> Iterator[str]:
+    def _warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -113,7 +107,7 @@ class PageValueCalculator:
         if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
-        smallest_and_largest_force_into(rows["hand_wrench_E"], zeros, hand)
+        force_range_into(rows["hand_wrench_E"], zeros, hand)
         if hand[1] > _WARNED_HAND_FORCE_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:

@@ -70,7 +70,7 @@ class DeviceClient:
         self._command: ForceCommand | None = None
         self._last_tick: float | None = None
 
-    def exchange_packets_and_render_wrench(
+    def exchange_packets(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
         """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
@@ -157,11 +157,8 @@ def open_device(address: str, grip: str, depth: float) -> HapticDevice:
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
-    raise DrakeTeleopError(
-        "is not the address of a haptic device",
-        where=address,
-        remedy="use virtual or haply://HOST:PORT",
-    )
+    remedy = "use virtual or haply://HOST:PORT"
+    raise DrakeTeleopError("is not the address of a haptic device", where=address, remedy=remedy)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -180,12 +177,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     end, largest = time.perf_counter() + options.seconds, 0.0
     try:
         while time.perf_counter() < end:
-            largest = max(
-                largest,
-                float(
-                    np.linalg.norm((client.exchange_packets_and_render_wrench() or (0.0,) * 3)[:3])
-                ),
-            )
+            wrench = client.exchange_packets() or (0.0,) * 6
+            largest = max(largest, float(np.linalg.norm(wrench[:3])))
     except KeyboardInterrupt:
         pass
     finally:

@@ -34,7 +34,7 @@ _CLIENT_END_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
 _LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_DURATION_AFTER_SILENCE_S = 0.05
+_CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 
 
 class DeviceLink:
@@ -49,11 +49,9 @@ class DeviceLink:
     def __init__(self, address: str) -> None:
         host, port = host_and_port(address)
         if not _is_loopback(host):
-            raise DrakeTeleopError(
-                "is not an address of this machine (other senders could move the arm)",
-                where=address,
-                remedy="use udp://127.0.0.1:PORT, and run the device's client on this machine",
-            )
+            what = "is not an address of this machine (other senders could move the arm)"
+            remedy = "use udp://127.0.0.1:PORT, and run the device's client on this machine"
+            raise DrakeTeleopError(what, where=address, remedy=remedy)
         self._socket = open_udp_receiver(host, port)
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
@@ -127,10 +125,7 @@ class DeviceLink:
         for k, name in enumerate("xyz"):
             values[name] = (state.position[k] - first.position[k]) / INPUT_UNIT_M
             values["r" + name] = turn[k] / INPUT_UNIT_RAD
-        if (
-            state.flags & CLUTCH_OPEN
-            or now - self._connected_at < _CLUTCH_OPEN_DURATION_AFTER_SILENCE_S
-        ):
+        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_AFTER_SILENCE_S:
             values["clutch"] = 0
         return values
 
@@ -191,11 +186,9 @@ class DeviceConnection:
     def __init__(self, address: str) -> None:
         kind = address.partition("://")[0]
         if kind not in ("udp", "haply"):
-            raise DrakeTeleopError(
-                "is not the address of a haptic device",
-                where=address,
-                remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
-            )
+            what = "is not the address of a haptic device"
+            remedy = "use udp://127.0.0.1:PORT or haply://localhost:10001"
+            raise DrakeTeleopError(what, where=address, remedy=remedy)
         self.link = DeviceLink(address if kind == "udp" else f"udp://{LOCALHOST}:0")
         self._client: subprocess.Popen[bytes] | None = None
         if kind == "haply":

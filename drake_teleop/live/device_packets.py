@@ -66,20 +66,19 @@ def unpack_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE_FORMAT.size or packet[:4] != _STATE_TAG:
         return None
     _, flags, number, t, *numbers = _STATE_FORMAT.unpack(packet)
-    return make_state_if_plausible(number, t, flags, numbers)
+    return valid_state(number, t, flags, numbers)
 
 
-def make_state_if_plausible(
-    number: int, t: float, flags: int, numbers: Sequence[float]
-) -> DeviceState | None:
-    """Return the state, or None if position, orientation or `behind` is implausible."""
+def valid_state(number: int, t: float, flags: int, numbers: Sequence[float]) -> DeviceState | None:
+    """Return the state with a unit quaternion; None if position, orientation or a time is invalid.
+
+    `numbers` (8,) are position, quaternion and `behind`, which is clipped to 1 s.
+    """
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.
     if not (
-        -_MAX_POSITION_M <= x <= _MAX_POSITION_M
-        and -_MAX_POSITION_M <= y <= _MAX_POSITION_M
-        and -_MAX_POSITION_M <= z <= _MAX_POSITION_M
+        all(abs(p) <= _MAX_POSITION_M for p in (x, y, z))
         and 0.5 < length < 2.0
         and -1e12 <= t <= 1e12
         and math.isfinite(behind)
@@ -93,10 +92,8 @@ def make_state_if_plausible(
 def rejection_reason(packet: bytes) -> str:
     """Return as text why `unpack_state` rejects a packet."""
     if len(packet) != _STATE_FORMAT.size:
-        length = (
-            len(packet) if len(packet) < _STATE_FORMAT.size else f"more than {_STATE_FORMAT.size}"
-        )
-        return f"is {length} bytes long, not {_STATE_FORMAT.size}"
+        length = len(packet) if len(packet) < MAX_PACKET_BYTES else f"more than {MAX_PACKET_BYTES}"
+        return f"is {length} bytes long, not {MAX_PACKET_BYTES}"
     if packet[:3] != _STATE_TAG[:3]:
         return f"begins with {packet[:4]!r}, not {_STATE_TAG!r}"
     if packet[3:4] != _STATE_TAG[3:]:
@@ -113,8 +110,6 @@ def unpack_force(packet: bytes) -> ForceCommand | None:
     if len(packet) != _FORCE_FORMAT.size or packet[:4] != _FORCE_TAG:
         return None
     _, _, number, t, *wrench = _FORCE_FORMAT.unpack(packet)
-    if not (
-        math.isfinite(t) and all(abs(f) < _MAX_WRENCH_VALUE for f in wrench)
-    ):  # refuses nan, too
+    if not (math.isfinite(t) and all(abs(f) < _MAX_WRENCH_VALUE for f in wrench)):  # nan, too
         return None
     return ForceCommand(number, t, tuple(wrench))

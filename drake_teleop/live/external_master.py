@@ -39,7 +39,7 @@ from drake_teleop.station.wiring import export_outputs
 POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
 # largest slew rate [1/s].
-_WRENCH_LIMIT_FADE_S, _WRENCH_LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
+_WRENCH_LIMIT_FADE_S, _LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
 # Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
 _HELD_INDEX, _START_TIME_INDEX, _START_POSE_INDEX = 0, 1, 2
 _DISPLACEMENT_INDEX, _ROTATION_INDEX = 9, 12
@@ -68,7 +68,7 @@ def _update_displayed_wrench(wrench, held, period, limits, last, now):
     if not are_finite_and_in_range(wrench):
         fault = _WRENCH_FAULT_NUMBER
     enabled = held and fault == 0.0
-    change = _WRENCH_LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S
+    change = _LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S
     allowed = min(max(last[_ALLOWED_SHARE_INDEX] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
     if enabled:

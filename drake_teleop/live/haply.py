@@ -17,7 +17,7 @@ from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     DevicePose,
     DeviceState,
-    make_state_if_plausible,
+    valid_state,
 )
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
@@ -49,7 +49,7 @@ def parse_device_message(text: Any) -> DeviceMessage | None:
     if not isinstance(name, str):
         return None
     flags = CLUTCH_OPEN if pressed else 0
-    state = make_state_if_plausible(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
+    state = valid_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
     return None if state is None else DeviceMessage(name, state)
 
 
@@ -89,9 +89,8 @@ class HaplyDevice:
             )
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
-            raise DrakeTeleopError(
-                f"Haply's service does not answer ({error})", where=address, remedy="start it"
-            ) from error
+            what = f"Haply's service does not answer ({error})"
+            raise DrakeTeleopError(what, where=address, remedy="start it") from error
         self._device = ""
 
     def read(self) -> DevicePose | None:
@@ -102,17 +101,12 @@ class HaplyDevice:
         except TimeoutError:
             return None
         except ConnectionClosed as error:
-            raise DrakeTeleopError(
-                "Haply's service has closed the connection",
-                where="haply",
-                remedy="restart the service",
-            ) from error
+            what = "Haply's service has closed the connection"
+            raise DrakeTeleopError(what, where="haply", remedy="restart the service") from error
         if message is None:
             return None
-        self._device = message.device_name
-        return DevicePose(
-            message.state.position, message.state.quaternion_wxyz, message.state.flags
-        )
+        self._device, state = message
+        return DevicePose(state.position, state.quaternion_wxyz, state.flags)
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         from websockets.exceptions import ConnectionClosed

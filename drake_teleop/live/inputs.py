@@ -61,9 +61,9 @@ class Inputs:
         rx, ry, rz: intended rotation vector in B [0.1 mrad].
         held: 1 while the hand holds the stylus.
         clutch: 1 while motion is transmitted.
-        sigma: scale of the gripper's (or whole) non-contact wrench [%].
+        sigma: scale of the non-contact wrench of the gripper, or of an undivided load [%].
         sigma_weight: scale of the load's weight alone [%]; -1: as its inertia.
-        sigma_object: scale of a gripped object's non-contact wrench [%].
+        sigma_object: the same of a gripped object [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
         network, method, grip, sensor: index into `choice_names()`.
@@ -97,10 +97,8 @@ class Inputs:
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Inputs:
-        sigma, sigma_object, gamma = (
-            round(s / _SIGMA_UNIT) for s in scenario.force_scaling.scales()[:3]
-        )
         config = scenario.force_scaling
+        sigma, sigma_object, gamma = (round(s / _SIGMA_UNIT) for s in config.scales()[:3])
         apart = config.sigma_weight is not None or config.sigma_inertia is not None
         weight = round(config.scales().weight_gripper / _SIGMA_UNIT) if apart else -1
         started = cls(
@@ -123,7 +121,6 @@ class Inputs:
 
     @property
     def hand_inputs(self) -> tuple[int, ...]:
-        """Inputs that move the hand."""
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
 
     @property
@@ -135,17 +132,14 @@ class Inputs:
 
     @property
     def channel_choices(self) -> tuple[int, ...]:
-        """Inputs that determine channel and passivity method."""
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,) from the `start` (3,); None if released."""
+        """Return the intended pose X_BE (7,); `start` (3,): p_BE at zero; None: released."""
         if not self.held:
             return None
-        turn = quaternion_exponential(
-            tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
-        )
-        return np.concatenate([turn, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
+        q = quaternion_exponential(tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz)))
+        return np.concatenate([q, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
 
     def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
@@ -195,10 +189,10 @@ def input_range(name: str) -> tuple[int, int]:
     return (0, len(METHODS) - 1) if name == "method" else INPUT_RANGES[name]
 
 
-_PACKAGE_VERSION = {"drake_teleop": __version__}
+_VERSION = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _PACKAGE_VERSION) -> str:
+def csv_header(made_by: Mapping[str, str] = _VERSION) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -209,38 +203,33 @@ def csv_row(ms: int, inputs: Inputs) -> str:
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
-def read_inputs(
-    path: Path, made_by: Mapping[str, str] = _PACKAGE_VERSION
-) -> list[tuple[int, Inputs]]:
-    """Return the recorded times [ms] and inputs of each change; the last is the end."""
+def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
+    """Return the recorded times [ms] and inputs of each change; the last is the end.
+
+    Raise DrakeTeleopError if the file is invalid, or if its versions differ from `made_by`.
+    """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _CSV_COLUMNS:
-        raise _not_repeatable_error(
-            "does not contain the version of drake_teleop that wrote it", path
-        )
+        raise _not_repeatable("does not contain the version of drake_teleop that wrote it", path)
     if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
-        raise DrakeTeleopError(
-            "does not contain the inputs of a recorded live session",
-            where=str(path),
-            remedy=f"use the columns {', '.join(_CSV_COLUMNS)}",
-        )
-    recorded_with = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
+        what = "does not contain the inputs of a recorded live session"
+        remedy = f"use the columns {', '.join(_CSV_COLUMNS)}"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
+    recorded = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
-        if recorded_with.get(name) != value:
-            found = recorded_with.get(name, "unknown")
-            what = f"was recorded with {name} {found}, and this is {value}"
+        if recorded.get(name) != value:
+            what = f"was recorded with {name} {recorded.get(name, 'unknown')}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _not_repeatable_error(changed if name == "files" else what, path)
+            raise _not_repeatable(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
-        raise DrakeTeleopError(
-            "has a duration of 0 s", where=str(path), remedy="record the session again"
-        )
+        remedy = "record the session again"
+        raise DrakeTeleopError("has a duration of 0 s", where=str(path), remedy=remedy)
     return changes
 
 
-def _not_repeatable_error(what: str, path: Path) -> DrakeTeleopError:
+def _not_repeatable(what: str, path: Path) -> DrakeTeleopError:
     folder = shlex.quote(str(path.parent))
     remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
@@ -251,37 +240,28 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
         if len(line) != len(_CSV_COLUMNS):
-            raise DrakeTeleopError(
-                f"has {len(line)} values, must have {len(_CSV_COLUMNS)}, one for each column",
-                where=where,
-                remedy="use the file as recorded",
-            )
+            what = f"has {len(line)} values, must have {len(_CSV_COLUMNS)}, one for each column"
+            raise _invalid_row(what, where)
         for column, name in enumerate(_CSV_COLUMNS):
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _not_repeatable_error(f"has the unknown {name} {line[column]!r}", path)
+                raise _not_repeatable(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:
-            raise DrakeTeleopError(
-                "has a value that is not a whole number (all inputs are integers)",
-                where=where,
-                remedy="use the file as recorded",
-            ) from None
+            what = "has a value that is not a whole number (all inputs are integers)"
+            raise _invalid_row(what, where) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
-            raise DrakeTeleopError(
-                f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)",
-                where=where,
-                remedy="use the file as recorded",
-            )
+            what = f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)"
+            raise _invalid_row(what, where)
         earlier, inputs = ms, dict(zip(INPUT_RANGES, values, strict=True))
         for name in INPUT_RANGES:
             low, high = input_range(name)
             if not low <= inputs[name] <= high:
-                raise DrakeTeleopError(
-                    f"{name} = {inputs[name]} is outside {low} to {high}",
-                    where=where,
-                    remedy="use the file as recorded",
-                )
+                raise _invalid_row(f"{name} = {inputs[name]} is outside {low} to {high}", where)
         yield ms, Inputs(**inputs)
+
+
+def _invalid_row(what: str, where: str) -> DrakeTeleopError:
+    return DrakeTeleopError(what, where=where, remedy="use the file as recorded")

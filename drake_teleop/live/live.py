@@ -23,7 +23,6 @@ from drake_teleop.live.inputs import (
     MAX_DURATION_MS,
     SLICE_MS,
     STATION_INPUTS,
-    Inputs,
     choice_names,
     input_range,
 )
@@ -45,7 +44,6 @@ MIN_DISPLAYED_TOUCH_FORCE_N = 0.12
 # of messages.
 _MAX_UNDRIVEN_S, _MAX_SLICES_PER_TICK = 0.25, 4
 _MIN_SHOWN_UNRENDERED_FORCE_N = 0.05  # N, smallest removed force that the page reports
-_RELEASED_HAND_INPUTS = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _SESSION_FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
@@ -99,17 +97,15 @@ class Live:
         folder = None if self._record is None else _unused_folder_path(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
-        by_device = self._link is not None
-        self._session = Session(
-            self._scenario, self._load, log=log, record=folder, device=by_device
-        )
+        device = self._link is not None
+        self._session = Session(self._scenario, self._load, log=log, record=folder, device=device)
         self._folder = "" if folder is None else str(folder)
         self._session.apply_inputs(self._session.inputs.with_changes(self._initial))
         if self._link is not None:
             self._link.reset_pose_origin(now)
         scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
-        self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
+        self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=device)
         self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
@@ -139,7 +135,6 @@ class Live:
         self.pace.restart(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the scenario's constants for a new page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
@@ -163,7 +158,7 @@ class Live:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._requested = self._requested.with_changes(_RELEASED_HAND_INPUTS)
+            self._requested = self._requested.with_changes({"held": 0, "clutch": 0})
             self._rates = RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
@@ -206,21 +201,19 @@ class Live:
         return self._session.ms
 
     @property
-    def is_simulation_halted(self) -> bool:
+    def is_halted(self) -> bool:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
-        return max(
-            0.0,
-            frame if self.is_simulation_halted else min(frame, self.pace.time_to_next_slice(now)),
-        )
+        due = frame if self.is_halted else min(frame, self.pace.time_to_next_slice(now))
+        return max(0.0, due)
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulate at most four due slices of time; return a frame for the pages if one is due."""
         for _ in range(_MAX_SLICES_PER_TICK):
             now = clock()
-            if self.is_simulation_halted or self.pace.time_to_next_slice(now) > 0:
+            if self.is_halted or self.pace.time_to_next_slice(now) > 0:
                 break
             self.pace.begin_slice(now)
             self._simulate_slice(now)
@@ -253,14 +246,15 @@ class Live:
             self.stopped = to_one_line(str(error))
 
     def _simulate_slice(self, now: float) -> None:
-        by_device = {} if self._link is None else self._link.hand_inputs(now)
         self._requested = self._rates.advance_inputs(self._requested, 1e-3 * self._slice_ms, now)
         self._show_now |= self._requested.hand_inputs != self._last_target
         self._last_target = self._requested.hand_inputs
+        requested, may_jump = self._requested, not self._session.inputs.held
+        if self._link is not None:
+            requested = requested.with_changes(self._link.hand_inputs(now))
+            may_jump |= not requested.clutch
         try:
-            self._session.apply_inputs(
-                self._limited_inputs(self._requested.with_changes(by_device))
-            )
+            self._session.apply_inputs(self._limiter.limit_inputs(requested, may_jump=may_jump))
         except _SESSION_FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
@@ -279,17 +273,11 @@ class Live:
         if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
 
-    def _limited_inputs(self, wanted: Inputs) -> Inputs:
-        by_device = self._link is not None
-        free = not self._session.inputs.held or (by_device and not wanted.clutch)
-        return self._limiter.limit_inputs(wanted, may_jump=free)
-
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()
         if len(rows["t"]):
-            self._last_frame = self._cockpit.page_values(
-                rows, self._session.inputs
-            ) | self._scene_part(rows)
+            values = self._cockpit.page_values(rows, self._session.inputs)
+            self._last_frame = values | self._scene_part(rows)
         inputs = self._requested
         words = self._last_frame.get("words", [])
         if self._session.is_channel_filling:
@@ -350,7 +338,7 @@ def _unused_folder_path(folder: Path) -> Path:
 
 
 def parse_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message, or None."""
+    """Return the valid requests in a message of either page, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:
@@ -363,20 +351,20 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     for kind in ("set", "rates"):
         values = message.get(kind)
         if isinstance(values, dict):
-            found[kind] = {
-                name: value for name, value in values.items() if _is_finite_number(value)
-            }
+            found[kind] = {name: value for name, value in values.items() if _is_finite(value)}
     if isinstance(message.get("pause"), bool):
         found["pause"] = message["pause"]
-    if _is_finite_number(message.get("slow")):
+    if _is_finite(message.get("slow")):
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
     if isinstance(message.get("scene"), str) and message["scene"] in SCENE_NAMES:
         found["scene"] = message["scene"]
-    found |= {name: True for name in ("reset", "drive") if message.get(name) is True}
+    found |= {name: True for name in ("reset", "drive", "go") if message.get(name) is True}
+    if type(message.get("answer")) is int and message["answer"] in (1, 2):
+        found["answer"] = message["answer"]
     return found or None
 
 
-def _is_finite_number(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) < 1e15 and math.isfinite(value)

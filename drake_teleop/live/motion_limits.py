@@ -10,9 +10,7 @@ from drake_teleop.live.inputs import INPUT_RANGES, INPUT_UNIT_M, INPUT_UNIT_RAD,
 
 _RATE_INPUT_TIMEOUT_S = 1.0  # s
 # Lead time of the target, which compensates the lag of the hand at constant speed [s].
-_LEAD_TIMES_S = dict.fromkeys(("x", "y", "z"), TARGET_LEAD_TIME_S) | dict.fromkeys(
-    ("rx", "ry", "rz"), 0.0
-)
+_LEAD_TIMES_S = dict.fromkeys("xyz", TARGET_LEAD_TIME_S) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
 # Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
 # limited only for a device; the path of a page's hand is smooth.
 _TOOL_TRANSLATION_LIMITS, _TOOL_ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
@@ -48,7 +46,10 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limiter of the hand's target: its speed, and for a device also its acceleration."""
+    """Limiter of the hand's target: its speed, and for a device also its acceleration.
+
+    `scales` are the tool's translation and rotation over the hand's.
+    """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _AxisLimiter] = {}
@@ -64,11 +65,10 @@ class MotionLimiter:
 
     def limit_inputs(self, inputs: Inputs, *, may_jump: bool) -> Inputs:
         """Return the limited inputs of the next period; `may_jump` permits jumps of the target."""
-        followed = {
-            name: axis.limit_target(getattr(inputs, name), may_jump)
-            for name, axis in self._axes.items()
-        }
-        return inputs.with_changes(followed)
+        axes = self._axes.items()
+        return inputs.with_changes(
+            {name: axis.limit_target(getattr(inputs, name), may_jump) for name, axis in axes}
+        )
 
 
 class _AxisLimiter:

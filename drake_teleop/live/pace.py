@@ -51,10 +51,8 @@ class Pace:
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
 
     def lateness_p99_s(self) -> float:
-        """Return the 99 % quantile of the slices' lateness [s]."""
-        return (
-            sorted(self._lateness)[(99 * len(self._lateness) - 1) // 100] if self._lateness else 0.0
-        )
+        late = sorted(self._lateness) or [0.0]
+        return late[(99 * len(late) - 1) // 100]
 
 
 @contextmanager

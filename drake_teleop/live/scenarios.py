@@ -32,13 +32,8 @@ _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD = 0.5
 _DELAY_INPUT_UNIT_S, _JITTER_INPUT_UNIT, _LOSS_INPUT_UNIT = 1e-4, 1e-2, 1e-3
 
 #: Shipped scenario of each scene; "own" is the scenario of the user.
-_SCENARIO_OF_SCENE = {
-    "leaf": "touch",
-    "slot": "peg_in_slot",
-    "wall": "touch",
-    "block": "push_block",
-}
-SCENE_NAMES = ("own", *_SCENARIO_OF_SCENE)
+_SHIPPED_SCENES = {"leaf": "touch", "slot": "peg_in_slot", "wall": "touch", "block": "push_block"}
+SCENE_NAMES = ("own", *_SHIPPED_SCENES)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -65,7 +60,7 @@ def load_scene(name: str, own: Scenario) -> Scenario:
     """Return the scenario of a scene in `SCENE_NAMES`; `own` is the user's scenario."""
     if name == "own":
         return own
-    scenario = LoadScenario(_SCENARIO_OF_SCENE[name])
+    scenario = LoadScenario(_SHIPPED_SCENES[name])
     if name == "wall":
         wall = Wall(position=[0.55, 0.0, 0.17], stiffness=1e4)
         changes = {"sheet_spring": None, "environment": [wall], "description": "a wall to press on"}
@@ -74,27 +69,24 @@ def load_scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`."""
+    """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`.
+
+    Contact detection requires the noise floor of `load`, which belongs to the scenario's sensor.
+    """
     method = tuple(METHODS)[inputs.method]
-    changes: dict[str, object] = {
-        "passivity__method": method,
-        "operator__grip": list(GRIP_IMPEDANCES)[inputs.grip],
-    }
+    changes: dict[str, object] = {"passivity__method": method}
+    changes["operator__grip"] = list(GRIP_IMPEDANCES)[inputs.grip]
     if method == "wave" != scenario.passivity.method:
         along, turning = scenario.passivity.wave.impedance
-        wave = dataclasses.replace(
-            scenario.passivity.wave,
-            impedance=[along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD)],
+        impedance = [along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD)]
+        changes["passivity__wave"] = dataclasses.replace(
+            scenario.passivity.wave, impedance=impedance
         )
-        changes["passivity__wave"] = wave
     name = NETWORKS[inputs.network]
     if name == "custom":
-        changes["channel"] = Channel(
-            delay=_DELAY_INPUT_UNIT_S * inputs.delay,
-            jitter=_JITTER_INPUT_UNIT * inputs.jitter,
-            distribution="gamma",
-            loss=_LOSS_INPUT_UNIT * inputs.loss,
-        )
+        delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter
+        loss = _LOSS_INPUT_UNIT * inputs.loss
+        changes["channel"] = Channel(delay=delay, jitter=jitter, distribution="gamma", loss=loss)
     elif name != AS_IN_SCENARIO:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
@@ -122,7 +114,7 @@ def _payload_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) of `before`, adapted to payload and sensor of `now`."""
+    """Return the estimate (16,) [offsets, phi] of `before`, adapted to payload, sensor of `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
@@ -138,10 +130,7 @@ def _wrist_sensor_offset(scenario: Scenario) -> Array:
 
 
 def channel_fill_time_s(scenario: Scenario) -> float:
-    """Return the time until all packets of a new channel arrive [s]."""
+    """Return the longest round trip of a new channel plus its time to resume [s]; 0: no channel."""
     if scenario.has_no_network_or_passivity:
         return 0.0
-    return (
-        sum(longest_delay(line) for line in scenario.channel.networks_of_directions())
-        + RESUME_TIME_S
-    )
+    return RESUME_TIME_S + sum(map(longest_delay, scenario.channel.networks_of_directions()))

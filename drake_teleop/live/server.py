@@ -108,17 +108,15 @@ class LiveDrive:
     def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
         with show_progress(True) as stage:
             self._load = _identify_load(scenario, stage)
-            self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
-
-    def _make_scenes(self, scenario: Scenario, device: bool, progress: UpdateProgress) -> None:
-        self._scene_scenarios: dict[str, Scenario] = {}
-        for name in SCENE_NAMES:
-            setup = load_scene(name, scenario)
-            self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
-            self._views[name] = PageScene(name, self._scene_scenarios[name])
-            progress(len(self._views) / (1 + len(SCENE_NAMES)))
-        compile_session_functions(scenario, self._load, device)
-        progress(1.0)
+            progress = stage("Prepare the station and its 3D scenes")
+            self._scene_scenarios: dict[str, Scenario] = {}
+            for name in SCENE_NAMES:
+                setup = load_scene(name, scenario)
+                self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
+                self._views[name] = PageScene(name, self._scene_scenarios[name])
+                progress(len(self._views) / (1 + len(SCENE_NAMES)))
+            compile_slice_functions(scenario, self._load, device)
+            progress(1.0)
 
     def wait(self) -> None:
         """Wait for the end of the session, by `stop` or Ctrl-C.
@@ -153,7 +151,7 @@ class LiveDrive:
             thread.join()
 
     def _stop_threads_or_exit_process(self) -> None:
-        """Stop all threads; Python may crash at exit while compiled code runs."""
+        # Python may crash at exit while compiled code runs.
         self._stop.set()
         end = time.monotonic() + _THREAD_END_TIMEOUT_S
         for thread in self._threads:
@@ -162,10 +160,7 @@ class LiveDrive:
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            print(
-                f"error: drive: does not end within {_THREAD_END_TIMEOUT_S:g} s{lost}",
-                file=sys.stderr,
-            )
+            _print_to_stderr(f"error: drive: does not end within {_THREAD_END_TIMEOUT_S:g} s{lost}")
             sys.stdout.flush()
             os._exit(2)
 
@@ -232,11 +227,8 @@ class LiveDrive:
                     await self._change_scene()
                 frame = self._live.tick(time.perf_counter)
                 if frame is not None:
-                    ready = [
-                        c
-                        for c in server.connections
-                        if c.transport.get_write_buffer_size() < _MAX_UNSENT_BYTES
-                    ]
+                    pages = [(c, c.transport.get_write_buffer_size()) for c in server.connections]
+                    ready = [c for c, unsent in pages if unsent < _MAX_UNSENT_BYTES]
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._device is not None and self._device.link.refusal != refusal:
                     refusal = self._device.link.refusal
@@ -296,30 +288,23 @@ class LiveDrive:
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
         ours = secrets.compare_digest(token, self._token.encode())
         if request.headers.get_all("Host") != [host] or not ours:
-            return _make_response(
-                HTTPStatus.FORBIDDEN, "text/plain", b"The address requires its token.\n"
-            )
+            return _make_response(HTTPStatus.FORBIDDEN, b"The address requires its token.\n")
         if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
-                return _make_response(
-                    HTTPStatus.FORBIDDEN,
-                    "text/plain",
-                    b"Only this server's page may open the socket.\n",
-                )
+                refusal = b"Only this server's page may open the socket.\n"
+                return _make_response(HTTPStatus.FORBIDDEN, refusal)
             return None
         if path == "/":
             page = self._page_html()
-            content_policy = content_security_policy(page, host)
-            return _make_response(
-                HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
-            )
+            policy = content_security_policy(page, host)
+            return _make_response(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8", policy)
         if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
-            return _make_response(HTTPStatus.OK, "application/json", view.objects)
+            return _make_response(HTTPStatus.OK, view.objects, "application/json")
         if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
-            return _make_response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
-        return _make_response(HTTPStatus.NOT_FOUND, "text/plain", b"Not found.\n")
+            return _make_response(HTTPStatus.OK, script, "text/javascript; charset=utf-8")
+        return _make_response(HTTPStatus.NOT_FOUND, b"Not found.\n")
 
     async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
@@ -338,10 +323,8 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _print_to_stderr(
-                    "no page is open: the simulation waits"
-                    + _START_TEXT_ENDINGS[self._device is not None]
-                )
+                ending = _START_TEXT_ENDINGS[self._device is not None]
+                _print_to_stderr(f"no page is open: the simulation waits{ending}")
 
 
 def _identify_load(scenario: Scenario, progress: bool | StartStage) -> IdentifiedLoad | None:
@@ -351,9 +334,7 @@ def _identify_load(scenario: Scenario, progress: bool | StartStage) -> Identifie
     return identified_load(dataclasses.replace(scenario, contact_detection=detection), progress)
 
 
-def compile_session_functions(
-    scenario: Scenario, load: IdentifiedLoad | None, device: bool
-) -> None:
+def compile_slice_functions(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
     """Compile the functions of the first simulation slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), PageValueCalculator(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
@@ -364,20 +345,18 @@ def compile_session_functions(
 
 
 def _make_response(
-    status: HTTPStatus, kind: str, body: bytes, content_policy: str = ""
+    status: HTTPStatus, body: bytes, kind: str = "text/plain", policy: str = "default-src 'none'"
 ) -> Response:
-    headers = Headers(
-        {
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            "Cache-Control": "no-store",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-            "Connection": "close",
-            "Content-Security-Policy": content_policy or "default-src 'none'",
-        }
-    )
-    return Response(status.value, status.phrase, headers, body)
+    headers = {
+        "Content-Type": kind,
+        "Content-Length": str(len(body)),
+        "Cache-Control": "no-store",
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Connection": "close",
+        "Content-Security-Policy": policy,
+    }
+    return Response(status.value, status.phrase, Headers(headers), body)
 
 
 def drive(
@@ -423,7 +402,6 @@ def run_drive_command(
 
 
 def start_condition_text(device: str | None) -> str:
-    """Return as text what starts the waiting simulation."""
     return "the simulation waits until this page is open" + _START_TEXT_ENDINGS[device is not None]
 
 

@@ -58,7 +58,7 @@ _SCALE_RAMP_S = 0.05
 # vibrations up to 1.7 / step = 1.1 kHz; the ball on a leaf vibrates at up to 700 Hz.
 _MIN_INTEGRATION_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
-_MAX_CHANNEL_CHANGE_FORCE_RISE_N = 0.9
+_MAX_FORCE_RISE_N = 0.9
 # Duration of short steps after a rejected one [s].
 _SHORT_STEPS_AFTER_REJECTION_S = 4e-3
 _NO_EVENT_STATUS = EventStatus.DidNothing()
@@ -92,8 +92,8 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
     simulator.set_monitor(set_step_mode)
 
 
-def add_placeholders_of_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log with signals that some stations lack."""
+def add_missing_signals(log: SimulationResult) -> SimulationResult:
+    """Return the log with signals that some stations lack: commands as received, else zeros."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -143,7 +143,7 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def take_over_and_get_clutch_wait_s(self, other: _Station, new_channel: bool) -> float:
+    def take_over(self, other: _Station, new_channel: bool) -> float:
         """Take over another station's state and fade to this station's force.
 
         With a new channel, open the clutch and return how long it must stay open [s]; else 0.
@@ -160,9 +160,7 @@ class _Station:
         rendered = other.signal_value("force_to_master")
         cross_fade.StartFade(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
         if new_channel:
-            cross_fade.LimitForce(
-                context, _MAX_CHANNEL_CHANGE_FORCE_RISE_N + float(np.linalg.norm(rendered[:3]))
-            )
+            cross_fade.LimitForce(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
         impedances = other.scenario.operator.hand, self.scenario.operator.hand
         if impedances[0] != impedances[1]:
             hand, context = self.block_and_context("live_hand")
@@ -211,9 +209,7 @@ class Session:
             self._record = SessionRecord(record, scenario, load, self.inputs, device=device)
         self._on_disk: BackgroundLog | None = None
         if log is not None:
-            self._on_disk = BackgroundLog(
-                log, self._station.simulator, 0.0, add_placeholders_of_missing_signals
-            )
+            self._on_disk = BackgroundLog(log, self._station.simulator, 0.0, add_missing_signals)
         self._earlier_rows: list[SimulationResult] = []
         self._station.simulator.Initialize()
 
@@ -241,7 +237,7 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.take_over_and_get_clutch_wait_s(
+        wait_s = station.take_over(
             self._station, inputs.channel_choices != self.inputs.channel_choices
         )
         if wait_s:
@@ -319,9 +315,7 @@ class Session:
             self._on_disk.wait_until_written()
 
     def _recorded_signals(self) -> SimulationResult:
-        return add_placeholders_of_missing_signals(
-            read_recorded_signals(self._station.simulator, 0.0)
-        )
+        return add_missing_signals(read_recorded_signals(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
         parts = [*self._earlier_rows, self._recorded_signals()]
@@ -376,10 +370,8 @@ def read_drive(folder: str | Path) -> RecordedDrive:
     load = read_cached_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):
-        raise DrakeTeleopError(
-            "is not an identified load (16 finite parameters)",
-            where=str(folder / LOAD_FILE),
-            remedy="record the session again",
-        )
+        what = "is not an identified load (16 finite parameters)"
+        remedy = "record the session again"
+        raise DrakeTeleopError(what, where=str(folder / LOAD_FILE), remedy=remedy)
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
     return RecordedDrive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)

@@ -28,21 +28,17 @@ _BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_station_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states, changeable parameters of `before` to `station`, except `excluded`."""
+    """Copy time, states, changeable parameters to `station`, except of blocks `excluded`."""
     context.SetTime(then.get_time())
     sources = dict(_blocks_by_path(before))
     for path, block in _blocks_by_path(station):
-        source_block = sources.get(path)
-        if (
-            source_block is None
-            or type(source_block) is not type(block)
-            or excluded & set(path.split("/"))
-        ):
+        source, names = sources.get(path), path.split("/")
+        if source is None or type(source) is not type(block) or excluded & set(names):
             continue
         _copy_block_state(
-            source_block.GetMyContextFromRoot(then),
+            source.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
-            path.rpartition("/")[2] in _BLOCKS_WITH_CHANGED_PARAMETERS,
+            names[-1] in _BLOCKS_WITH_CHANGED_PARAMETERS,
         )
 
 
@@ -133,9 +129,7 @@ class CrossFade(LeafSystem):
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
         inputs = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc_wrench), inputs)
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            period, 0.0, self._update_fade_weight_and_force_limit
-        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_fade_and_limit)
 
     def StartFade(self, context: Context, start: float, length: float, rendered: Array) -> None:
         """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `length` [s]."""
@@ -153,7 +147,7 @@ class CrossFade(LeafSystem):
         force = _force_norm(self._wrench.Eval(context))
         return max(force - max_force, 0.0) if share == 1.0 else 0.0
 
-    def _update_fade_weight_and_force_limit(self, context: Context, state: DiscreteValues) -> None:
+    def _update_fade_and_limit(self, context: Context, state: DiscreteValues) -> None:
         share, max_force = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()

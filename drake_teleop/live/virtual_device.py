@@ -4,29 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _SIMULATION_STEPS_PER_MS = 10  # per ms
+_MASS_KG, _DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
+HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
+"""Function from time [s] to intended position [m] and velocity [m/s]."""
 
 
 class VirtualDevice:
-    """Simulated device of given mass [kg] and damping [N s/m] in a moving hand.
+    """Simulated device in a moving hand; `energy`: work of both against the rendered force [J]."""
 
-    `hand_motion` maps time [s] to intended position [m] and velocity [m/s]; `energy` is the work
-    of device and hand against the rendered force [J].
-    """
-
-    def __init__(
-        self,
-        hand_motion: Callable[[float], tuple[Sequence[float], Sequence[float]]],
-        grip: str = "medium",
-        mass: float = 0.15,
-        damping: float = 0.5,
-    ) -> None:
-        held = GRIP_IMPEDANCES[grip]
-        self._hand, self._b = hand_motion, damping
-        self._mass, self._k, self._d = mass + held.mass, held.stiffness, held.damping
+    def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
+        held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
+        self._mass, self._k, self._d = _MASS_KG + held.mass, held.stiffness, held.damping
         self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
         self.energy, self._t = 0.0, 0.0
 
@@ -39,15 +32,14 @@ class VirtualDevice:
             at, speed = self._hand(self._t)
             for i in range(3):
                 x, v = self.position[i], self.velocity[i]
-                pull = force[i] - self._b * v + self._k * (at[i] - x) + self._d * (speed[i] - v)
+                elastic, damped = self._k * (at[i] - x), self._d * (speed[i] - v)
+                pull = force[i] - _DAMPING_NS_M * v + elastic + damped
                 v += h * pull / self._mass
                 self.velocity[i], self.position[i] = v, x + h * v
                 self.energy -= force[i] * h * v
 
 
-def tapping_motion(
-    depth: float, *, hertz: float = 0.5
-) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
+def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
     """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""
     lift, hold = 0.01, 0.6
 

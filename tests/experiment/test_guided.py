@@ -17,7 +17,7 @@ from drake_teleop.live.experiment.design import (
     Experiment,
 )
 from drake_teleop.live.experiment.guided import (
-    HAND_INPUT_NAMES_OF_PARTICIPANT,
+    PARTICIPANT_INPUTS,
     GuidedExperiment,
     parse_experiment_message,
 )
@@ -100,10 +100,10 @@ def test_stimulus_and_measured_level_of_a_mass_agree(condition, shown):
     assert payload > 0.0 or condition.eta is None
     assert made.load_mass_at_hand == pytest.approx(mass * 0.1 * 2.0)
     level = 0.3 * made.load_mass_at_hand
-    inputs = made.stimulus_scales_percent(level, 8.0)
+    inputs = made.stimulus_scales(level, 8.0)
     assert inputs["sigma_object"] == round(100 * (shown + 0.3)) and inputs["gamma"] == 100
     assert inputs["sigma"] == (0 if condition.eta else inputs["sigma_object"])
-    assert made.stimulus_scales_percent(0.0, 8.0)["sigma_object"] == round(100 * shown)
+    assert made.stimulus_scales(0.0, 8.0)["sigma_object"] == round(100 * shown)
     rows = IntervalLog(SCALED, None)
     assert made.interval_result(level, inputs, rows).level == pytest.approx(level)
     assert made.interval_result(0.0, inputs, rows).level == 0.0
@@ -111,8 +111,8 @@ def test_stimulus_and_measured_level_of_a_mass_agree(condition, shown):
 
 def test_stimulus_and_measured_level_of_a_contact_agree():
     made = make_apparatus(ContactDetection(), Condition(sigma=0.2, gamma=2.0), SCALED, None)
-    assert made.stimulus_scales_percent(0.0, 8.0) == {"sigma": 20, "sigma_object": 20, "gamma": 0}
-    inputs = made.stimulus_scales_percent(3.0, 8.0)
+    assert made.stimulus_scales(0.0, 8.0) == {"sigma": 20, "sigma_object": 20, "gamma": 0}
+    inputs = made.stimulus_scales(3.0, 8.0)
     assert inputs["gamma"] == 75  # 3/8 of 200 %
     for force, valid in ((6.0, True), (0.4, False)):
         rows = IntervalLog(SCALED, None)
@@ -204,7 +204,7 @@ def test_10000_random_messages_change_only_permitted_inputs():
     for found in filter(None, heard):
         assert set(found) <= {"set", "drive", "go", "answer"}
         assert found.get("answer", 1) in (1, 2) and set(found.get("set", {})) <= set(
-            HAND_INPUT_NAMES_OF_PARTICIPANT
+            PARTICIPANT_INPUTS
         )
     for bad in (
         b"{}",

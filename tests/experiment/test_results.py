@@ -12,6 +12,8 @@ from test_procedure import SMALL, run_participant
 
 from drake_teleop.cli.experiment import next_participant
 from drake_teleop.common.style import Picture
+from drake_teleop.live.experiment import simulated
+from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
 from drake_teleop.live.experiment.procedure import Procedure, plan_trials
 from drake_teleop.live.experiment.results import (
@@ -22,7 +24,9 @@ from drake_teleop.live.experiment.results import (
 )
 from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
-from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario
+from drake_teleop.station.signals import signal_of
 
 CONTACT = "threshold of contact [N at the tool]"
 
@@ -54,6 +58,27 @@ def test_intervals_have_different_random_numbers():
         for seed in (0, 1)
     }
     assert len(seeds) == 32
+
+
+def test_simulated_insertion_averages_the_contact_force_over_20_ms_as_for_people(monkeypatch):
+    base, contact = LoadScenario("insert"), np.zeros((200, 6))
+    contact[100, 2], contact[:, 1] = 90.0, 3.0
+    signals = {"true_contact_wrench_W": contact, "force_to_master": np.zeros((200, 6))}
+    specs = [signal_of(name, 6) for name in signals]
+    result = SimulationResult(1e-3 * np.arange(200), signals, specs)
+    for name, value in (
+        ("MakeTeleopStation", None),
+        ("simulate", result),
+        ("task_measures", {"success": 1.0, "task_time_s": 2.0}),
+    ):
+        monkeypatch.setattr(simulated, name, lambda *_, value=value, **__: value)
+    apparatus = make_apparatus(PegInSlot(), Condition(name="a"), base, None)
+    procedure = SimpleNamespace(
+        trial_number=0, interval=1, participant=1, experiment=Experiment(seed=0)
+    )
+    inserted = simulated._insert_peg(apparatus, base, procedure)
+    assert inserted.force_N == pytest.approx((19 * 3.0 + math.hypot(3.0, 90.0)) / 20)
+    assert inserted.done and inserted.time_s == 2.0
 
 
 @pytest.mark.pictures

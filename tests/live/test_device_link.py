@@ -317,7 +317,7 @@ def test_client_displays_the_stations_force_and_none_after_silence(link):
     client = DeviceClient(device, f"udp://127.0.0.1:{link.port}")
     for k in range(200):
         now = MS * k
-        client.exchange_packets_and_render_wrench(lambda now=now: now)
+        client.exchange_packets(lambda now=now: now)
         if k < 100:
             link.hand_inputs(now)
             link.send_wrench(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))

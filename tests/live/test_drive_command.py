@@ -148,7 +148,7 @@ def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypat
         raise RuntimeError("joint 2\nleaves its range")
 
     page(until=lambda frame: bool(frame["stopped"]))
-    monkeypatch.setattr("drake_teleop.live.server.compile_session_functions", lambda *_: None)
+    monkeypatch.setattr("drake_teleop.live.server.compile_slice_functions", lambda *_: None)
     monkeypatch.setattr(Session, "advance", fail)
     assert drive() == 2
     message = capsys.readouterr().err

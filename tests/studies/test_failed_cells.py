@@ -165,7 +165,7 @@ def test_half_widths_equal_least_squares():
     seen = random.random((6, 4)) < 0.7
     table = fill_missing_values(np.where(seen, random.normal(size=(6, 4)), np.nan))
     design = Factorial(levels, [3, 2], seen)
-    weights = design.comparable_levels_and_weights(0)[2]
+    weights = design.comparison_weights(0)[2]
     weights -= weights.mean(axis=0)
     X = np.hstack([np.repeat(np.eye(6), 4, axis=0), np.tile(np.eye(4), (6, 1))])[seen.ravel()]
     solve = np.linalg.pinv(X)
@@ -189,11 +189,11 @@ def test_regression_does_not_extrapolate_into_failed_cells():
     known = points[:, 0] - points[:, 1] < 0.4
     value = np.exp(3 * (points[:, 0] - points[:, 1]))[:, None]
     model = fit_level_model(factors, points.T.tolist(), known)
-    kept, over, terms = model.comparable_levels_and_weights(0)
+    kept, over, terms = model.comparison_weights(0)
     assert kept.all() and 1 <= over.sum() < 5
     means = model.means(value[known], terms)[0]
     assert value[known].min() < means.min() and means.max() < value[known].max()
-    cells, _, terms = model.comparable_levels_and_weights(0, 1)
+    cells, _, terms = model.comparison_weights(0, 1)
     lost = model.failed[0, 1]
     assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
     assert np.array_equal(cells, ~lost.ravel())

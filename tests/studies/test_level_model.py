@@ -9,7 +9,7 @@ from scipy.stats import qmc
 
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import effects_table, main_effects, pair_means
-from drake_teleop.lab.studies.level_model import fit_level_model, levels_of_factor_values
+from drake_teleop.lab.studies.level_model import factor_levels, fit_level_model
 
 UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
 EDGES = np.linspace(0.0, 1.0, 6)
@@ -155,4 +155,4 @@ def test_too_few_points_give_no_effects():
 
 def test_words_without_run_are_not_levels():
     factor = Factor("a.w", words=["a", "b", "c"])
-    assert levels_of_factor_values(factor, ["c", "a", "c"]).names == ["a", "c"]
+    assert factor_levels(factor, ["c", "a", "c"]).names == ["a", "c"]

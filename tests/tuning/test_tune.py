@@ -51,13 +51,13 @@ def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_e
         ("light", 20000.0), ("firm", 20000.0), ("light", 500.0), ("firm", 500.0),
     ]  # fmt: skip
     walls = pytest.approx([20000.0 * 40 ** (-k / 3) for k in range(4)])
-    assert stated.tested_gamma_factors_grips_and_walls == [
+    assert stated.tested_parts == [
         (1.1, ["light"], walls),
         (1.1, ["light"], walls),
         (1.1, ["medium", "firm"], walls),
         (1.0, ["light", "firm"], [20000.0]),
     ]
-    assert make_stated_set(["light"], [3.0], "press").tested_gamma_factors_grips_and_walls == [
+    assert make_stated_set(["light"], [3.0], "press").tested_parts == [
         *(2 * [(1.1, ["light"], [3000.0])]),
         (1.0, ["light"], [3000.0]),
     ]

@@ -54,7 +54,7 @@ class Factor:
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: FactorValue) -> list[float]:
-        """Return a number from 0 to 1, or an indicator (0 or 1) for each word, flag or vector."""
+        """Return the share (0 to 1) of the range, or an indicator of each word, flag or vector."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
@@ -68,30 +68,21 @@ class Factor:
         ranged = [self.low is not None, self.high is not None]
         lists = (self.values, self.words, self.flags, self.vectors)
         if [*map(bool, lists), any(ranged)].count(True) != 1 or any(ranged) != all(ranged):
-            raise DrakeTeleopError(
-                "has no values, or several kinds of them",
-                where=where,
-                remedy="give one of values, words, flags, vectors, or both low and high",
-            )
+            what = "has no values, or several kinds of them"
+            remedy = "give one of values, words, flags, vectors, or both low and high"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = [*self.values, *itertools.chain(*self.vectors)]
         numbers += [self.high - self.low] if self.low is not None and self.high is not None else []
         if not all(map(math.isfinite, numbers)):
-            raise DrakeTeleopError(
-                "has numbers, or a range, that are not finite",
-                where=where,
-                remedy="replace NaN and infinity",
-            )
+            what = "has numbers, or a range, that are not finite"
+            raise DrakeTeleopError(what, where=where, remedy="replace NaN and infinity")
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise DrakeTeleopError(
-                f"{self.high:g} is not above low, {self.low:g}",
-                where=f"{where}.high",
-                remedy="raise high or lower low",
-            )
+            what = f"{self.high:g} is not above low, {self.low:g}"
+            raise DrakeTeleopError(what, where=f"{where}.high", remedy="raise high or lower low")
         listed = self.level_values()
         if repeated := [value for k, value in enumerate(listed) if value in listed[:k]]:
-            raise DrakeTeleopError(
-                f"repeats the value {repeated[0]}", where=where, remedy="list each value once"
-            )
+            remedy = "list each value once"
+            raise DrakeTeleopError(f"repeats the value {repeated[0]}", where=where, remedy=remedy)
 
 
 @settings
@@ -124,42 +115,30 @@ class Study:
         check_all_field_values(self, where)
         for name in self.measures:
             if name not in MEASURES:
-                raise DrakeTeleopError(
-                    f"there is no measure '{name}'",
-                    where=f"{where}:measures",
-                    remedy=suggest_name(name, MEASURES, f"choose among {', '.join(MEASURES)}"),
-                )
+                what = f"there is no measure '{name}'"
+                remedy = suggest_name(name, MEASURES, f"choose among {', '.join(MEASURES)}")
+                raise DrakeTeleopError(what, where=f"{where}:measures", remedy=remedy)
         for index, factor in enumerate(self.factors):
             factor.check(f"{where}:factors[{index}]")
         fields = [factor.field for factor in self.factors]
         for index, name in enumerate(fields):
             place = f"{where}:factors[{index}].field"
             if name in fields[:index]:
-                raise DrakeTeleopError(
-                    f"{name} is varied twice", where=place, remedy="remove one factor"
-                )
+                remedy = "remove one factor"
+                raise DrakeTeleopError(f"{name} is varied twice", where=place, remedy=remedy)
             if name == "simulation.seed":
-                raise DrakeTeleopError(
-                    "the seed cannot be a factor", where=place, remedy="set repeats and seed"
-                )
+                remedy = "set repeats and seed"
+                raise DrakeTeleopError("the seed cannot be a factor", where=place, remedy=remedy)
         if not self.factors:
-            raise DrakeTeleopError(
-                "is empty (a study varies at least one field)",
-                where=f"{where}:factors",
-                remedy="add a factor",
-            )
+            what = "is empty (a study varies at least one field)"
+            raise DrakeTeleopError(what, where=f"{where}:factors", remedy="add a factor")
         if self.design == "sobol" and self.samples & (self.samples - 1):
-            raise DrakeTeleopError(
-                f"{self.samples} Sobol points are not balanced (a power of two is)",
-                where=f"{where}:samples",
-                remedy="give a power of two",
-            )
+            what = f"{self.samples} Sobol points are not balanced (a power of two is)"
+            raise DrakeTeleopError(what, where=f"{where}:samples", remedy="give a power of two")
         if (self.design == "adaptive") != (self.objective in self.measures):
-            raise DrakeTeleopError(
-                f"'{self.objective}' cannot be the objective of design '{self.design}'",
-                where=f"{where}:objective",
-                remedy="give one of the measures for an adaptive design, none for others",
-            )
+            what = f"'{self.objective}' cannot be the objective of design '{self.design}'"
+            remedy = "give one of the measures for an adaptive design, none for others"
+            raise DrakeTeleopError(what, where=f"{where}:objective", remedy=remedy)
 
     def num_points(self) -> int:
         if self.design == "factorial":
@@ -167,15 +146,15 @@ class Study:
         return self.samples
 
     def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Raise above `MAX_RUNS` runs, or above `MAX_RUNS_WITHOUT_CONSENT` unless `yes`."""
+        """Raise DrakeTeleopError above `MAX_RUNS` runs, or without consent if they take days.
+
+        `yes` is the consent, or a function from a question to the user's answer.
+        """
         runs = self.num_points() * self.repeats
         count = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
-            raise DrakeTeleopError(
-                f"{count} are too many (at most {MAX_RUNS:,})",
-                where=where,
-                remedy="give fewer values or repeats",
-            )
+            what = f"{count} are too many (at most {MAX_RUNS:,})"
+            raise DrakeTeleopError(what, where=where, remedy="give fewer values or repeats")
         if runs <= MAX_RUNS_WITHOUT_CONSENT or yes is True:
             return
         if yes is False or not yes(f"{where}: {count}. Begin?"):
@@ -204,18 +183,15 @@ class Study:
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
         drawn = self._draw_sobol_points(_NUM_ADAPTIVE_CANDIDATES, self.seed + len(points))
-        candidates = list(
-            {str(point): point for point in drawn if str(point) not in tried}.values()
-        )
+        candidates = list({str(p): p for p in drawn if str(p) not in tried}.values())
         if len(candidates) <= count:
             return candidates
-        chosen = propose_points(
-            self._coordinates(points), objective, self._coordinates(candidates), count
-        )
+        places, others = self._coordinates(points), self._coordinates(candidates)
+        chosen = propose_points(places, objective, others, count)
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[FactorValues], first: int = 0) -> list[dict[str, Any]]:
-        """Return a table row (run, point, seed, values) without measures for each run."""
+        """Return a table row (run, point, seed, values) for each run, from point `first`."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values
@@ -229,16 +205,10 @@ class Study:
         sobol = qmc.Sobol(len(self.factors), seed=np.random.default_rng(seed))
         shares = sobol.random_base2(count.bit_length() - 1)
         return [
-            {
-                factor.field: factor.value_at_share(u)
-                for factor, u in zip(self.factors, point, strict=True)
-            }
+            {f.field: f.value_at_share(u) for f, u in zip(self.factors, point, strict=True)}
             for point in shares.tolist()
         ]
 
     def _coordinates(self, points: Sequence[FactorValues]) -> Array:
-        rows = [
-            list(itertools.chain(*(f.coordinates(point[f.field]) for f in self.factors)))
-            for point in points
-        ]
-        return np.array(rows)
+        values = [[f.coordinates(point[f.field]) for f in self.factors] for point in points]
+        return np.array([np.concatenate(row) for row in values])

@@ -22,9 +22,9 @@ from drake_teleop.lab.studies.level_model import (
     TOO_FEW_POINTS,
     BooleanArray,
     LevelModel,
+    factor_levels,
     fit_level_model,
     largest_complete_block,
-    levels_of_factor_values,
     missing_value_reasons,
 )
 
@@ -46,9 +46,7 @@ class Factorial:
     counts: list[int]
     has_value: BooleanArray
 
-    def comparable_levels_and_weights(
-        self, *shown: int
-    ) -> tuple[BooleanArray, BooleanArray, Array]:
+    def comparison_weights(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
 
         For two factors, a level is a pair of levels. The matrix (comparable levels, n) maps values
@@ -66,13 +64,12 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        means = [
-            self.comparable_levels_and_weights(factor)[2] for factor in range(len(self.counts))
-        ]
+        means = [self.comparison_weights(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
+        """Return the means over points, by `weights`, and over seeds, and their half widths."""
         mean, half = means_and_half_widths_over_seeds(weights @ table)
         return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
 
@@ -184,7 +181,6 @@ class PairMeans:
 
 
 def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects by measure, factor and level."""
     import polars as pl
 
     table = [
@@ -210,9 +206,8 @@ def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
     data = _MeasureData(study, rows, measure)
-    return (
-        {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
-    )
+    factors = [] if data.is_empty else data.factors
+    return {factor.field: data.main_effect(k) for k, factor in enumerate(factors)}
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
@@ -235,9 +230,7 @@ class _MeasureData:
         self.table = fill_missing_values(values[used])
         points = rows.unique("point", keep="first").sort("point")
         columns = [points[factor.field].to_list() for factor in self.factors]
-        self.levels = [
-            levels_of_factor_values(f, c) for f, c in zip(self.factors, columns, strict=True)
-        ]
+        self.levels = [factor_levels(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
@@ -254,7 +247,7 @@ class _MeasureData:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
-            is_compared, combinations, weights = self.model.comparable_levels_and_weights(factor)
+            is_compared, combinations, weights = self.model.comparison_weights(factor)
             if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
@@ -262,9 +255,9 @@ class _MeasureData:
                 compared = self._count_combinations(combinations, factor)
             why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        left_out = self._count_combinations(np.ones(1), factor) - compared
+        unused = self._count_combinations(np.ones(1), factor) - compared
         return MainEffect(
-            levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
+            levels.names, runs, mean, half, effect, effect_half, why, compared, unused,
             self.is_fitted,
         )  # fmt: skip
 
@@ -273,7 +266,7 @@ class _MeasureData:
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.comparable_levels_and_weights(first, second)
+        is_compared, combinations, weights = self.model.comparison_weights(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
@@ -282,12 +275,9 @@ class _MeasureData:
         mean[~is_compared] = np.nan
         why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
         compared = self._count_combinations(combinations, first, second)
-        left_out = self._count_combinations(np.ones(1), first, second) - compared
-        fields = self.factors[first].field, self.factors[second].field
-        names = a.names, b.names
-        return PairMeans(
-            fields, names, mean.reshape(shape), why, compared, left_out, self.is_fitted
-        )
+        unused = self._count_combinations(np.ones(1), first, second) - compared
+        fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
+        return PairMeans(fields, names, mean.reshape(shape), why, compared, unused, self.is_fitted)
 
     @property
     def is_fitted(self) -> bool:

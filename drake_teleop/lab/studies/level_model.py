@@ -41,7 +41,10 @@ def largest_complete_block(there: BooleanArray) -> tuple[BooleanArray, BooleanAr
 def missing_value_reasons(
     compared: BooleanArray, runs: NDArray[np.int64], good: NDArray[np.int64]
 ) -> list[str]:
-    """Return for each level or cell why it has no value; "" where `compared` is True."""
+    """Return for each level or cell why it has no value; "" where `compared` is True.
+
+    `runs` and `good` count its points, and its runs with a value.
+    """
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
@@ -49,7 +52,7 @@ def missing_value_reasons(
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_RANGE_PARTS_AND_PRODUCTS_OF_MODELS = (
+_PARTS_AND_PRODUCTS = (
     *((parts, True) for parts in (5, 4, 3)),
     *((parts, False) for parts in (5, 4, 3, 2)),
 )
@@ -77,9 +80,7 @@ class Levels:
     middle_columns: Array
 
 
-def levels_of_factor_values(
-    factor: Factor, column: Sequence[FactorValue], parts: int = 5
-) -> Levels:
+def factor_levels(factor: Factor, column: Sequence[FactorValue], parts: int = 5) -> Levels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
     listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
@@ -109,7 +110,6 @@ class LevelModel:
         products: columns of X for each pair (i, j) of factors.
         failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
         X: (n, p) design matrix; first column: the mean.
-        pseudo_inverse: (p, n) pseudo-inverse of X.
     """
 
     factors: list[Levels]
@@ -119,9 +119,7 @@ class LevelModel:
     X: Array
     pseudo_inverse: Array
 
-    def comparable_levels_and_weights(
-        self, *shown: int
-    ) -> tuple[BooleanArray, BooleanArray, Array]:
+    def comparison_weights(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return the same as `Factorial`, but with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
@@ -140,9 +138,7 @@ class LevelModel:
 
         `table` (points, seeds) contains the measure.
         """
-        means = [
-            self.comparable_levels_and_weights(factor)[2] for factor in range(len(self.factors))
-        ]
+        means = [self.comparison_weights(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
         coefficients = self.pseudo_inverse @ table.mean(axis=1)
@@ -151,12 +147,8 @@ class LevelModel:
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
-            halves.append(
-                np.hypot(
-                    design * self._std_over_residual(terms),
-                    self._half_width_over_seeds(table, terms),
-                )
-            )
+            over_points = design * self._relative_std(terms)
+            halves.append(np.hypot(over_points, self._half_width_over_seeds(table, terms)))
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
@@ -165,9 +157,8 @@ class LevelModel:
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
-        return each.mean(axis=1), np.hypot(
-            self._half_width_over_points(table, 1) * self._std_over_residual(terms), over_seeds
-        )
+        over_points = self._half_width_over_points(table, 1) * self._relative_std(terms)
+        return each.mean(axis=1), np.hypot(over_points, over_seeds)
 
     def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
         count = len(next(iter(at.values())))
@@ -180,7 +171,7 @@ class LevelModel:
         for (i, j), columns in self.products.items():
             if i in at and j in at:
                 a, b = (self.factors[k].middle_columns[at[k]] for k in (i, j))
-                terms[:, columns] = _pairwise_column_products(a, b)
+                terms[:, columns] = _pair_products(a, b)
         return terms
 
     @property
@@ -193,7 +184,7 @@ class LevelModel:
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
 
-    def _std_over_residual(self, terms: Array) -> Array:
+    def _relative_std(self, terms: Array) -> Array:
         return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
 
     def _half_width_over_points(self, table: Array, num_intervals: int) -> float:
@@ -206,9 +197,7 @@ class LevelModel:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
         moved = np.sum((terms @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
-        noise = self._residual_variance(apart, seeds - 1) * np.sum(
-            self._std_over_residual(terms) ** 2
-        )
+        noise = self._residual_variance(apart, seeds - 1) * np.sum(self._relative_std(terms) ** 2)
         deviation = np.sqrt(max(moved - noise, 0.0) / len(terms) / seeds)
         return _student_quantile(len(self.factors), seeds - 1) * float(deviation)
 
@@ -226,10 +215,8 @@ def fit_level_model(
     chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _RANGE_PARTS_AND_PRODUCTS_OF_MODELS:
-        levels = [
-            levels_of_factor_values(f, c, parts) for f, c in zip(factors, columns, strict=True)
-        ]
+    for parts, products in _PARTS_AND_PRODUCTS:
+        levels = [factor_levels(f, c, parts) for f, c in zip(factors, columns, strict=True)]
         model = _build_level_model(levels, products, known, by_chance)
         if model is not None:
             found = model
@@ -249,9 +236,7 @@ def _build_level_model(
     columns += [f.within[known, None] for f in factors if f.within is not None]
     places, first = {}, sum(column.shape[1] for column in columns)
     for i, j in itertools.combinations(range(len(factors)), 2) if products else ():
-        pair = _pairwise_column_products(
-            factors[i].centred_columns[known], factors[j].centred_columns[known]
-        )
+        pair = _pair_products(factors[i].centred_columns[known], factors[j].centred_columns[known])
         places[i, j] = slice(first, first := first + pair.shape[1])
         columns.append(pair)
     X = np.hstack(columns)
@@ -284,7 +269,7 @@ def _find_failed_level_cells(
     return found
 
 
-def _pairwise_column_products(a: Array, b: Array) -> Array:
+def _pair_products(a: Array, b: Array) -> Array:
     return np.einsum("ni,nj->nij", a, b).reshape(len(a), -1)
 
 

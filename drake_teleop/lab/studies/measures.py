@@ -70,11 +70,9 @@ def evaluate_measures(
 ) -> dict[str, float]:
     """Return the measures `names` of one run; `force_threshold` in N."""
     if "force_to_master" not in result:
-        raise DrakeTeleopError(
-            "the run identifies the load without a hand, so it has no measures",
-            where="operator.intent",
-            remedy="give the operator an intent or a task, or set load_estimator.enabled: false",
-        )
+        what = "the run identifies the load without a hand, so it has no measures"
+        remedy = "give the operator an intent or a task, or set load_estimator.enabled: false"
+        raise DrakeTeleopError(what, where="operator.intent", remedy=remedy)
     own = [name for name in names if name in _MEASURES_OF_EVERY_RUN]
     found = {name: _MEASURES_OF_EVERY_RUN[name](result, force_threshold) for name in own}
     if len(own) < len(names):

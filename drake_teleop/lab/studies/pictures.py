@@ -136,11 +136,8 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
         for axes, found in zip(grid.ravel(), maps, strict=False):
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
-                axes.add_patch(
-                    _hatched_cell_without_value(
-                        found.missing_reasons[row, column], (column - 0.5, row - 0.5)
-                    )
-                )
+                why, corner = found.missing_reasons[row, column], (column - 0.5, row - 0.5)
+                axes.add_patch(_hatched_cell_without_value(why, corner))
             axes.grid(False)
             _label_levels(axes, found.level_names[1])
             axes.set_yticks(range(len(found.level_names[0])), found.level_names[0])

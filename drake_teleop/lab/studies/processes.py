@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
@@ -25,14 +24,8 @@ Chunk: TypeAlias = list[dict[str, Any]]
 RunRows: TypeAlias = Callable[[Chunk], Chunk]
 
 
-@dataclass(frozen=True)
-class RunExecutor:
-    """Executor of `num_workers` runs at once; `run_chunks` yields finished chunks."""
-
-    num_workers: int
-    run_chunks: Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
-
-
+RunChunks: TypeAlias = Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
+"""Function that runs chunks in parallel and yields each one when it is finished."""
 PROCESS_ENDED_ERROR = "the run has ended its process"
 _PARENT_CHECK_PERIOD_S = 0.5  # period of the check for the parent process [s]
 
@@ -40,40 +33,32 @@ _PARENT_CHECK_PERIOD_S = 0.5  # period of the check for the parent process [s]
 @contextmanager
 def open_executor(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
-) -> Iterator[RunExecutor]:
-    """Start `jobs` processes, a Dask cluster or a custom executor for the context.
+) -> Iterator[tuple[int, RunChunks]]:
+    """Start the processes; yield the number of parallel runs and a function that runs chunks.
 
     `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
     """
     if executor is not None:
         if not isinstance(executor, Executor):
-            raise DrakeTeleopError(
-                f"has type {type(executor).__name__}, not concurrent.futures.Executor",
-                where="executor",
-                remedy="pass a ProcessPoolExecutor, for instance",
-            )
-        yield RunExecutor(
-            getattr(executor, "_max_workers", max(jobs, 1)),
-            lambda run, chunks: _run_on_given_executor(run, chunks, executor),
-        )
+            what = f"has type {type(executor).__name__}, not concurrent.futures.Executor"
+            remedy = "pass a ProcessPoolExecutor, for instance"
+            raise DrakeTeleopError(what, where="executor", remedy=remedy)
+        workers = getattr(executor, "_max_workers", max(jobs, 1))
+        yield workers, lambda run, chunks: _run_on_executor(run, chunks, executor)
         return
     if cluster is None:
         from joblib import effective_n_jobs
 
-        yield RunExecutor(
-            effective_n_jobs(jobs),
-            lambda run, chunks: _run_in_local_processes(run, chunks, store, jobs),
-        )
+        workers = effective_n_jobs(jobs)
+        yield workers, lambda run, chunks: _run_locally(run, chunks, store, jobs)
         return
     with _open_dask_client(cluster, jobs) as client:
         _check_worker_versions(client)
         workers = sum(client.nthreads().values())
-        yield RunExecutor(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
+        yield workers, lambda run, chunks: _run_on_cluster(run, chunks, client)
 
 
-def _run_in_local_processes(
-    run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int
-) -> Iterator[Chunk]:
+def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
     left = list(chunks)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
@@ -91,11 +76,9 @@ def _run_in_local_processes(
         except BrokenExecutor as error:
             suspicious = 1
             if not store.first_runs_of_chunks_started_at_least(suspicious):
-                raise DrakeTeleopError(
-                    f"processes ended before their first run ({error})",
-                    where="study",
-                    remedy="repeat with one job to see the cause",
-                ) from error
+                what = f"processes ended before their first run ({error})"
+                remedy = "repeat with one job to see the cause"
+                raise DrakeTeleopError(what, where="study", remedy=remedy) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 
 
@@ -156,9 +139,8 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
         import dask
         from distributed import Client
     except ImportError:
-        raise DrakeTeleopError(
-            "Dask is not installed", where="--cluster", remedy=remedy_to_install_extra("cluster")
-        ) from None
+        remedy = remedy_to_install_extra("cluster")
+        raise DrakeTeleopError("Dask is not installed", where="--cluster", remedy=remedy) from None
     local = {
         "n_workers": jobs if jobs > 0 else None,
         "threads_per_worker": 1,
@@ -174,28 +156,22 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
         try:
             client = Client(**local) if address == "local" else Client(address)
         except (OSError, ValueError) as error:
-            raise DrakeTeleopError(
-                f"no Dask scheduler answers at {address} ({error})",
-                where="--cluster",
-                remedy="start one, or check the address",
-            ) from None
+            what = f"no Dask scheduler answers at {address} ({error})"
+            remedy = "start one, or check the address"
+            raise DrakeTeleopError(what, where="--cluster", remedy=remedy) from None
         with client:
             yield client
 
 
-def _run_on_given_executor(
-    run: RunRows, chunks: Sequence[Chunk], executor: Executor
-) -> Iterator[Chunk]:
+def _run_on_executor(run: RunRows, chunks: Sequence[Chunk], executor: Executor) -> Iterator[Chunk]:
     futures = [executor.submit(run, chunk) for chunk in chunks]
     try:
         for future in as_completed(futures):
             yield future.result()
     except BrokenExecutor as error:
-        raise DrakeTeleopError(
-            f"ended before all runs were finished ({error})",
-            where="executor",
-            remedy="repeat the call with a new executor; finished runs are kept",
-        ) from error
+        what = f"ended before all runs were finished ({error})"
+        remedy = "repeat the call with a new executor; finished runs are kept"
+        raise DrakeTeleopError(what, where="executor", remedy=remedy) from error
     finally:
         for future in futures:
             future.cancel()

@@ -39,7 +39,7 @@ _RUN_SECONDS_KEY = "seconds"
 # waits at the end. The first chunks have one run, for early results and time estimates.
 _MAX_RUNS_PER_CHUNK = 8
 _TARGET_NUM_CHUNKS = 512
-_NUM_SINGLE_RUN_CHUNKS = 64
+_NUM_SINGLE_RUNS = 64
 # Number of latest runs for the estimate of the remaining time.
 _NUM_RUNS_FOR_TIME_ESTIMATE = 16
 
@@ -66,16 +66,13 @@ def run_study(
 
     part = None if shard is None else parse_shard(shard)
     if (part or merge) and study.design == "adaptive":
-        raise DrakeTeleopError(
-            "an adaptive design has no shards, because its points depend on earlier runs",
-            where="study",
-            remedy="use jobs, cluster or executor",
-        )
+        what = "an adaptive design has no shards, because its points depend on earlier runs"
+        raise DrakeTeleopError(what, where="study", remedy="use jobs, cluster or executor")
     points = study.points()
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
-    identity |= {"single_runs": _NUM_SINGLE_RUN_CHUNKS}  # chunks are identified by their first run
+    identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
     schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = _group_into_chunks(first_rows)
@@ -89,21 +86,19 @@ def run_study(
         try:
             with (
                 show_progress(progress) as stage,
-                open_executor(store, jobs, cluster, executor) as workers,
+                open_executor(store, jobs, cluster, executor) as (num_workers, run_chunks),
             ):
-                counter.start(stage("Study"), workers.num_workers)
+                counter.start(stage("Study"), num_workers)
                 new = points
                 while new:
                     finished = store.first_runs_of_finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
-                    for found in workers.run_chunks(run, left):
+                    for found in run_chunks(run, left):
                         columns = {name: [row.get(name) for row in found] for name in schema}
                         store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
-                    new = study.next_points(
-                        points, _mean_objective_of_points(study, store, len(points))
-                    )
+                    new = study.next_points(points, _mean_objectives(study, store, len(points)))
                     chunks = _group_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
@@ -116,14 +111,12 @@ def run_study(
 
 def _group_into_chunks(rows: Chunk) -> list[Chunk]:
     size = min(max(len(rows) // _TARGET_NUM_CHUNKS, 1), _MAX_RUNS_PER_CHUNK)
-    chunks = [[row] for row in rows[:_NUM_SINGLE_RUN_CHUNKS]]
-    chunks += [
-        rows[first : first + size] for first in range(_NUM_SINGLE_RUN_CHUNKS, len(rows), size)
-    ]
+    chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
+    chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     return chunks
 
 
-def _mean_objective_of_points(study: Study, store: Store, points: int) -> Array:
+def _mean_objectives(study: Study, store: Store, points: int) -> Array:
     if not study.objective:
         return np.empty(0)
     import polars as pl
@@ -135,7 +128,7 @@ def _mean_objective_of_points(study: Study, store: Store, points: int) -> Array:
 
 
 class StudyProgress:
-    """Progress of a study: number of finished runs and remaining time."""
+    """Finished runs and remaining time of a study."""
 
     def __init__(self, total: int) -> None:
         self.total, self.done, self._num_timed = total, 0, 0
@@ -149,7 +142,6 @@ class StudyProgress:
         self._report_progress()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs and their times."""
         self.done += len(rows)
         for row in rows:
             if _RUN_SECONDS_KEY in row:  # missing if the run ended its process
@@ -162,9 +154,8 @@ class StudyProgress:
         left, words = self.total - self.done, "the first runs begin"
         if self._recent:
             at_once = min(self._processes, left) or 1
-            words = (
-                f"about {_format_duration(float(np.median(self._recent)) * left / at_once)} left"
-            )
+            seconds = float(np.median(self._recent)) * left / at_once
+            words = f"about {_format_duration(seconds)} left"
         self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
 
 
@@ -173,9 +164,7 @@ def _format_duration(seconds: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
-def _run_chunk(
-    work: RunFunction, names: Sequence[str], rows: Sequence[dict[str, Any]]
-) -> list[dict[str, Any]]:
+def _run_chunk(work: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:
     found = []
     with one_blas_thread():
         for row in rows:

@@ -7,6 +7,7 @@ sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +46,7 @@ TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
 )
 """Criteria of each task; free reaching has no contact."""
 _ETA_STUDY_NAME = "scaling_object"
-_SIGMA_FIELD, _GAMMA_FIELD, _ETA_FIELD = (
-    f"force_scaling.{name}" for name in ("sigma", "gamma", "eta")
-)
+_SIGMA_KEY, _GAMMA_KEY, _ETA_KEY = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
 _NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
 _MAX_FAILED_RUN_SHARE, _MIN_SHARE_OF_DRAWS_AS_BEST = 0.05, 0.05
 
@@ -83,22 +82,16 @@ def scaling_study_command(
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
-    sigmas, gammas = _sigmas_and_gammas()
-    answers = {
-        selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
-    }
+    answers = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
-        "choice": {
-            selection: _find_best_scales(found, sigmas, gammas)
-            for selection, found in answers.items()
-        },
+        "choice": {selection: _find_best_scales(found) for selection, found in answers.items()},
         "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
     with output_folder(out, "answer.json"):
-        write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
-        write_picture(out / "answer.png", draw_criteria(rows, sigmas, gammas))
-        write_picture(out / "choice.png", draw_best_scales(answers, sigmas, gammas))
+        write_table(out / "answer.csv", _merit_table(answers))
+        write_picture(out / "answer.png", draw_criteria(rows))
+        write_picture(out / "choice.png", draw_best_scales(answers, *_sigmas_and_gammas()))
         write_json(out / "answer.json", summary)
     if not quiet:
         _print_best_scales(summary, out)
@@ -106,7 +99,10 @@ def scaling_study_command(
 
 
 def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
-    """Return merits, bootstrap intervals and failures for a selection of criteria."""
+    """Return merits, bootstrap intervals and failures for a selection of criteria.
+
+    `tables` [task][criterion or "success"] are arrays (s, g, seeds).
+    """
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
@@ -143,15 +139,16 @@ def _means_over_unscaled(table: Array, weights: Array) -> Array:
     return means / means[:, -1, _sigmas_and_gammas()[1].index(1.0), None, None]  # sigma = gamma = 1
 
 
+@cache
 def _sigmas_and_gammas() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
-    return factors[_SIGMA_FIELD], factors[_GAMMA_FIELD]
+    return factors[_SIGMA_KEY], factors[_GAMMA_KEY]
 
 
 def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _sigmas_and_gammas()
     seeds = rows["seed"].n_unique()
-    count = len(gammas) if _GAMMA_FIELD in rows.columns else 1
+    count = len(gammas) if _GAMMA_KEY in rows.columns else 1
     measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
     tables = {}
     for name, measure in measures.items():
@@ -163,11 +160,10 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _find_best_scales(
-    found: ScaleRating, sigmas: list[float], gammas: list[float]
-) -> dict[str, Any] | None:
+def _find_best_scales(found: ScaleRating) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
         return None
+    sigmas, gammas = _sigmas_and_gammas()
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
     near = np.argwhere(found.best_share >= _MIN_SHARE_OF_DRAWS_AS_BEST)
     return {
@@ -184,11 +180,10 @@ def _find_best_scales(
     }
 
 
-def _merit_table(
-    answers: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
-) -> pl.DataFrame:
+def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
     import polars as pl
 
+    sigmas, gammas = _sigmas_and_gammas()
     return pl.DataFrame(
         [
             {
@@ -208,10 +203,10 @@ def _merit_table(
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
-    etas = sorted(rows[_ETA_FIELD].unique().to_list())
+    etas = sorted(rows[_ETA_KEY].unique().to_list())
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
-        values = values_by_seed(rows, measure, by=_ETA_FIELD)
+        values = values_by_seed(rows, measure, by=_ETA_KEY)
         figures = *means_and_half_widths_over_seeds(values), effect_half_widths_over_seeds(values)
         names = (measure, f"{measure}_half", f"{measure}_effect_half")
         for row, at_eta in zip(table, np.column_stack(figures), strict=True):
@@ -219,9 +214,8 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     return table
 
 
-def draw_criteria(
-    rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
-) -> Figure:
+def draw_criteria(rows: dict[str, pl.DataFrame]) -> Figure:
+    sigmas, gammas = _sigmas_and_gammas()
     tasks = [task for task in TASK_CRITERIA if "force" in TASK_CRITERIA[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
@@ -253,14 +247,12 @@ def draw_best_scales(
     # The colour scale is symmetric about 1 in ratios; excluded points are grey.
     ends = 2.0**-farthest, 2.0**farthest
     scale = LogNorm(*ends)
-    colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
+    cmap = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(2, 2)
         for axes, (selection, found) in zip(grid.ravel(), answers.items(), strict=True):
-            drawn = axes.imshow(
-                found.merit, origin="lower", aspect="auto", cmap=colours, norm=scale
-            )
+            drawn = axes.imshow(found.merit, origin="lower", aspect="auto", cmap=cmap, norm=scale)
             axes.grid(False)
             axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas])
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])

@@ -32,26 +32,22 @@ class Shard(NamedTuple):
 
     def chunks(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         if self.total > len(chunks):
-            raise DrakeTeleopError(
-                f"the study has only {len(chunks)} chunks of runs (one for each shard)",
-                where=f"shard {self.number}/{self.total}",
-                remedy=f"give at most {len(chunks)} shards",
-            )
+            what = f"the study has only {len(chunks)} chunks of runs (one for each shard)"
+            remedy = f"give at most {len(chunks)} shards"
+            raise DrakeTeleopError(what, where=f"shard {self.number}/{self.total}", remedy=remedy)
         return list(chunks[self.number - 1 :: self.total])
 
 
 def parse_shard(text: str) -> Shard:
-    """Return the shard of a text such as "3/8"."""
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
     if not found or not 1 <= int(found[1]) <= int(found[2]):
-        raise DrakeTeleopError(
-            f"{text!r} is not K/N with 1 <= K <= N", where="shard", remedy="give one, such as 3/8"
-        )
+        what = f"{text!r} is not K/N with 1 <= K <= N"
+        raise DrakeTeleopError(what, where="shard", remedy="give one, such as 3/8")
     return Shard(int(found[1]), int(found[2]))
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Add the result files of all shards in `out` to its table, by hard links."""
+    """Link the result files of all shards in `out` into its table; raise if runs are missing."""
     names = [_SHARD_FOLDER_PATTERN.fullmatch(path.name) for path in (out / "shards").glob("*")]
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:
@@ -70,11 +66,9 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         listed = ",".join(map(str, numbers[:_MAX_SHARDS_IN_MESSAGE]))
         more = ",..." if len(numbers) > _MAX_SHARDS_IN_MESSAGE else ""
         runs = sum(len(chunks[k]) for k in missing)
-        raise DrakeTeleopError(
-            f"{runs} of {sum(map(len, chunks))} runs are missing",
-            where=str(out),
-            remedy=f"run shards {listed}{more} of {count} again, then merge",
-        )
+        what = f"{runs} of {sum(map(len, chunks))} runs are missing"
+        remedy = f"run shards {listed}{more} of {count} again, then merge"
+        raise DrakeTeleopError(what, where=str(out), remedy=remedy)
 
 
 def _link_or_copy_file(part: Path, path: Path, temporary_base: Path) -> None:

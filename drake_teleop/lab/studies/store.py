@@ -31,11 +31,9 @@ class Store:
     folder: Path
 
     def first_runs_of_finished_chunks(self) -> set[int]:
-        """Return the first run of each stored chunk."""
         return set(map(_first_run_of_part, self.part_files()))
 
     def part_files(self) -> list[Path]:
-        """Return the files of the stored chunks, sorted by run."""
         return sorted(self.folder.glob(_PART_FILE_NAME.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
@@ -46,12 +44,10 @@ class Store:
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        write_table(
-            self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, temporary_base=self.folder
-        )
+        path = self.folder / _PART_FILE_NAME.format(rows["run"][0])
+        write_table(path, rows, temporary_base=self.folder)
 
     def count_chunk_start(self, first_run: int) -> None:
-        """Count one more start of the chunk that starts with `first_run`."""
         path = self._start_counts_folder / str(first_run)
         with wrap_write_errors(path):
             self._start_counts_folder.mkdir(exist_ok=True)
@@ -62,7 +58,6 @@ class Store:
         (self._start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
     def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
-        """Return the first runs of unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
@@ -71,7 +66,6 @@ class Store:
         return self.folder.with_name("running")
 
     def read(self) -> pl.DataFrame:
-        """Return all rows, sorted by run."""
         import polars as pl
 
         remedy = "remove the damaged part and repeat the command"
@@ -121,9 +115,8 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise DrakeTeleopError(
-                "is in use by another process", where=str(out), remedy="wait for it, or stop it"
-            ) from None
+            what = "is in use by another process"
+            raise DrakeTeleopError(what, where=str(out), remedy="wait for it, or stop it") from None
         write_or_check_identity(out, identity)
         yield
     finally:
@@ -137,8 +130,6 @@ def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:
     if not path.exists():
         write_text(path, text)
     elif path.read_bytes() != text.encode():
-        raise DrakeTeleopError(
-            "contains runs of another study, or of another version of this one",
-            where=str(out),
-            remedy="give another folder, or remove this one",
-        )
+        what = "contains runs of another study, or of another version of this one"
+        remedy = "give another folder, or remove this one"
+        raise DrakeTeleopError(what, where=str(out), remedy=remedy)

@@ -42,7 +42,6 @@ class StationRunFunction:
     Args:
         scenario_data: content of the base scenario's file.
         scenario_file: name of that file, for messages.
-        measures: names of the measures.
         force_threshold_N: force [N] of time_above_force_s.
     """
 
@@ -53,9 +52,7 @@ class StationRunFunction:
 
     def scenario(self, values: FactorValues, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(
-            _set_scenario_fields(self.scenario_data, changes), self.scenario_file
-        )
+        return ScenarioFromData(_set_fields(self.scenario_data, changes), self.scenario_file)
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
@@ -91,11 +88,8 @@ def study_command(
         ("cluster", "executor", cluster and executor is not None),
     ):
         if both:
-            raise DrakeTeleopError(
-                f"the options {first} and {second} cannot be combined",
-                where="study",
-                remedy="remove one of them",
-            )
+            what = f"the options {first} and {second} cannot be combined"
+            raise DrakeTeleopError(what, where="study", remedy="remove one of them")
     study, path = LoadStudy(path), find_shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_num_runs(str(path), yes)
@@ -107,7 +101,7 @@ def study_command(
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
-            changed = _set_scenario_fields(packages, {factor.field: value})
+            changed = _set_fields(packages, {factor.field: value})
             place = f"{path}:factors[{index}]"
             config = settings_without_range_check(Scenario, changed, place)
             check_all_field_values(config, place)
@@ -141,7 +135,7 @@ def LoadStudy(path: str | Path) -> Study:
     return study
 
 
-def _set_scenario_fields(data: Any, changes: dict[str, Any]) -> Any:
+def _set_fields(data: Any, changes: dict[str, Any]) -> Any:
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")

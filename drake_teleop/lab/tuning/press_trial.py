@@ -67,6 +67,7 @@ class TunedSettings:
     low_pass_hz: float
 
     def passivity(self, stated: StatedSet) -> PassivityConfig:
+        """Return the method's settings; `charged_tdpa` assumes the firmest stated hand."""
         hand = GRIP_IMPEDANCES[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
@@ -76,14 +77,8 @@ class TunedSettings:
         sensor = base.wrist_sensor
         if not sensor.ideal:
             sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
-        scaling = dataclasses.replace(
-            base.force_scaling,
-            sigma=0.0,
-            eta=None,
-            gamma=self.gamma,
-            sigma_weight=0.0,
-            sigma_inertia=self.sigma_inertia,
-        )
+        scaling = dataclasses.replace(base.force_scaling, sigma=0.0, eta=None, sigma_weight=0.0)
+        scaling = dataclasses.replace(scaling, gamma=self.gamma, sigma_inertia=self.sigma_inertia)
         return replace(
             base, wrist_sensor=sensor, force_scaling=scaling, passivity=self.passivity(stated)
         )
@@ -101,7 +96,7 @@ class StationPressTrial:
     Args:
         user_scenario: scenario of the user, with its own passivity and scales.
         base_scenario: the same without environment, task and passivity method.
-        load_estimate: (16,) load estimate.
+        load_estimate: (16,) [offsets, phi].
     """
 
     user_scenario: Scenario
@@ -117,13 +112,9 @@ class StationPressTrial:
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base_scenario.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
+        depth = renderable_press_depth(self.base_scenario, grip)
         setup, _ = delayed_contact(
-            scenario,
-            channel,
-            scenario.passivity,
-            wall,
-            task=task,
-            depth=renderable_press_depth(self.base_scenario, grip),
+            scenario, channel, scenario.passivity, wall, task=task, depth=depth
         )
         setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
@@ -183,7 +174,7 @@ class OneAxisGammaSearch:
             for corner in self.stated_set.corners:
                 found = self.share_in_one_axis(axis, settings, gamma, *corner, seed)
                 share = min(share, found)
-                if not is_rendered_share_accepted(found, MAX_TUNED_FORCE_ERROR):
+                if not is_share_accepted(found, MAX_TUNED_FORCE_ERROR):
                     return -1.0
             shares[gamma] = share
             return 1.0
@@ -191,11 +182,9 @@ class OneAxisGammaSearch:
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
         if stability_sign(high) < 0:
-            limit = (
-                bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
-                if stability_sign(low) > 0
-                else -np.inf
-            )
+            limit = -np.inf
+            if stability_sign(low) > 0:
+                limit = bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
         gamma = max((g for g in shares if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
@@ -220,30 +209,20 @@ class OneAxisGammaSearch:
         wall: float,
         seed: int,
     ) -> float:
-        """Return the rendered share of the contact force; 0: unstable."""
+        """Return the rendered share of the contact force; 0: unstable or too noisy at rest."""
         forward, backward = self.base_scenario.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
-        shown = {
-            entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
-        }
+        shown = {f.name: getattr(axis, f.name) for f in dataclasses.fields(AxisParameters)}
         model = OneDof(**shown | {
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = (
-            0.0
-            if self.base_scenario.wrist_sensor.ideal
-            else _FILTER_DELAY_CYCLES / settings.low_pass_hz
-        )
+        ideal = self.base_scenario.wrist_sensor.ideal
+        added = 0.0 if ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
-        run = run_one_dof(
-            model,
-            settings.passivity(self.stated_set),
-            forward,
-            dataclasses.replace(backward, delay=backward.delay + added),
-            seed=seed,
-            intent=operator_intent(task),
-        )
+        passivity, intent = settings.passivity(self.stated_set), operator_intent(task)
+        filtered = dataclasses.replace(backward, delay=backward.delay + added)
+        run = run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
         force, period = run.hand_force[hold], run.t[1] - run.t[0]
@@ -251,8 +230,7 @@ class OneAxisGammaSearch:
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
-def is_rendered_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
-    """Return whether a rendered share of the scaled contact force is accepted."""
+def is_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     return abs(share - 1.0) <= max_error
 
 
@@ -273,14 +251,14 @@ def short_press_task(round_trip: float) -> Task:
 
 
 def renderable_press_depth(base: Scenario, grip: str) -> float:
-    """Return the displacement [m] into a wall that the device can render to the grip."""
+    """Return the hand's displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
     return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
 def rms_above_hz(x: Array, period: float, frequency: float) -> float:
-    """Return the rms of the part of x (N,) above a frequency [Hz]; infinite for invalid x."""
+    """Return the rms of x (N,) above a frequency [Hz], without parabola; inf for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

@@ -7,7 +7,7 @@ its softest and stiffest wall and between them, with several seeds.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
-    is_rendered_share_accepted,
+    is_share_accepted,
     settings_from_values,
 )
 
@@ -43,9 +43,8 @@ BEYOND_MARGIN_FACTOR = 1.2
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
-_GAMMA_STEP_ABOUT_NOISE_LIMIT = (
-    1.03  # gamma fails and holds by so much above and below that of accepted noise
-)
+# Gamma fails and holds by this factor above and below that of accepted noise.
+_GAMMA_STEP_ABOUT_NOISE_LIMIT = 1.03
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -76,16 +75,10 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
-    given = execute(
-        "as_given",
-        _study_of_settings(TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
-        trial,
-    )
-    quiet = execute(
-        "noise",
-        _study_of_settings(TunedSettings("ledger", 1.0, 0.0, own), ends, [stiffest]),
-        trial,
-    )
+    unscaled = TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
+    given = execute("as_given", _study_of_settings(unscaled, ends, [stiffest]), trial)
+    unscaled = dataclasses.replace(unscaled, method="ledger")
+    quiet = execute("noise", _study_of_settings(unscaled, ends, [stiffest]), trial)
     noise = max(1e-9, *(row["rest_force_N"] for row in quiet))  # N at gamma = 1
     low_passes = [own]
     if not base.wrist_sensor.ideal:
@@ -111,17 +104,15 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
+        gamma, inside = _find_station_gamma(settings_from_values(row), trial, execute)
         if inside:
             chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
-        raise DrakeTeleopError(
-            "no settings were stable for all given hands and walls",
-            where="tune",
-            remedy="state firmer hands, softer walls or a faster network",
-        )
+        what = "no settings were stable for all given hands and walls"
+        remedy = "state firmer hands, softer walls or a faster network"
+        raise DrakeTeleopError(what, where="tune", remedy=remedy)
     _, chosen, inside = found[0]
     larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
     beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
@@ -130,7 +121,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     return SearchResult(chosen, search, given, inside, beyond)
 
 
-def _find_gamma_limit_in_station(
+def _find_station_gamma(
     settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
@@ -143,9 +134,7 @@ def _find_gamma_limit_in_station(
     inside: list[Row] = []
     while gamma >= smallest:
         rows: list[Row] = []
-        for seed, (factor, hands, walls) in enumerate(
-            trial.stated_set.tested_gamma_factors_grips_and_walls
-        ):
+        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
             tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
             rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
@@ -166,14 +155,10 @@ def _find_gamma_limit_in_station(
     return stable, inside
 
 
-def meets_requirements(
-    row: Mapping[str, Any], max_force_error: float = MAX_RENDERED_FORCE_ERROR
-) -> bool:
+def meets_requirements(row: Row, max_force_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
-    return bool(
-        row["rests"] and quiet and is_rendered_share_accepted(row["share"], max_force_error)
-    )
+    return bool(row["rests"] and quiet and is_share_accepted(row["share"], max_force_error))
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
@@ -198,10 +183,8 @@ def _add_predicted_threshold(
     row: Row, trial: StationPressTrial, noise_N_by_low_pass_hz: dict[float, float]
 ) -> Row:
     gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
-    human, scale = (
-        trial.base_scenario.operator.perception,
-        trial.base_scenario.force_scaling.force_scale,
-    )
+    human = trial.base_scenario.operator.perception
+    scale = trial.base_scenario.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noise_N_by_low_pass_hz[row["low_pass_hz"]] * gamma

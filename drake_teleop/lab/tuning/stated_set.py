@@ -64,7 +64,7 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def tested_gamma_factors_grips_and_walls(self) -> list[tuple[float, list[str], list[float]]]:
+    def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
         """Factor of gamma, grips and walls of each part of the tests; each has its own seed.
 
         The softest grip fails first: it is tested twice. The last part has no margin.
@@ -95,15 +95,11 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
     limits = f"{_MIN_WALL_N_M / 1e3:g} to {_MAX_WALL_N_M / 1e3:g} kN/m"
     for wall in walls:
         if not (math.isfinite(wall) and _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M):
-            raise DrakeTeleopError(
-                f"{wall:g} kN/m is outside {limits}",
-                where="walls",
-                remedy="give stiffnesses in kN/m",
-            )
+            what = f"{wall:g} kN/m is outside {limits}"
+            raise DrakeTeleopError(what, where="walls", remedy="give stiffnesses in kN/m")
     if not walls:
-        raise DrakeTeleopError(
-            "no wall stiffness is given", where="walls", remedy="give kN/m, such as 0.5,20"
-        )
+        remedy = "give kN/m, such as 0.5,20"
+        raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
     grips = list(GRIP_IMPEDANCES)
     places = sorted(map(grips.index, hands))
     return StatedSet(

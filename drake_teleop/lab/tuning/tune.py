@@ -96,11 +96,9 @@ def tune(
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
         write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
+        url = png_data_url(out / "trade_off.png")
         page = render_page(
-            "drake_teleop.lab.tuning",
-            "report.html.j2",
-            summary=summary,
-            picture=png_data_url(out / "trade_off.png"),
+            "drake_teleop.lab.tuning", "report.html.j2", summary=summary, picture=url
         )
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
@@ -120,14 +118,13 @@ def _make_tuning_summary(
     failed = [row for row in found.beyond_runs if not meets_requirements(row)]
     shares = [row["share"] for row in found.inside_runs]
     edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
+    holds = all(map(meets_requirements, found.given_runs))
     worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
         "share": min(shares),
         "largest_share": max(shares),
         "threshold_N": max(row["threshold_N"] for row in edge),
-        "given_threshold_N": worst_given
-        if all(map(meets_requirements, found.given_runs))
-        else None,
+        "given_threshold_N": worst_given if holds else None,
         "rest_force_N": max(row["rest_force_N"] for row in edge),
         "margin": stated.requirements.loop_gain_margin,
         "fails_at": {
@@ -197,15 +194,10 @@ def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
         axes = figure.subplots()
-        margins = np.geomspace(1.0, 4.0, 50)
-        for colour, method in zip(
-            COLOURS, dict.fromkeys(r["method"] for r in found.searched_settings), strict=False
-        ):
-            rows = [
-                r
-                for r in found.searched_settings
-                if r["method"] == method and r["gamma_limit"] > 0.0
-            ]
+        margins, searched = np.geomspace(1.0, 4.0, 50), found.searched_settings
+        methods = dict.fromkeys(row["method"] for row in searched)
+        for colour, method in zip(COLOURS, methods, strict=False):
+            rows = [r for r in searched if r["method"] == method and r["gamma_limit"] > 0.0]
             if not rows:
                 continue
             best = min(rows, key=lambda row: float(row["threshold_N"]))

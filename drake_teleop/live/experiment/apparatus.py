@@ -33,13 +33,15 @@ _MAX_SLOT_FLOOR_DISTANCE_M, _MIN_SLOT_FLOOR_TIME_S = 2e-3, 0.2
 
 
 def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
-    """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task and condition; `load_mass_at_hand`: perceived mass at load scale 1 [kg]."""
+    """Station of a task and condition.
+
+    `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1.
+    """
 
     task: Task
     condition: Condition
@@ -47,7 +49,7 @@ class Apparatus:
     load: IdentifiedLoad | None
     load_mass_at_hand: float
 
-    def stimulus_scales_percent(self, level: float, contact_force: float) -> dict[str, int]:
+    def stimulus_scales(self, level: float, contact_force: float) -> dict[str, int]:
         """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
 
         `level` is the rendered force [N] or mass [kg], `contact_force` the expected one [N].
@@ -67,12 +69,14 @@ class Apparatus:
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval; `target`: intended level (0: no stimulus)."""
+        """Return the result of an interval with the intended level `target` (0: no stimulus).
+
+        `inputs` are its `stimulus_scales`.
+        """
         force = rows.largest_mean_contact_force()
         if isinstance(self.task, PegInSlot):
-            return IntervalResult(
-                force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
-            )
+            time_s = rows.done_at or rows.time
+            return IntervalResult(force_N=force, done=rows.done_at > 0.0, time_s=time_s)
         if isinstance(self.task, ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
             return IntervalResult(level if target else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
@@ -93,18 +97,16 @@ def make_apparatus(
     if condition.method != AS_IN_SCENARIO:
         changes["passivity__method"] = condition.method
     setup = replace(setup, contact_detection=None, **changes)
-    empty = NominalSlave(setup.slave).arm.phi_load[0]
+    mass = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
-        with_object = chosen_scenario(
-            setup, load, Inputs.from_scenario(setup).with_changes({"object": 1})
-        )
+        inputs = Inputs.from_scenario(setup).with_changes({"object": 1})
+        with_object = chosen_scenario(setup, load, inputs)
         estimate = adapt_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
         setup = with_object
     setup.check()
-    mass = empty
     if condition.eta is not None:
         mass = setup.slave.payload.mass
     at_hand = setup.force_scaling.force_scale * setup.kinematic_scaling.translation_scale
@@ -152,7 +154,10 @@ class IntervalLog:
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def largest_rendered_force_change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N] since `after` [s]."""
+        """Return the largest 20 ms mean of the rendered force's change [N] after time `after` [s].
+
+        The reference is the mean force of the 0.1 s before.
+        """
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)
         rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)

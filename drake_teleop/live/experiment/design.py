@@ -129,41 +129,32 @@ class Experiment:
         check_all_field_values(self, where)
         for name in ("tasks", "conditions"):
             if not getattr(self, name):
-                raise DrakeTeleopError(
-                    "is empty", where=f"{where}:{name}", remedy="add at least one"
-                )
+                remedy = "add at least one"
+                raise DrakeTeleopError("is empty", where=f"{where}:{name}", remedy=remedy)
         kinds = [type(task).__name__ for task in self.tasks]
         for kind in kinds:
             if kinds.count(kind) > 1:
-                raise DrakeTeleopError(
-                    f"the task !{kind} is listed twice", where=f"{where}:tasks", remedy="remove one"
-                )
+                what = f"the task !{kind} is listed twice"
+                raise DrakeTeleopError(what, where=f"{where}:tasks", remedy="remove one")
         for index, task in enumerate(self.tasks):
             if not isinstance(task, PegInSlot) and not 2.0 * task.low <= task.high:
-                raise DrakeTeleopError(
-                    f"{task.high:g} is less than twice low, {task.low:g}: the range is too small",
-                    where=f"{where}:tasks[{index}].high",
-                    remedy="increase high, so that the range contains the threshold",
-                )
+                what = f"{task.high:g} is less than twice low, {task.low:g}: the range is too small"
+                remedy = "increase high, so that the range contains the threshold"
+                raise DrakeTeleopError(what, where=f"{where}:tasks[{index}].high", remedy=remedy)
         names = [condition.name for condition in self.conditions]
         for index, condition in enumerate(self.conditions):
             place = f"{where}:conditions[{index}]"
             if not condition.name or condition.name in names[:index]:
-                raise DrakeTeleopError(
-                    f"{condition.name!r} is empty, or the name of an earlier condition",
-                    where=f"{place}.name",
-                    remedy="give each condition its own name",
-                )
+                what = f"{condition.name!r} is empty, or the name of an earlier condition"
+                remedy = "give each condition its own name"
+                raise DrakeTeleopError(what, where=f"{place}.name", remedy=remedy)
             if condition.eta is not None and condition.sigma != 0.0:
-                raise DrakeTeleopError(
-                    "cannot be combined with sigma > 0", where=f"{place}.eta", remedy="set sigma: 0"
-                )
+                what = "cannot be combined with sigma > 0"
+                raise DrakeTeleopError(what, where=f"{place}.eta", remedy="set sigma: 0")
             if condition.delay is not None and condition.network != AS_IN_SCENARIO:
-                raise DrakeTeleopError(
-                    f"cannot be combined with network {condition.network!r}",
-                    where=f"{place}.delay",
-                    remedy="remove delay or network",
-                )
+                what = f"cannot be combined with network {condition.network!r}"
+                remedy = "remove delay or network"
+                raise DrakeTeleopError(what, where=f"{place}.delay", remedy=remedy)
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
@@ -181,11 +172,9 @@ def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
     scenario = LoadScenario(task.scenario if known else path.parent / task.scenario)
     place = f"{path}:tasks[{index}].scenario"
     if isinstance(task, PegInSlot) and not isinstance(scenario.operator.task, Insert):
-        raise DrakeTeleopError(
-            f"{task.scenario} has no slot", where=place, remedy="give its operator a task !Insert"
-        )
+        remedy = "give its operator a task !Insert"
+        raise DrakeTeleopError(f"{task.scenario} has no slot", where=place, remedy=remedy)
     if isinstance(task, ContactDetection) and scenario.surroundings is None:
-        raise DrakeTeleopError(
-            f"{task.scenario} has no object to touch", where=place, remedy="use one such as touch"
-        )
+        what = f"{task.scenario} has no object to touch"
+        raise DrakeTeleopError(what, where=place, remedy="use one such as touch")
     return scenario

@@ -28,16 +28,10 @@ _SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_BLANK_FRAME_VALUES = {
-    "contact": False,
-    "energy": [0.0, 0.0],
-    "words": [],
-    "record": "",
-    "scene": "own",
-}
+_BLANK_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
 
 #: Names of the inputs that move the hand.
-HAND_INPUT_NAMES_OF_PARTICIPANT = ("x", "y", "z", "rx", "ry", "rz", "clutch")
+PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 class GuidedExperiment:
@@ -72,7 +66,7 @@ class GuidedExperiment:
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
         self._rows = IntervalLog(self._apparatus.scenario, insert)
-        self._stimulus = self._apparatus.stimulus_scales_percent(
+        self._stimulus = self._apparatus.stimulus_scales(
             procedure.current_level, procedure.expected_contact_force
         )
         name = f"{procedure.trial_number:04}-{procedure.interval}"
@@ -169,12 +163,11 @@ class GuidedExperiment:
 
     @property
     def stopped(self) -> str:
-        """Failure that stops the simulation, or ""."""
         return self._live.stopped
 
     @property
     def ms(self) -> int:
-        """Simulated time since the present interval of the trial began [ms]."""
+        """Simulated time of the present interval [ms]."""
         return self._live.ms
 
     @property
@@ -204,9 +197,8 @@ class GuidedExperiment:
         if live.ms < 1e3 * length and not (slot and self._rows.done_at):
             return
         live.frame()
-        result = self._apparatus.interval_result(
-            self._procedure.current_level, self._stimulus, self._rows
-        )
+        level = self._procedure.current_level
+        result = self._apparatus.interval_result(level, self._stimulus, self._rows)
         result = dataclasses.replace(result, lost_s=live.pace.lost_time_s)
         self._procedure.finish_interval(result)
         self._since = self._frame_due = now
@@ -220,12 +212,13 @@ class GuidedExperiment:
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
         plain = Inputs()
         inputs = {name: getattr(plain, name) for name in INPUT_RANGES}
-        inputs |= {name: inner["inputs"][name] for name in HAND_INPUT_NAMES_OF_PARTICIPANT}
+        inputs |= {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
             **_BLANK_FRAME_VALUES,
             "f": [rendered] * 3,
+            "scene": "own",
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,
             "drive": self._intervals,
@@ -241,25 +234,11 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of the experiment's page, or None."""
+    """Return the valid requests that participants may make, or None."""
     message = parse_message(text) or {}
-    found: dict[str, Any] = {}
+    found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:
         found[kind] = {
-            name: value
-            for name, value in message[kind].items()
-            if name in HAND_INPUT_NAMES_OF_PARTICIPANT
+            name: value for name, value in message[kind].items() if name in PARTICIPANT_INPUTS
         }
-    if "drive" in message:
-        found["drive"] = True
-    try:
-        whole = json.loads(text) if isinstance(text, str) and len(text) < 100 else None
-    except (ValueError, RecursionError):
-        whole = None
-    if isinstance(whole, dict):
-        if whole.get("go") is True:
-            found["go"] = True
-        answer = whole.get("answer")
-        if isinstance(answer, int) and not isinstance(answer, bool) and answer in (1, 2):
-            found["answer"] = answer
     return found or None

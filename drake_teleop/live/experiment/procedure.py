@@ -19,7 +19,7 @@ FEEDBACK_PHASE, BREAK_PHASE, END_PHASE = "told", "break", "end"
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """Planned trial; `signal_interval` (1 or 2) has the stimulus; 0 for the peg task."""
+    """Planned trial: indices of task and condition, interval (1, 2) of the stimulus; 0: peg."""
 
     task: int
     condition: int
@@ -110,7 +110,7 @@ class Procedure:
 
     @property
     def expected_contact_force(self) -> float:
-        """Median of the participant's contact forces up to now [N]."""
+        """Median of the participant's contact forces up to now [N]; at first `pressed`."""
         task = self.task
         if self._pressed:
             return float(np.median(self._pressed))

@@ -46,20 +46,14 @@ class PsiMethod:
         self._thresholds = np.geomspace(
             low / _MAX_THRESHOLD_OVER_LEVEL, high * _MAX_THRESHOLD_OVER_LEVEL, _NUM_GRID_THRESHOLDS
         )
-        self._grid = tuple(
-            np.meshgrid(
-                self._thresholds, _GRID_SLOPES, _GRID_LAPSE_RATES, indexing="ij", sparse=True
-            )
-        )
+        self._grid = np.ix_(self._thresholds, _GRID_SLOPES, _GRID_LAPSE_RATES)
         shape = (_NUM_GRID_THRESHOLDS, len(_GRID_SLOPES), len(_GRID_LAPSE_RATES))
         self._posterior = np.full(shape, 1.0 / math.prod(shape))
         # P(correct) as (levels, thresholds, slopes and lapses).
-        self._p_correct = np.stack(
-            [self._grid_correct_probability(x).reshape(shape) for x in self.levels]
-        )
-        self._p_correct = self._p_correct.reshape(_NUM_STIMULUS_LEVELS, _NUM_GRID_THRESHOLDS, -1)
+        p_correct = np.stack([self._grid_probability(x) for x in self.levels])
+        self._p_correct = p_correct.reshape(_NUM_STIMULUS_LEVELS, _NUM_GRID_THRESHOLDS, -1)
 
-    def _grid_correct_probability(self, level: float) -> Array:
+    def _grid_probability(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
@@ -75,11 +69,12 @@ class PsiMethod:
         return float(self.levels[np.argmin(lost)])
 
     def update_posterior(self, level: float, correct: bool) -> None:
-        p = self._grid_correct_probability(level)
+        p = self._grid_probability(level)
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 
     def threshold(self) -> EstimateWithLimits:
+        """Return the posterior median of the level with d' = 1."""
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
@@ -89,7 +84,7 @@ class PsiMethod:
         return EstimateWithLimits(float(value), float(low), float(high))
 
     def estimate_d_prime(self, level: float) -> EstimateWithLimits:
-        """Return the estimated sensitivity d' at a level."""
+        """Return the posterior median of the sensitivity d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)

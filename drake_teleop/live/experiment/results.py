@@ -29,7 +29,7 @@ _DONE_SHARE_QUANTITY = "share of trials done"
 
 
 class ResultRow(NamedTuple):
-    """Row of the result table: a quantity with its 95 % interval. Participant 0 is the mean."""
+    """Row of the result table: a quantity with its 95 % interval; participant 0: the mean."""
 
     task: str
     condition: str
@@ -57,9 +57,8 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    over = _geometric_or_share_mean_with_interval(
-                        [r.value for r in one], share=quantity == _DONE_SHARE_QUANTITY
-                    )
+                    values, share = [r.value for r in one], quantity == _DONE_SHARE_QUANTITY
+                    over = _mean_with_interval(values, share=share)
                     trials = sum(r.trials for r in one)
                     found.append(ResultRow(kind, condition.name, 0, trials, quantity, *over))
     return found
@@ -76,26 +75,21 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
         interval = share.proportion_ci(method="wilson")
         found = {_DONE_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
         if done:
-            found["time to the floor [s]"] = _geometric_or_share_mean_with_interval(
-                [row.time_s for row in done]
-            )
-            found["largest contact force [N]"] = _geometric_or_share_mean_with_interval(
-                [row.force_N for row in done]
-            )
+            found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
+            found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
         return found
     psi = PsiMethod(task.low, task.high)
     for row in rows:
         psi.update_posterior(row.level, bool(row.correct))
     middle = math.sqrt(task.low * task.high)
-    mass = isinstance(task, ApparentMass)
-    unit = "kg" if mass else "N"
-    name = "threshold of mass [kg at the hand]" if mass else "threshold of contact [N at the tool]"
+    unit, name = "N", "threshold of contact [N at the tool]"
+    if isinstance(task, ApparentMass):
+        unit, name = "kg", "threshold of mass [kg at the hand]"
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.estimate_d_prime(middle)}
 
 
-def _geometric_or_share_mean_with_interval(
-    values: Sequence[float], *, share: bool = False
-) -> EstimateWithLimits:
+def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> EstimateWithLimits:
+    """Return the geometric mean, or for shares the arithmetic mean, with Student's interval."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
@@ -122,9 +116,8 @@ def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:
 def _write_picture(path: Path, experiment: Experiment, found: list[ResultRow]) -> None:
     from drake_teleop.common.style import Picture, plot_style
 
-    shown = [
-        quantity for quantity in _DRAWN_QUANTITIES if any(r.quantity == quantity for r in found)
-    ]
+    quantities = {r.quantity for r in found}
+    shown = [quantity for quantity in _DRAWN_QUANTITIES if quantity in quantities]
     if not shown:
         return
     names = [condition.name for condition in experiment.conditions]

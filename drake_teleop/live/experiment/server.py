@@ -12,16 +12,16 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment
 from drake_teleop.live.experiment.guided import GuidedExperiment
 from drake_teleop.live.experiment.procedure import Procedure
-from drake_teleop.live.experiment.simulated import make_apparatus_by_task_and_condition
+from drake_teleop.live.experiment.simulated import make_apparatuses
 from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_task_space_device
-from drake_teleop.live.server import LiveDrive, compile_session_functions, start_condition_text
+from drake_teleop.live.server import LiveDrive, compile_slice_functions, start_condition_text
 from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """Live session of one participant's experiment, with its server."""
+    """Live session of one participant, with its server."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class ExperimentDrive(LiveDrive):
     ) -> None:
         if device is not None:
             scenarios = [with_task_space_device(scenario) for scenario in scenarios]
-        self._stations = make_apparatus_by_task_and_condition(experiment, scenarios)
+        self._stations = make_apparatuses(experiment, scenarios)
         self.procedure = Procedure(experiment, participant, store)
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
@@ -44,7 +44,7 @@ class ExperimentDrive(LiveDrive):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
         first = self._stations[0, 0]
-        compile_session_functions(first.scenario, first.load, device)
+        compile_slice_functions(first.scenario, first.load, device)
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link
@@ -53,10 +53,8 @@ class ExperimentDrive(LiveDrive):
         return GuidedExperiment(*setup, time.perf_counter(), link)
 
     def _page_html(self) -> str:
-        panel = (
-            resources.files("drake_teleop.live.experiment").joinpath("page.html").read_text("utf-8")
-        )
-        return super()._page_html().replace("</body>", panel + "</body>")
+        panel = resources.files("drake_teleop.live.experiment") / "page.html"
+        return super()._page_html().replace("</body>", panel.read_text("utf-8") + "</body>")
 
 
 def serve_experiment(
@@ -69,7 +67,6 @@ def serve_experiment(
     browser: bool,
     device: str | None,
 ) -> None:
-    """Serve the page of an experiment until Ctrl-C or SIGTERM."""
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:
         webbrowser.open(live.url)
@@ -81,11 +78,8 @@ def serve_experiment(
     done, trials = live.procedure.trial_number, len(live.procedure.trials)
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
-        raise DrakeTeleopError(
-            f"the simulation has stopped: {live.ended}; {what}",
-            where="drive",
-            remedy="run the same command again to continue",
-        )
+        what = f"the simulation has stopped: {live.ended}; {what}"
+        raise DrakeTeleopError(what, where="drive", remedy="run the same command again to continue")
     if done < trials:
         raise KeyboardInterrupt(f"{reason}: {what}; run the same command again to continue")
     print(f"\nended by {reason}: {what}")

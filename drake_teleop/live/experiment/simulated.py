@@ -34,14 +34,14 @@ from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
-from drake_teleop.station.task_measures import task_measures, true_contact_force_magnitudes
+from drake_teleop.station.task_measures import task_measures
 
 # Start of the hand's motion [s].
 _HAND_MOTION_START_S = 0.4
 _LOG_READ_PERIOD_MS = 200
 
 
-def make_apparatus_by_task_and_condition(
+def make_apparatuses(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
@@ -53,7 +53,6 @@ def make_apparatus_by_task_and_condition(
 
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """Return the scenario with the random seed of the present interval."""
     number = 2 * procedure.trial_number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -74,7 +73,7 @@ def simulate_participant(
         if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                result = _run_peg_insertion(apparatus, scenarios[procedure.trial.task], procedure)
+                result = _insert_peg(apparatus, scenarios[procedure.trial.task], procedure)
             else:
                 result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
@@ -106,9 +105,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.stimulus_scales_percent(
-        procedure.current_level, procedure.expected_contact_force
-    )
+    stimulus = apparatus.stimulus_scales(procedure.current_level, procedure.expected_contact_force)
     rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _HAND_MOTION_START_S
     while session.ms < 1e3 * task.interval:
@@ -126,21 +123,18 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
             rows.add_rows(session.new_rows())
     rows.add_rows(session.new_rows())
     session.close()
-    return apparatus.interval_result(
-        procedure.current_level, stimulus, rows
-    ), rows.largest_rendered_force_change(_HAND_MOTION_START_S)
+    result = apparatus.interval_result(procedure.current_level, stimulus, rows)
+    return result, rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _run_peg_insertion(
-    apparatus: Apparatus, task_scenario: Scenario, procedure: Procedure
-) -> IntervalResult:
+def _insert_peg(apparatus: Apparatus, base: Scenario, procedure: Procedure) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
-    assert isinstance(task, PegInSlot) and isinstance(task_scenario.operator.task, Insert)
+    assert isinstance(task, PegInSlot) and isinstance(base.operator.task, Insert)
     scenario = replace(
         with_interval_seed(apparatus.scenario, procedure),
-        operator__task=task_scenario.operator.task,
+        operator__task=base.operator.task,
         simulation__duration=task.timeout,
-        simulation__settle=task_scenario.simulation.settle,
+        simulation__settle=base.simulation.settle,
         simulation__end_with_task=True,
         force_scaling__sigma=condition.sigma,
         force_scaling__gamma=condition.gamma,
@@ -153,6 +147,6 @@ def _run_peg_insertion(
     measures = task_measures(result, scenario)
     done = measures["success"] > 0.0
     time_s = measures["task_time_s"] if done else task.timeout
-    return IntervalResult(
-        force_N=float(true_contact_force_magnitudes(result).max()), done=done, time_s=time_s
-    )
+    rows = IntervalLog(scenario, None)
+    rows.add_rows({"t": result.t} | {name: result[name] for name in result.signals})
+    return IntervalResult(force_N=rows.largest_mean_contact_force(), done=done, time_s=time_s)

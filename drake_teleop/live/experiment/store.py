@@ -58,7 +58,7 @@ _TRIAL_SCHEMA = table_schema(TrialRow)
 
 @dataclass(frozen=True)
 class TrialStore:
-    """Trials of an experiment on disk, in one folder."""
+    """Folder with an experiment's trials."""
 
     folder: Path
 
@@ -100,7 +100,7 @@ class TrialStore:
 
 @contextmanager
 def open_trial_store(folder: Path, experiment: Experiment) -> Iterator[TrialStore]:
-    """Yield the results in a folder, locked for this process."""
+    """Yield the trials in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}
     with locked_folder(folder, identity):
