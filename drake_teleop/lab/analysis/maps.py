@@ -53,12 +53,7 @@ class StabilityMap:
 
 
 def stability_map(
-    axis: OneAxis,
-    sampling: Sampling,
-    x_name: str,
-    x: ArrayLike,
-    y_name: str,
-    y: ArrayLike,
+    axis: OneAxis, sampling: Sampling, x_name: str, x: ArrayLike, y_name: str, y: ArrayLike
 ) -> StabilityMap:
     """Return stability and distortion over increasing values of two parameters.
 

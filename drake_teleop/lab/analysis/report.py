@@ -14,14 +14,7 @@ from matplotlib.figure import Figure
 
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.style import (
-    BLACK,
-    COLOURS,
-    GREY,
-    VERMILION,
-    Picture,
-    plot_style,
-)
+from drake_teleop.common.style import BLACK, COLOURS, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.analysis import absolute_stability, transparency
 from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis

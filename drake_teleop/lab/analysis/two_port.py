@@ -64,10 +64,7 @@ def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0,
     determinant = (1 + h11) * (1 + h22) - h12 * h21
     return (
         two_port_matrix(
-            (h11 - 1) * (h22 + 1) - h12 * h21,
-            2 * h12,
-            -2 * h21,
-            (1 + h11) * (1 - h22) + h12 * h21,
+            (h11 - 1) * (h22 + 1) - h12 * h21, 2 * h12, -2 * h21, (1 + h11) * (1 - h22) + h12 * h21
         )
         / determinant[..., None, None]
     )

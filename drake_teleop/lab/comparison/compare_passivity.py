@@ -256,11 +256,7 @@ def _run_release_study(
 
 
 def _run_station_study(
-    base: Scenario,
-    networks: Sequence[str],
-    methods: Sequence[str],
-    jobs: int,
-    stage: StartStage,
+    base: Scenario, networks: Sequence[str], methods: Sequence[str], jobs: int, stage: StartStage
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, Array]]]:
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.

@@ -81,11 +81,7 @@ class OneDof(AxisParameters):
 
 
 REFERENCE = OneDof(
-    hand_mass=0.2,
-    hand_damping=5.0,
-    hand_stiffness=300.0,
-    position_gain=58.5,
-    velocity_gain=234.0,
+    hand_mass=0.2, hand_damping=5.0, hand_stiffness=300.0, position_gain=58.5, velocity_gain=234.0
 )
 """Model of the figures in docs/delay.md, notebook 02 and benchmarks/README.md.
 

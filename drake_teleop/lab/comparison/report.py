@@ -176,9 +176,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
     figure = _draw_trace_grid(summary, traces, draw_run_energy, "energy [J]")
     figure.suptitle(
-        "Energy between hand and actual motion:\nbelow 0 the station is active",
-        x=0.01,
-        ha="left",
+        "Energy between hand and actual motion:\nbelow 0 the station is active", x=0.01, ha="left"
     )
     return figure
 

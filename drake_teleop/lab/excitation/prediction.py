@@ -13,10 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
-from drake_teleop.station.sensor.motion_estimation import (
-    MotionEstimationConfig,
-    fusion_gains,
-)
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_gains
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 

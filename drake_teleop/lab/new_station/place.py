@@ -145,11 +145,7 @@ def _trial_wall_name(edge: float) -> str:
 
 
 def find_start_place(
-    arm: ArmModel,
-    shapes: PostureShapes | None = None,
-    *,
-    plane: float = 0.0,
-    axis: str = "z",
+    arm: ArmModel, shapes: PostureShapes | None = None, *, plane: float = 0.0, axis: str = "z"
 ) -> StartPlace:
     """Find a start at which the tool points down.
 
