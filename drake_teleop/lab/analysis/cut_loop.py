@@ -71,7 +71,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 0.0) -> Complex:
-    """Return the response (N, ...) at `omega` [rad/s]; stability limit: 1."""
+    """Return the response L (N, ...) with delay at `omega` (N,) [rad/s]; stability limit: 1."""
     dimensions = max(loop.period_s.ndim, np.ndim(one_way_delay_s))
     w = np.atleast_1d(np.asarray(omega, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period_s)[..., None]
@@ -81,7 +81,10 @@ def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 
 
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
-    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf."""
+    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf.
+
+    `response` (N,) is from `loop_response`, at increasing frequencies.
+    """
     if np.abs(response).max() < _MAX_GAIN_OF_NO_LOOP:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
@@ -106,7 +109,7 @@ def _interpolate_in_steps(value: Array, fraction: Array) -> Array:
 
 
 def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDArray[np.int64]:
-    """Return the number of unstable eigenvalues of the closed loop."""
+    """Return the number of multipliers outside the unit circle of the loop closed with delay."""
     D = (2 * np.asarray(one_way_delay_s) / loop.period_s)[..., None]
     angles = loop.gain_crossing_angles
     turns = (loop.gain_crossing_phases - D * angles) / (2 * np.pi)

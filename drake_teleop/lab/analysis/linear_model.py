@@ -16,8 +16,8 @@ from drake_teleop.lab.analysis.one_axis import Complex
 COMPONENT_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 _MAX_STATES_FOR_DENSE_EIGENVALUES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # Hz, limit of the sparse search
-_EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
+_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # limit of the sparse search
+_EIGENVALUES_PER_SHIFT = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Linearization:
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return the response (n, outputs, inputs) at omega (n,) [rad/s]."""
+        """Return the response (n, outputs, inputs) at omega (n,) [rad/s], with closed loops."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
         # Solve for each frequency: a chain of delays has no basis of eigenvectors.

@@ -137,7 +137,7 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
         1 <= count <= _MAX_RATE_OVER_HAND_RATE and (np.abs(ratios - count) <= 1e-9 * count).all()
     ):
         raise DrakeTeleopError(
-            "is no whole multiple of hand_hz",
+            f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)",
             where=f"sampling.{name}",
             remedy=f"let servo and sensor run 1 to {_MAX_RATE_OVER_HAND_RATE} times as often",
         )
@@ -176,13 +176,13 @@ class _PeriodMapRows:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
-        hand_force = {
+        force = {
             MASTER_X: -axis.hand_stiffness / mass,
             MASTER_V: -axis.hand_damping / mass,
             _HELD_HAND_FORCE: 1 / mass,
+            RECEIVED_FORCE: -1 / mass,
         }
-        force = self._make_row(hand_force) + self._make_row({RECEIVED_FORCE: -1 / mass})
-        ahead = [force * push[..., i, None] for i in range(2)]
+        ahead = [self._make_row(force) * push[..., i, None] for i in range(2)]
         for i in range(2):
             ahead[i] = ahead[i] + self._make_row({MASTER_X: x[..., i], MASTER_V: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
@@ -196,14 +196,13 @@ class _PeriodMapRows:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
-        contact_force = {
+        force = {
             SLAVE_X: scale * axis.wall_stiffness,
             SLAVE_V: scale * axis.wall_damping,
             _HELD_ENVIRONMENT_FORCE: scale,
+            SERVO_A: axis.force_scale * felt_mass,
         }
-        load_force = {SERVO_A: axis.force_scale * felt_mass}
-        value = self._make_row(contact_force) + self._make_row(load_force)
-        memory = []
+        value, memory = self._make_row(force), []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
             first, second = FIRST_FILTER_STATE + 2 * k, FIRST_FILTER_STATE + 2 * k + 1
@@ -219,19 +218,9 @@ class _PeriodMapRows:
         x, v, push = mass_spring_responses_to_unit_x_v_u(
             axis.wall_stiffness / mass, axis.wall_damping / mass, time
         )
-        rows = []
-        for i in range(2):
-            p = push[..., i]
-            rows.append(
-                self._make_row(
-                    {
-                        SLAVE_X: x[..., i],
-                        SLAVE_V: v[..., i],
-                        SERVO_A: p,
-                        _HELD_ENVIRONMENT_FORCE: -p / mass,
-                    }
-                )
-            )
+        by_force = -push / np.asarray(mass)[..., None]
+        ahead = {SLAVE_X: x, SLAVE_V: v, SERVO_A: push, _HELD_ENVIRONMENT_FORCE: by_force}
+        rows = [self._make_row({k: y[..., i] for k, y in ahead.items()}) for i in range(2)]
         return np.stack(rows, axis=-2)
 
 
