@@ -198,9 +198,8 @@ def _cached_trajectory_and_kappa(
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
-    if (
-        key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment
-    ):  # the environment's files may change
+    # The environment's files may change.
+    if key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment:
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
         _TRAJECTORIES_AND_KAPPAS[key] = found, criterion_values(robot, found)["kappa_w10"]

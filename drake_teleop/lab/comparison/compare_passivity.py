@@ -137,7 +137,10 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none."""
+    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
+
+    `jitter` and `loss` are those of `NetworkConfig`; without both, only the first seed runs.
+    """
     longest = 0.0
     for round_trip in ROUND_TRIPS_S:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -150,7 +153,7 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, with the rates of the comparison."""
+    """Return the scenario without environment and detection, with the comparison's rates."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
@@ -198,9 +201,8 @@ def _run_while_stable(
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release_start)
     for part in (hold, task):
-        advance_without_garbage_collection(
-            simulator, 1e-3 * round(1e3 * (settle + part.end))
-        )  # exactly to the event
+        end = 1e-3 * round(1e3 * (settle + part.end))  # exactly at the event
+        advance_without_garbage_collection(simulator, end)
         result = read_recorded_signals(simulator, settle)
         found = figures_of_station_run(result, scenario, part)
         if not found.stable:
@@ -268,19 +270,15 @@ def _run_station_study(
         jobs,
         stage("The whole station"),
     )
-    order = {
-        name: list(names).index
-        for name, names in (("network", networks), ("leaf", LEAF_THICKNESSES_M))
-    }
+    leaves = list(LEAF_THICKNESSES_M)
     rows = sorted(
         (row for row, _ in results),
-        key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
+        key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])),
     )
-    first = next(iter(LEAF_THICKNESSES_M))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results
-        if row["leaf"] == first and shown
+        if row["leaf"] == leaves[0] and shown
     }
     return rows, traces
 

@@ -32,8 +32,8 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: period of the channel [s]
 _SUBSTEPS_PER_CHANNEL_PERIOD = 20
-_DEVICE_FRICTION_SPEED_M_S = 5e-3  # m/s, regularisation of the device's Coulomb friction
-_SLAVE_FRICTION_SPEED_M_S = 1e-3  # m/s, regularisation of the slave's friction
+# Speeds that regularise the Coulomb friction.
+_DEVICE_FRICTION_SPEED_M_S, _SLAVE_FRICTION_SPEED_M_S = 5e-3, 1e-3
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
@@ -236,6 +236,7 @@ def _smooth_ramp(t: Array, start: float, length: float) -> Array:
 
 
 def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
+    """Return the measures of a run; `task` contains the times of its intended motion."""
     return figures_of_traces(
         t=run.t,
         master=run.master_position,
@@ -302,10 +303,6 @@ def figures_of_traces(
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
-    return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
-
-
-def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     s = 1j * _RESISTANCE_FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -314,8 +311,8 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     delay_factor = np.exp(-s * (round_trip + 1.5 * PERIOD))
     contact = model.gamma * model.wall_stiffness / s
     inertia = model.sigma * model.tool_mass * s
-    felt = model.force_scale * (contact + inertia) * closed_loop * delay_factor
-    return np.asarray(felt.real)
+    displayed = model.force_scale * (contact + inertia) * closed_loop * delay_factor
+    return max(0.0, -float(displayed.real.min()))
 
 
 def _range_about_parabola(x: Array) -> float:

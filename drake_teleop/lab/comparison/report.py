@@ -121,18 +121,11 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
 
 def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
+    shares = [f"displayed share of taps at {rate:g} Hz [%]" for rate in TAP_RATES_HZ]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
-        (
-            f"displayed share of taps at {TAP_RATES_HZ[0]:g} Hz [%]",
-            "linear",
-            lambda row: 100 * row["tap_shares"][0],
-        ),
-        (
-            f"displayed share of taps at {TAP_RATES_HZ[1]:g} Hz [%]",
-            "linear",
-            lambda row: 100 * row["tap_shares"][1],
-        ),
+        (shares[0], "linear", lambda row: 100 * row["tap_shares"][0]),
+        (shares[1], "linear", lambda row: 100 * row["tap_shares"][1]),
     )
     with plot_style():
         figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))

@@ -65,8 +65,8 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the work (N, 2) [J] of the load's displayed wrench, for translation and rotation."""
-    arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
-    q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
+    arm, t = slave_arm(scenario), result.t
+    q, v = np.split(np.ascontiguousarray(result["slave_state"]), [arm.num_joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))
     for k in range(len(t)):
         pose_into(arm.table, q[k], poses[k])
@@ -89,14 +89,13 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the passivity method's initial energy (2,) [J], for translation and rotation."""
+    """Return the energy (2,) stored at both ends at the start [J], by translation and rotation."""
     scales = _kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return (
-        2 * energy_balance(methods.initial_method_memory(scenario.passivity.method, p, pose)).stored
-    )
+    memory = methods.initial_method_memory(scenario.passivity.method, p, pose)
+    return 2 * energy_balance(memory).stored
 
 
 def _kinematic_scales(scenario: Scenario) -> Array:

@@ -98,12 +98,8 @@ class DesignProblem:
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period_s * np.sqrt(task.num_harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
-        spread = np.tile(
-            np.repeat(
-                _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, limits.q_half), task.num_harmonics - 1
-            ),
-            2,
-        )
+        amplitude = _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, limits.q_half)
+        spread = np.tile(np.repeat(amplitude, task.num_harmonics - 1), 2)
         q0 = task.home_posture + 0.1 * rng.standard_normal(len(size))
         if not near_home:
             half = finite_half_ranges(limits.q_half)
@@ -158,10 +154,8 @@ class DesignProblem:
         # (8, free, n), summed over position, velocity, acceleration and time.
         by_coefficients = (self._basis.transpose(0, 2, 1) @ g).sum(axis=1)
         count, free, n = by_coefficients.shape
-        by_coefficients = (
-            by_coefficients.reshape(count, 2, free // 2, n).swapaxes(2, 3).reshape(count, -1)
-        )
-        return np.hstack([by_q0, by_coefficients])
+        by_coefficients = by_coefficients.reshape(count, 2, free // 2, n).swapaxes(2, 3)
+        return np.hstack([by_q0, by_coefficients.reshape(count, -1)])
 
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
@@ -282,20 +276,19 @@ class _DescentSearch:
     def _run_slsqp(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, iterations: int
     ) -> Array:
+        def evaluate(x: Array) -> Evaluation:
+            return self._evaluate_once(x, criterion_sharpness, limit_sharpness)
+
         found: Array = self._minimize(
-            lambda x, *sharpness: self._evaluate_once(x, *sharpness).log_criterion,
+            lambda x: evaluate(x).log_criterion,
             x,
-            (criterion_sharpness, limit_sharpness),
-            "SLSQP",
-            jac=lambda x, *sharpness: self._evaluate_once(x, *sharpness).gradients[0],
+            method="SLSQP",
+            jac=lambda x: evaluate(x).gradients[0],
             bounds=self._problem.bounds(x),
             constraints={
                 "type": "ineq",
-                "fun": lambda x, *sharpness: (
-                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).smooth_limit_uses
-                ),
-                "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
-                "args": (criterion_sharpness, limit_sharpness),
+                "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).smooth_limit_uses,
+                "jac": lambda x: -evaluate(x).gradients[1:],
             },
             options={"maxiter": iterations, "ftol": _SLSQP_TOLERANCE},
         ).x
@@ -319,9 +312,7 @@ class _DescentSearch:
             self._key = key
             if self._last.largest_limit_use <= _MAX_LIMIT_USE_OF_FEASIBLE_MOTION:
                 self._record_iterate(x)
-            elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and self._best_of_start == float(
-                "inf"
-            ):
+            elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and np.isinf(self._best_of_start):
                 raise _InfeasibleStartError
         return self._last
 

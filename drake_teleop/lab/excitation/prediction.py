@@ -55,16 +55,13 @@ def sensor_noise(
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
 
-def predicted_deviations(
-    s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
-) -> Array:
-    return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
-
-
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3)."""
+    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3).
+
+    `step` is the sample period [s], `phi` the load (10,).
+    """
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.assumed_wrench_std[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)

@@ -30,7 +30,7 @@ from drake_teleop.station.slave.plant import (
 )
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random postures for distances of shapes
+_NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random
 # Usable share of joint limits; the rest is for tracking errors and feedback.
 _USABLE_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.

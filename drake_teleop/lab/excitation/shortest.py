@@ -94,9 +94,8 @@ def design_shortest_motion(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi) * sidak_factor(
-        len(tolerance.required_entry_names)
-    )
+    errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
+    errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
     task = DesignTask(
         robot.arm.table,
@@ -131,9 +130,8 @@ def design_shortest_motion(
         around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
-            vain_rounds += 1
-            if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period:
-                vain_rounds = 0
+            progressed = trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
+            vain_rounds = 0 if progressed else vain_rounds + 1
             if trajectory.period < shortest_period:
                 excitation = assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
@@ -202,13 +200,9 @@ class ShortestMotionProblem(DesignProblem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds of the unknowns; only log T is bounded."""
-        shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
-        around = (
-            np.clip(x[-1] + step, shortest_period, largest)
-            for step in (-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP)
-        )
-        low, high = (float(each) for each in around)
+        """Return bounds of the unknowns; only log T is bounded, near that of x."""
+        ends = x[-1] + np.array([-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP])
+        low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
@@ -242,9 +236,8 @@ class ShortestMotionProblem(DesignProblem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(
-            self._variances_of_estimates(self._weighted_regressor_rows(*motion), period)[0]
-        )
+        rows = self._weighted_regressor_rows(*motion)
+        return np.sqrt(self._variances_of_estimates(rows, period)[0])
 
     def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)

@@ -275,7 +275,10 @@ def _starts_at_rounded_position(
 def _with_largest_wall(
     shapes: PostureShapes | None, place: StartPlace, region: StartRegion
 ) -> StartPlace:
-    """Return the place with its largest free wall; overlaps reduce its score."""
+    """Return the place with its largest free wall; overlaps reduce its score.
+
+    Wall and score are unchanged without `shapes`.
+    """
     if shapes is None:
         return place
     shapes.move_to(place.q)
@@ -330,7 +333,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
 
 
 def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
-    """Return how far bodies extend beyond S along an axis of S [m]."""
+    """Return how far bodies extend beyond So along an axis of S [m], at least 0."""
     points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
@@ -396,7 +399,7 @@ def sensor_axis_along_last_joint(arm: ArmModel) -> str:
     )
 
 
-def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:
+def tool_frame_advice(model: Path, sensor_frame: str, axis: str) -> str:
     """Return advice on a sensor frame with z along the tool; empty: not needed."""
     if axis == "z":
         return ""

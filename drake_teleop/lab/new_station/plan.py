@@ -142,7 +142,7 @@ def plan_station(
         lowest_tool_point_W=lowest,
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
-        tool_axis_advice=tool_frame_advice(model, arm, sensor_frame, axis),
+        tool_axis_advice=tool_frame_advice(arm, sensor_frame, axis),
         overlap_warnings=tuple(overlap_warnings(shapes, of_arm=True)),
         base_plane_height=plane,
         weak_joints=weak_joints,
@@ -165,9 +165,8 @@ def _find_start_and_tool_axis(
             if axis != "z" or slave.tool.shapes[0].position[2] != _STAND_IN_LENGTH_M:
                 shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
-            found.append(
-                (find_start_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes)
-            )
+            place = find_start_place(shapes.arm, shapes, plane=plane, axis=axis)
+            found.append((place, axis, shapes))
         except DrakeTeleopError as error:
             errors.append(error)
         if found and found[-1][0].posture_score > _SUFFICIENT_POSTURE_SCORE:
@@ -189,9 +188,8 @@ def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
 
 def _tool_extends_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
-    link_end = extent_beyond_sensor(
-        shapes, shapes.bodies_welded_to_sensor() - shapes.tool_bodies, axis
-    )
+    link_bodies = shapes.bodies_welded_to_sensor() - shapes.tool_bodies
+    link_end = extent_beyond_sensor(shapes, link_bodies, axis)
     return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
