@@ -26,7 +26,7 @@ from drake_teleop.lab.excitation.optimizer import (
     FeasibleIterate,
     minimise_criterion,
 )
-from drake_teleop.lab.excitation.prediction import predicted_covariance
+from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
@@ -125,9 +125,7 @@ def assemble_excitation(
     uses: list[LimitUse],
 ) -> Excitation:
     motion = trajectory_sensor_motion(robot, trajectory)
-    covariance = predicted_covariance(
-        *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
-    )
+    noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
     best = accumulate((iterate.criterion_value for iterate in iterates), min)
     history = [(it.num_evaluations, value) for it, value in zip(iterates, best, strict=True)]
     return Excitation(
@@ -135,7 +133,7 @@ def assemble_excitation(
         trajectory,
         criterion,
         criterion_values(robot, trajectory),
-        np.sqrt(np.diag(covariance)),
+        predicted_deviations(*motion, 1 / CHECK_RATE_HZ, noise, phi),
         uses,
         np.array(history).reshape(-1, 2),
         iterates[-1].cpu_time_s if iterates else 0.0,

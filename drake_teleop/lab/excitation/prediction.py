@@ -55,6 +55,12 @@ def sensor_noise(
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
 
+def predicted_deviations(
+    s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
+) -> Array:
+    return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
+
+
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
