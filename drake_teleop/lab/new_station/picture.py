@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import (  # type: ignore[import-untyped]
-    Line3DCollection,
-    Poly3DCollection,
-)
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 from scipy.spatial import ConvexHull, QhullError
 
 from drake_teleop.common.numeric import Array

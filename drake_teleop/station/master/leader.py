@@ -170,10 +170,9 @@ def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench
 def _flag_rows_with_motor_at_limit(arm_without_hand, arm, joint_table, q, F, share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
+    tables = arm_without_hand, arm, joint_table
     for row in range(rows):
-        limited_leader_motor_torques_into(
-            arm_without_hand, arm, joint_table, q[row], F[row], torque
-        )
+        limited_leader_motor_torques_into(*tables, q[row], F[row], torque)
         for i in range(n):
             flags[row] |= abs(torque[i]) >= share * joint_table[_TORQUE_LIMIT_ROW, i]
     return flags
@@ -239,7 +238,7 @@ class LeaderDevice(HapticDeviceBase):
         for k in np.flatnonzero((q < lower) | (q > upper)):
             raise DrakeTeleopError(
                 f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
-                f" {lower[k]:.3g} and {upper[k]:.3g} (rad or m)",
+                f" {lower[k]:.3g} to {upper[k]:.3g} (rad or m)",
                 where="master.leader.home",
                 remedy="start within the limits of its joints",
             )
@@ -250,10 +249,7 @@ class LeaderDevice(HapticDeviceBase):
         The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         tables = self.compiled_constants
-        flags: NDArray[np.bool_] = _flag_rows_with_motor_at_limit(
-            *tables, q.copy(), F.copy(), share
-        )
-        return flags
+        return np.asarray(_flag_rows_with_motor_at_limit(*tables, q.copy(), F.copy(), share))
 
     def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
