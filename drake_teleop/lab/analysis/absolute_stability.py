@@ -136,10 +136,8 @@ class ImpedanceRange:
         """Return the range's corners (..., 4) [N s/m], counter-clockwise from the lower left."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
-        least, most = self.damping
-        return np.stack(
-            [least + 1j * low, most + 1j * low, most + 1j * high, least + 1j * high], -1
-        )
+        b0, b1 = self.damping
+        return np.stack([b0 + 1j * low, b1 + 1j * low, b1 + 1j * high, b0 + 1j * high], -1)
 
     def contains(self, impedance: Complex, omega: Array) -> BooleanArray:
         corners = self.corners(omega)
@@ -165,9 +163,8 @@ def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
     stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
-    t, u = _oscillation_points_on_edges(
-        h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer
-    )
+    dz = np.roll(z, -1, axis=-1) - z
+    t, u = _oscillation_points_on_edges(h11, h12 * h21, h22, z, dz, wall, stiffer)
     limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
     return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
 

@@ -88,9 +88,8 @@ def _analyze_in_stages(
     points = [("free motion", free, axis)]
     if scenario.first_sheet_spring is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.first_sheet_spring)
-        pressed = linearize(
-            alone, load_estimate=estimate, displacement=master_displacement_into_leaf(alone)
-        )
+        depth = master_displacement_into_leaf(alone)
+        pressed = linearize(alone, load_estimate=estimate, displacement=depth)
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 

@@ -88,9 +88,8 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < _MAX_GAIN_OF_NO_LOOP:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    lag = np.mod(
-        _interpolate_in_steps(np.unwrap(angle), _zero_crossing_fractions(log_gain)), 2 * np.pi
-    )
+    crossings = _zero_crossing_fractions(log_gain)
+    lag = np.mod(_interpolate_in_steps(np.unwrap(angle), crossings), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
     fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
@@ -148,9 +147,8 @@ def _gain_crossings_into(opened, closed, angles, found):
         if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        at, values = _angles_with_gain_extremes_and_responses(
-            _add_pole_angles(angles, poles), poles, zeros
-        )
+        more = _add_pole_angles(angles, poles)
+        at, values = _angles_with_gain_extremes_and_responses(more, poles, zeros)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase

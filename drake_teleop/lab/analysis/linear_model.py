@@ -43,8 +43,8 @@ class Linearization:
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
-        rows = self._find_component_indices(outputs, self.outputs)
-        columns = self._find_component_indices(inputs, self.inputs)
+        rows = self._component_indices(outputs, self.outputs)
+        columns = self._component_indices(inputs, self.inputs)
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
         A = self.A + self.B[:, columns] @ self.C[list(rows)]
@@ -132,9 +132,7 @@ class Linearization:
         )
 
     @staticmethod
-    def _find_component_indices(
-        names: str | Sequence[str], known: tuple[str, ...]
-    ) -> tuple[int, ...]:
+    def _component_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
         parts = port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})

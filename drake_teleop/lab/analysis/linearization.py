@@ -117,9 +117,8 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     lines = scenario.channel.networks_of_directions()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
         return 0, 0
-    ahead, back = (
-        max(1, round(max(line.delay, line.playout) * scenario.rates.hand_hz)) for line in lines
-    )
+    rate = scenario.rates.hand_hz
+    ahead, back = (max(1, round(max(line.delay, line.playout) * rate)) for line in lines)
     return ahead, back
 
 
@@ -280,9 +279,8 @@ class _PeriodSimulator:
 
     def _apply_input_changes(self, u: Array) -> None:
         self._fix_input_port("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix_input_port(
-            "inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12])
-        )
+        command = _displace_pose(self._pose, u[6:12])
+        self._fix_input_port("inverse_kinematics", "pose_command", command)
         self._fix_input_port("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
@@ -399,10 +397,8 @@ def _displace_pose(pose: Array, change: Array) -> Array:
 
 
 def _pose_difference(pose: Array, other: Array) -> Array:
-    turn = quaternion_logarithm(
-        quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
-    )
-    return np.concatenate([pose[4:] - other[4:], turn])
+    rotation = quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
+    return np.concatenate([pose[4:] - other[4:], quaternion_logarithm(rotation)])
 
 
 def _without_nonlinear_parts(scenario: Scenario) -> Scenario:

@@ -25,7 +25,7 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 (MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
-_MAX_RATE_OVER_HAND_RATE = 1000
+_MAX_RATE_RATIO = 1000  # over the hand's rate
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,8 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
     flows = {gap: rows.slave_rows(float(gap) * hand_period) for gap in set(gaps)}
-    shape = np.broadcast_shapes(
-        *(part.shape[:-2] for part in (hand, servo, sensor, *flows.values()))
-    )
+    parts = hand, servo, sensor, *flows.values()
+    shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
     M = np.broadcast_to(np.eye(n + 3), (*shape, n + 3, n + 3)).copy()
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
@@ -102,9 +101,8 @@ def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
 def closed_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
     """Return the model with its loop closed over the delay of both ways."""
     periods = 2 * one_way_delay_in_hand_periods(axis, sampling)
-    return cut_axis_model(axis, sampling).close_loop(
-        ["displayed_force"], ["received_force"], periods
-    )
+    cut = cut_axis_model(axis, sampling)
+    return cut.close_loop(["displayed_force"], ["received_force"], periods)
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
@@ -133,13 +131,11 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    if not (
-        1 <= count <= _MAX_RATE_OVER_HAND_RATE and (np.abs(ratios - count) <= 1e-9 * count).all()
-    ):
+    if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
         raise DrakeTeleopError(
             f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)",
             where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_RATE_OVER_HAND_RATE} times as often",
+            remedy=f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand",
         )
     return count
 
@@ -164,9 +160,7 @@ class _PeriodMapRows:
         self._axis, self._size = axis, size
 
     def _make_row(self, entries: dict[int, Any]) -> Array:
-        values = np.broadcast_arrays(
-            *(np.asarray(value, dtype=float) for value in entries.values())
-        )
+        values = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in entries.values()))
         row = np.zeros((*values[0].shape, self._size))
         for index, value in zip(entries, values, strict=True):
             row[..., index] += value

@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.delayed_contact import (
     LEAF_THICKNESSES_M,
     delayed_contact,
     figures_of_station_run,
-    vertical_force_and_energy_traces,
+    force_and_energy_traces,
 )
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
@@ -178,7 +178,7 @@ def simulate_press(
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    shown = vertical_force_and_energy_traces(result, setup)
+    shown = force_and_energy_traces(result, setup)
     held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
@@ -301,9 +301,7 @@ def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     return rows
 
 
-def _run_in_processes(
-    function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any
-) -> list[Any]:
+def _run_in_processes(function: Any, cases: list[Any], jobs: int, progress: Any) -> list[Any]:
     from joblib import Parallel, delayed
 
     results = []

@@ -105,15 +105,13 @@ def leaf_thickness(stiffness: float) -> float:
 
 def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
     """Return the measures of a station's run of the task, along z of the world."""
-    traces = vertical_force_and_energy_traces(result, scenario)
+    traces = force_and_energy_traces(result, scenario)
     traces |= {"master": result["pose_command"][:, 6]}
-    traces["slave"], traces["turned"] = _slave_heights_and_rotations(result, scenario)
+    traces["slave"], traces["turned"] = _slave_height_and_rotation(result, scenario)
     return figures_of_traces(**traces, task=task)
 
 
-def vertical_force_and_energy_traces(
-    result: SimulationResult, scenario: Scenario
-) -> dict[str, Array]:
+def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
     """Return a run's t [s], vertical forces at the master's scale [N] and `injected_energy` [J].
 
     "felt" is the displayed force, "pressed" the scaled true contact force.
@@ -135,9 +133,7 @@ def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 
 
-def _slave_heights_and_rotations(
-    result: SimulationResult, scenario: Scenario
-) -> tuple[Array, Array]:
+def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> tuple[Array, Array]:
     arm = slave_arm(scenario)
     poses = np.empty((len(result.t), 7))
     for pose, state in zip(poses, result["slave_state"], strict=True):

@@ -188,9 +188,8 @@ def run_one_dof(
     ]
     states = [network.initial_network_state(line, np.zeros(PACKET_SIZE)) for line in lines]
     ends = initial_state_of_ends(passivity.method, p, start)
-    stored = float(
-        ends[MASTER_METHOD_MEMORY][STORED_ENERGY][0] + ends[SLAVE_METHOD_MEMORY][STORED_ENERGY][0]
-    )
+    memories = ends[MASTER_METHOD_MEMORY], ends[SLAVE_METHOD_MEMORY]
+    stored = float(memories[0][STORED_ENERGY][0] + memories[1][STORED_ENERGY][0])
     numbers = (
         model.device_mass, model.device_friction, model.slave_mass, model.servo_stiffness,
         model.servo_damping, model.ideal_servo, model.slave_friction, model.motor_lag,
@@ -220,9 +219,8 @@ def operator_intent(task: Task = Task()) -> Array:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION_M)
-    fade = np.minimum(
-        _smooth_ramp(t, task.swing_start, 0.5), 1 - _smooth_ramp(t, task.swing_end - 0.5, 0.5)
-    )
+    fading_out = _smooth_ramp(t, task.swing_end - 0.5, 0.5)
+    fade = np.minimum(_smooth_ramp(t, task.swing_start, 0.5), 1 - fading_out)
     x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing_start))
     pressing = _smooth_ramp(t, task.press_start, task.press_end - task.press_start)
     releasing = _smooth_ramp(t, task.release_start, task.release_end - task.release_start)
@@ -274,11 +272,10 @@ def figures_of_traces(
 
     hold = window_slice(task.release_start - task.rest_window, task.release_start)
     rest = window_slice(task.end - task.rest_window, task.end)
-    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in (hold, rest))
-    angles = () if turned is None else turned.T
-    turning = max(
-        (_range_about_parabola(x[part]) for x in angles for part in (hold, rest)), default=0.0
-    )
+    swing = window_slice(task.swing_start, task.swing_end)
+    parts, angles = (hold, rest), () if turned is None else turned.T
+    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in parts)
+    turning = max((_range_about_parabola(x[part]) for x in angles for part in parts), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -293,9 +290,7 @@ def figures_of_traces(
         chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(
-            np.sqrt(np.mean(felt[window_slice(task.swing_start, task.swing_end)] ** 2))
-        ),
+        free_force=float(np.sqrt(np.mean(felt[swing] ** 2))),
         rise_delay=_rise_delay_in_samples(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )

@@ -88,9 +88,7 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             x, y = networks.index(network), methods.index(method)
             mark, colour, text_colour = VERDICT_STYLES[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
-            lines = [
-                f"displays {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.force_pairs
-            ]
+            lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
             lines += cell.motion_texts
             offset = 0.12 * len(lines)
             axes.text(

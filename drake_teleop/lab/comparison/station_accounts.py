@@ -41,7 +41,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
         )
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
-    poses, motor = _sensor_poses_and_motor_wrenches(scenario, q, torque)
+    poses, motor = _poses_and_motor_wrenches(scenario, q, torque)
     contact = np.zeros_like(motor)
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
@@ -104,9 +104,7 @@ def _kinematic_scales(scenario: Scenario) -> Array:
     return np.where(scales > 0.0, scales, 1.0)
 
 
-def _sensor_poses_and_motor_wrenches(
-    scenario: Scenario, q: Array, torque: Array
-) -> tuple[Array, Array]:
+def _poses_and_motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
     """Return X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight."""
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)

@@ -244,9 +244,8 @@ class CollisionScene:
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
             first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
-            shape_distances[first, second] = np.minimum(
-                of_pair, shape_distances.get((first, second), np.inf)
-            )
+            known = shape_distances.get((first, second), np.inf)
+            shape_distances[first, second] = np.minimum(of_pair, known)
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         outer_capsules = [capsules[shape][1] for shape in outer_shapes]
@@ -315,9 +314,7 @@ def _add_load(
     moments, products = np.diag(unit), unit[np.triu_indices(3, 1)]
     inertia = SpatialInertia(mass, phi[1:4] / mass, UnitInertia(*moments, *products))
     body = plant.AddRigidBody("drake_teleop_reserve", instance, inertia)
-    plant.AddJoint(
-        WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform.Identity())
-    )
+    plant.AddJoint(WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform()))
 
 
 def _complete_collision_shapes(

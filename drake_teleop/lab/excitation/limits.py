@@ -90,7 +90,7 @@ def write_sensor_motion(motions, out):
 
 
 @njit(cache=True)
-def add_criterion_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
+def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
     """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), from that by V (T, 6, 10)."""
     rows = motions.shape[1]
     seeds, g = np.zeros((rows, SEED_SIZE)), np.empty((3, 3))

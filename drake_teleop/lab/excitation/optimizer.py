@@ -17,7 +17,7 @@ from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     Limits,
-    add_criterion_gradient_by_joints,
+    add_gradient_by_joints,
     allocate_link_motions,
     finite_half_ranges,
     write_limit_uses,
@@ -115,9 +115,7 @@ class DesignProblem:
         g[0] = 0.0
         s, omega, alpha = self._vectors
         value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        add_criterion_gradient_by_joints(
-            self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0]
-        )
+        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0])
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[1:])
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
@@ -323,9 +321,8 @@ class _DescentSearch:
             self._best = min(value, self._best)
             seconds = time.thread_time() - self._start_time
             trajectory = self._problem.trajectory(x)
-            self.found.append(
-                FeasibleIterate(seconds, self._all_evaluations, self.start, value, trajectory)
-            )
+            counts = self._all_evaluations, self.start
+            self.found.append(FeasibleIterate(seconds, *counts, value, trajectory))
 
     def _count_evaluation(self) -> None:
         self._evaluations += 1

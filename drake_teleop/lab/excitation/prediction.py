@@ -79,11 +79,11 @@ def predicted_covariance(
     if noise.motion_error_filters is not None:
         of_s, of_alpha = noise.motion_error_filters
         of_motion = -spatial_inertia_matrix(phi) @ influence[:, :6]
-        through_s = _filter_backwards_in_time(of_s, of_motion[:, :3], step)
+        through_s = _filter_backwards(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.p_SoAo_S).T @ through_s
         influence[:, 6:9] = through_s
-        influence[:, 9:] = _filter_backwards_in_time(of_alpha, through_alpha, step)
+        influence[:, 9:] = _filter_backwards(of_alpha, through_alpha, step)
     # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
     of_white = _covariance_from_noise_influence(influence, noise.white_noise_densities) / step
@@ -101,9 +101,7 @@ def _motion_error_polynomials(gains: Array, period: float) -> tuple[Array, Array
     return numerator, denominator
 
 
-def _filter_backwards_in_time(
-    polynomials: tuple[Array, Array], signals: Array, step: float
-) -> Array:
+def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
     # Imported late: slower than the station's import.
     from scipy.signal import bilinear, lfilter
 

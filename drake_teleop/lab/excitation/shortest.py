@@ -26,7 +26,7 @@ from drake_teleop.lab.excitation.excite import (
     find_best_within_limits,
     trajectory_sensor_motion,
 )
-from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_criterion_gradient_by_joints
+from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_gradient_by_joints
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
     DesignProblem,
@@ -174,10 +174,9 @@ class ShortestMotionProblem(DesignProblem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = white_noise_densities_over_wrench_noise(
-            robot.sensor_noise, robot.limits.heaviest_phi
-        )
-        self._roots = np.sqrt(robot.sensor_noise.white_noise_densities[:6])
+        noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
+        self._noise = white_noise_densities_over_wrench_noise(noise, phi)
+        self._roots = np.sqrt(noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
@@ -212,12 +211,9 @@ class ShortestMotionProblem(DesignProblem):
         self._period = T = float(np.exp(log_period))
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._largest_error_over_tolerance(
-            _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
-        )
-        add_criterion_gradient_by_joints(
-            self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1]
-        )
+        sharpness = _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
+        use, worst, g_V = self._largest_error_over_tolerance(sharpness)
+        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.

@@ -205,9 +205,8 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
 def _stand_in_tool(axis: str, length: float) -> Tool:
     along = TOOL_AXES[axis].matrix()[:, 2]
     ball = Ball(_STAND_IN_BALL_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
-    return Tool(
-        mass=_STAND_IN_MASSES_KG[0], com=(_STAND_IN_COM_M * along).round(6).tolist(), shapes=[ball]
-    )
+    com = (_STAND_IN_COM_M * along).round(6).tolist()
+    return Tool(mass=_STAND_IN_MASSES_KG[0], com=com, shapes=[ball])
 
 
 def _stand_in_length(shapes: PostureShapes, axis: str) -> float:

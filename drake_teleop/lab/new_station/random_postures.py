@@ -183,14 +183,11 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     margin = np.minimum(least_joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
     # Only as many singular values as the arm has degrees of freedom.
-    smallest = _jacobian_singular_values(arm, postures)[
-        :, sensor_degrees_of_freedom(arm, postures) - 1
-    ]
+    rank = sensor_degrees_of_freedom(arm, postures)
+    smallest = _jacobian_singular_values(arm, postures)[:, rank - 1]
     sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
-    elbow = (
-        np.minimum(upward_share_of_elbow_offset(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
-        / _SUFFICIENT_ELBOW_UP_SHARE
-    )
+    upward = upward_share_of_elbow_offset(postures, region.reach)
+    elbow = np.minimum(upward, _SUFFICIENT_ELBOW_UP_SHARE) / _SUFFICIENT_ELBOW_UP_SHARE
     origins = postures.origins[:, region.is_joint_above_plane, 2]
     low = np.maximum(region.plane_height + _MIN_JOINT_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach

@@ -209,9 +209,7 @@ def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array
     )
     if not len(touched):
         return np.full(4, -np.inf)
-    return np.maximum(
-        touched.max(axis=0) - free.max(axis=0), free.min(axis=0) - touched.min(axis=0)
-    )
+    return np.maximum(touched.max(0) - free.max(0), free.min(0) - touched.min(0))
 
 
 def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> NamedValues:

@@ -230,9 +230,8 @@ def _print_comparison(rows: list[Comparison], out: Path) -> None:
     colours = {"agrees": "green", "differs": "bold red", "": "dim"}
     for row in rows:
         verdict = f"[{colours[row.css_class]}]{row.verdict}[/]"
-        table.add_row(
-            row.quantity, row.paper_value, row.reproduced_value, row.set_or_found, verdict
-        )
+        values = row.paper_value, row.reproduced_value, row.set_or_found
+        table.add_row(row.quantity, *values, verdict)
     console = Console()
     console.print(table)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -131,12 +131,11 @@ def step_leader(
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
         limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
+        q, v, vdot = stage[:n], stage[n:], slope[n:]
         copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
             copy_into(slope, 0, stage, n, n)
-            leader_acceleration_into(
-                arm, joint_table, stage[:n], stage[n:], applied, motor, slope[n:]
-            )
+            leader_acceleration_into(arm, joint_table, q, v, applied, motor, vdot)
             weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
             ahead = 1.0 if i == 2 else 0.5
             for k in range(2 * n):

@@ -132,9 +132,8 @@ def _is_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDAr
 
 
 def is_any_axis_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
-    return (
-        _is_past_end_stop(q, device, 0.0) & np.append([True] * 3, device.max_rotation > 0.0)
-    ).any(axis=1)
+    has_end_stop = np.append([True] * 3, device.max_rotation > 0.0)
+    return (_is_past_end_stop(q, device, 0.0) & has_end_stop).any(axis=1)
 
 
 def check_limits(q: Array, device: DeviceParameters) -> None:

@@ -247,10 +247,8 @@ def _perceive_and_decide(
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE_INDEX] > decision.PHASE_MOVING
     felt = perceived_forces[step % perceived_forces.shape[0]]
-    period, force, velocity = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
-    update_perception_into(
-        force_memory, senses, period, hand_mass, force, velocity, attentive, felt
-    )
+    period, force, v = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
+    update_perception_into(force_memory, senses, period, hand_mass, force, v, attentive, felt)
     # The next entry to be overwritten is the oldest.
     seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
     felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
