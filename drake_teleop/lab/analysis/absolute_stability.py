@@ -38,7 +38,7 @@ def llewellyn_parameter(H: Complex) -> Array:
 
 
 def is_absolutely_stable(H: Complex) -> BooleanArray:
-    """Return, for each frequency, whether the station is stable at any passive hand and wall."""
+    """Return, for each frequency, whether any passive hand and environment are stable."""
     h11, h12, h21, h22 = matrix_entries(H)
     return _is_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
 

@@ -83,10 +83,10 @@ def _slowest_motion(system: Linearization, stable: bool) -> dict[str, Any]:
 
 
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest deviations to 30 Hz of a two-port from the one-axis models.
+    """Return the largest deviations of H from the one-axis models up to 30 Hz.
 
     They are relative to the largest magnitude of each entry. `H` (N, 2, 2) is the linearised
-    Diagram's hybrid matrix at `OMEGA`, with the hand's mass.
+    Diagram's at `OMEGA`, with the hand's mass.
     """
     compared = OMEGA <= COMPARISON_BAND_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)

@@ -31,7 +31,7 @@ LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task with longer waits for a longer round-trip delay [s]."""
+    """Return the times of the task; longer round trips [s] have longer waits."""
     return Task(
         swing_start=0.3,
         swing_end=1.8,

@@ -234,7 +234,7 @@ def _smooth_ramp(t: Array, start: float, length: float) -> Array:
 
 
 def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
-    """Return the measures of a run; `task` contains the times of its intended motion."""
+    """Return the measures of a run with the intended motion of `task`."""
     return figures_of_traces(
         t=run.t,
         master=run.master_position,

@@ -105,7 +105,7 @@ def _kinematic_scales(scenario: Scenario) -> Array:
 
 
 def _poses_and_motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
-    """Return X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight."""
+    # X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight.
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)
     poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))

@@ -145,7 +145,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
 
 @njit(cache=True)
 def _exact_and_smooth_maximum(use, sharpness):
-    """Return exact and smooth maximum over all of `use` (T, m); `use` becomes the gradient."""
+    # `use` (T, m) becomes the gradient of the smooth maximum.
     top = use.max()
     total = 0.0
     for t in range(use.shape[0]):
@@ -344,10 +344,8 @@ def _are_segments_surely_apart(first, second, distance):
 
 @njit(cache=True)
 def _segment_distance_and_nearest_into(first, second, nearest):
-    """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
-
-    Write to `nearest` (5,): positions on both segments (0 to 1), unit vector to the first.
-    """
+    # Distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection). `nearest` (5,):
+    # positions on both segments (0 to 1), unit vector to the first.
     dd = ee = de = dr = er = 0.0
     for i in range(3):
         d, e = first[1, i] - first[0, i], second[1, i] - second[0, i]

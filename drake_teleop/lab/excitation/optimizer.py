@@ -120,7 +120,7 @@ class DesignProblem:
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
     def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
-        """Return q, qd, qdd (3, T, n) of a motion, and write the motions of links and sensor."""
+        # q, qd, qdd (3, T, n); also writes the motions of links and sensor.
         n = len(self.task.home_posture)
         q_qd_qdd: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q_qd_qdd[0] += x[:n]
@@ -133,7 +133,7 @@ class DesignProblem:
     def _limit_uses(
         self, q_qd_qdd: Array, sharpness: float, gradients: Array
     ) -> tuple[Array, float]:
-        """Return smooth uses (7,) and the exact largest one; write the gradients (7, 3, T, n)."""
+        # Smooth uses (7,) and the exact largest one; writes the gradients (7, 3, T, n).
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
             self.task.arm_table, *q_qd_qdd, self._motions, self.task.limits, sharpness,

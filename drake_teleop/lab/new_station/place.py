@@ -90,7 +90,6 @@ class StartPlace(NamedTuple):
         posture_score: merit of the posture, see `posture_scores`, without the cost of overlaps.
         wall_edge_m: edge of the wall that fits below the tool [m].
         moves_only_vertically: True if the arm can only move up and down by `cube_half_m`.
-        has_overlaps: True if shapes of the arm overlap.
     """
 
     pose: Array
@@ -252,7 +251,7 @@ def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
 def _starts_at_rounded_position(
     arm: ArmModel, q: Array, position: Array
 ) -> Iterator[tuple[Array, Array, bool]]:
-    """Yield joint positions near q, their pose, and whether `slave.position` specifies them."""
+    # Joint positions near q, their pose, and whether `slave.position` specifies them.
     position = np.round(position, 2)
     for yaw_deg in _TOOL_YAWS_DEG:
         R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
@@ -270,10 +269,7 @@ def _starts_at_rounded_position(
 def _with_largest_wall(
     shapes: PostureShapes | None, place: StartPlace, region: StartRegion
 ) -> StartPlace:
-    """Return the place with its largest free wall; overlaps reduce its score.
-
-    Wall and score are unchanged without `shapes`.
-    """
+    # Overlaps reduce the score; without `shapes` wall and score are unchanged.
     if shapes is None:
         return place
     shapes.move_to(place.q)

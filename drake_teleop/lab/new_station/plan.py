@@ -55,17 +55,13 @@ class StationPlan:
     """Start, scales and motions of a new station.
 
     Args:
-        stand_in_tool: stand-in for a missing tool, or None.
         tool_mass_kg: mass beyond the sensor [kg].
-        has_own_tool: True if the model contains the tool.
         swing_amplitude_m: amplitude of the slave in free motion [m].
         lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
         tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
         tool_axis_advice: advice if the tool is not along z_S.
-        overlap_warnings: sentences about overlaps of shapes at the start.
-        base_plane_height: height of the base plane [m].
         weak_joints: joints whose torque limits cannot hold the arm.
-        posture_shapes: shapes of arm and tool, at the start.
+
     """
 
     joint_names: tuple[str, ...]
@@ -180,7 +176,7 @@ def _find_start_and_tool_axis(
 
 
 def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
-    """Return the axis of S towards the model's own load, or else along the last joint; else z."""
+    # Axis of S towards the model's own load, or else along the last joint; else z.
     if load[0] > _MIN_TOOL_MASS_KG and (axis := nearest_sensor_axis(load[1:] / load[0])):
         return axis
     return sensor_axis_along_last_joint(shapes.arm) or "z"
@@ -217,10 +213,9 @@ def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
 def _without_weak_torque_limits(
     arm: ArmModel, q: Array, load_share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
-    """Return the arm without torque limits too low to hold it at q, their joints, and texts.
+    """Return the arm without torque limits that cannot hold it at q, their joints, and texts.
 
-    Args:
-        load_share: share of the load that the arm must hold.
+    The arm must hold `load_share` of its load.
     """
     torque = np.abs(holding_torque(arm.with_load(load_share * arm.phi_load), q))
     weak = torque > MAX_HOLDING_TORQUE_USE * arm.effort_limit

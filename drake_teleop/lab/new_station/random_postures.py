@@ -65,7 +65,6 @@ class StartRegion:
     """Region in which a start is searched.
 
     Attributes:
-        plane_height: height of the base plane [m].
         tool_length: distance of the tool's end from S [m].
         first_joint_W: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
@@ -240,7 +239,7 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
 
 
 def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with its sensor frame rotated by R_SA, to z along the tool."""
+    """Return the arm with its sensor frame rotated by R_SA."""
     table = arm.table.copy()
     R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
     table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()

@@ -201,7 +201,7 @@ def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedV
 def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| (4,) leave their contact-free range in contact [N].
 
-    Negative: a value stays within. Then no threshold on it separates contact from free motion.
+    Negative: a value stays within, so that no threshold on it detects the contact.
     """
     touched, free = (
         np.column_stack([raw[:, :3], _force_norms(raw)])

@@ -109,7 +109,7 @@ class Leader:
 
 
 def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
-    """Return the arm with E as end frame, and its base moved so that E is at p_BE (3,) at home."""
+    # The base moves so that E is at p_BE (3,) at home.
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
