@@ -61,7 +61,6 @@ class StationPlan:
         tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
         tool_axis_advice: advice if the tool is not along z_S.
         weak_joints: joints whose torque limits cannot hold the arm.
-
     """
 
     joint_names: tuple[str, ...]
