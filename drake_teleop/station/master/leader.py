@@ -169,9 +169,10 @@ def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench
 def _flag_rows_with_motor_at_limit(arm_without_hand, arm, joint_table, q, F, share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
-    tables = arm_without_hand, arm, joint_table
     for row in range(rows):
-        limited_leader_motor_torques_into(*tables, q[row], F[row], torque)
+        limited_leader_motor_torques_into(
+            arm_without_hand, arm, joint_table, q[row], F[row], torque
+        )
         for i in range(n):
             flags[row] |= abs(torque[i]) >= share * joint_table[_TORQUE_LIMIT_ROW, i]
     return flags

@@ -224,8 +224,9 @@ def _hand_wrench_at_time(
     packed, start, start_twist, memory, time, impedance, intent_pose, intent_twist, pose, twist,
     wrench,
 ):  # fmt: skip
-    intent = packed, start, start_twist, memory
-    _intended_plus_planned_motion_into(*intent, time, intent_pose, intent_twist)
+    _intended_plus_planned_motion_into(
+        packed, start, start_twist, memory, time, intent_pose, intent_twist
+    )
     hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 
 
