@@ -36,11 +36,11 @@ from drake_teleop.lab.analysis.analyze import (
     close_other_directions,
     sampling_of_scenario,
 )
-from drake_teleop.lab.analysis.figures import OMEGA, axis_with_grip, stiffest_stable_walls
 from drake_teleop.lab.analysis.linear_model import Linearization
 from drake_teleop.lab.analysis.linearization import hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
+from drake_teleop.lab.analysis.summary_values import OMEGA, axis_with_grip, stiffest_stable_walls
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances
 from drake_teleop.lab.identification import slave_arm

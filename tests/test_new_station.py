@@ -157,7 +157,7 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_advised_line_of_directives_turns_z_to_the_tool(axis):
-    line = place.tool_frame_advice(None, Path("a.dmd.yaml"), "sensor", axis).split(" - ")[1]
+    line = place.tool_frame_advice(Path("a.dmd.yaml"), "sensor", axis).split(" - ")[1]
     line = line.split(" and give")[0].replace("MODEL", "arm")
     plant = MultibodyPlant(0.0)
     added = f"- add_model: {{name: arm, file: file://{ARM}}}"

@@ -151,15 +151,14 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _cached_trajectory_and_kappa(scenario, stage)
+            trajectory, kappa = _trajectory_and_kappa(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
             _check_trajectory(robot, trajectory, simulation.duration)
             kappa = criterion_values(robot, trajectory)["kappa_w10"]
         station = MakeIdentificationStation(scenario, trajectory)
-        result, factor = simulate_with_real_time_factor(
-            station, simulation, stage("Identify the load"), log
-        )
+        update = stage("Identify the load")
+        result, factor = simulate_with_real_time_factor(station, simulation, update, log)
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
     with one_blas_thread():
@@ -192,15 +191,12 @@ def identify_by_batch(
     return found.identification
 
 
-def _cached_trajectory_and_kappa(
-    scenario: Scenario, stage: StartStage
-) -> tuple[FourierTrajectory, float]:
+def _trajectory_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
-    if (
-        key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment
-    ):  # the environment's files may change
+    # The environment's files may change.
+    if key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment:
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
         _TRAJECTORIES_AND_KAPPAS[key] = found, criterion_values(robot, found)["kappa_w10"]

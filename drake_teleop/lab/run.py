@@ -216,9 +216,8 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
         console.print(f"assumed: {assumption}", highlight=False, markup=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
-    console.print(
-        f"written to {out}; 3D replay: {out / 'replay.html'}", highlight=False, markup=False
-    )
+    replay = out / "replay.html"
+    console.print(f"written to {out}; 3D replay: {replay}", highlight=False, markup=False)
 
 
 def _format_ms(delay: float | None) -> str:

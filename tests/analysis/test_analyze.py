@@ -9,7 +9,7 @@ from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis import analyze
-from drake_teleop.lab.analysis import figures as of_summary
+from drake_teleop.lab.analysis import summary_values as of_summary
 from drake_teleop.lab.analysis.maps import stability_map
 from drake_teleop.lab.analysis.report import print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction

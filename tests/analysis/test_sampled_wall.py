@@ -131,10 +131,10 @@ def test_grid_of_parameters_equals_single_values():
 @pytest.mark.parametrize(
     "spoilt, match",
     [
-        (lambda: passive_stiffness(1.0, 0.0, 0.0), "period"),
-        (lambda: passive_stiffness(-1.0, 0.0, PERIOD), "damping of the device"),
-        (lambda: stable_stiffness(0.0, 1.0, 0.0, PERIOD), "mass"),
-        (lambda: stable_stiffness(1.0, 1.0, 0.0, PERIOD, hand_stiffness=-5.0), "hand"),
+        (lambda: passive_stiffness(1.0, 0.0, 0.0), "^period: has the value 0, which is not pos"),
+        (lambda: passive_stiffness(-1.0, 0.0, PERIOD), "^device_damping: has the value -1"),
+        (lambda: stable_stiffness(0.0, 1.0, 0.0, PERIOD), "^mass: has the value 0"),
+        (lambda: stable_stiffness(1.0, 1.0, 0.0, PERIOD, hand_stiffness=-5.0), "^hand_stiffness:"),
     ],
 )
 def test_invalid_numbers_raise(spoilt, match):

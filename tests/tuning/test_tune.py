@@ -12,7 +12,7 @@ import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import AxisParameters
 from drake_teleop.lab.comparison.delayed_contact import (
-    _slave_heights_and_rotations,
+    _slave_height_and_rotation,
     delayed_contact,
     leaf_thickness,
 )
@@ -118,7 +118,7 @@ def test_rotation_of_the_slave_is_about_the_axes_of_the_world():
     state = np.tile([0.1, -0.4, 0.9, 0.2, 0.7, -0.3, *np.zeros(6)], (3, 1))
     state[1:, 0] += [0.1, -0.2]  # about z_W
     result = SimulationResult(t, {"slave_state": state}, [SIGNALS["slave_state"]])
-    heights, rotations = _slave_heights_and_rotations(result, scenario)
+    heights, rotations = _slave_height_and_rotation(result, scenario)
     np.testing.assert_allclose(rotations, np.outer([0.0, 0.1, -0.2], [0, 0, 1]), atol=1e-12)
     assert np.ptp(heights) < 1e-12
 

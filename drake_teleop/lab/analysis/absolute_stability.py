@@ -21,7 +21,10 @@ _RELATIVE_ROUNDING_ERROR = 1e-12  # relative to the terms that cancel in a crite
 
 
 def llewellyn_criterion(H: Complex) -> Array:
-    """Return Llewellyn's criterion (Proc. IRE 40, 1952; T54); negative: not absolutely stable."""
+    """Return 2 Re h11 Re h22 - Re h12 h21 - |h12 h21| (Llewellyn, Proc. IRE 40, 1952; T54).
+
+    Negative: not absolutely stable.
+    """
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     return 2 * h11.real * h22.real - product.real - np.abs(product)
@@ -35,18 +38,23 @@ def llewellyn_parameter(H: Complex) -> Array:
 
 
 def is_absolutely_stable(H: Complex) -> BooleanArray:
-    """Return, for each frequency of H, whether it is stable with any passive hand and wall."""
+    """Return, for each frequency, whether any passive hand and environment are stable."""
     h11, h12, h21, h22 = matrix_entries(H)
-    size = np.abs(h12 * h21) + np.abs(h11 * h22)
-    return (
-        (h11.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h11))
-        & (h22.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h22))
-        & (llewellyn_criterion(H) >= -_RELATIVE_ROUNDING_ERROR * size)
-    )
+    return _is_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
+
+
+def _is_met(H: Complex, criterion: Array, criterion_size: Array) -> BooleanArray:
+    met = criterion >= -_RELATIVE_ROUNDING_ERROR * criterion_size
+    for port in (H[..., 0, 0], H[..., 1, 1]):
+        met &= port.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(port)
+    return met
 
 
 def required_damping(H: Complex) -> Array:
-    """Return the additional device damping [N s/m] for absolute stability; inf: impossible."""
+    """Return the lacking device damping [N s/m] for absolute stability; negative: a reserve.
+
+    inf: no damping makes the station absolutely stable.
+    """
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
@@ -57,7 +65,10 @@ def required_damping(H: Complex) -> Array:
 
 
 def raisbeck_criterion(H: Complex) -> Array:
-    """Return Raisbeck's criterion (J. Appl. Phys. 25, 1954; T55); negative: not passive."""
+    """Return 4 Re h11 Re h22 - |h12 + h21*|^2 (Raisbeck, J. Appl. Phys. 25, 1954; T55).
+
+    Negative: not passive.
+    """
     h11, h12, h21, h22 = matrix_entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
@@ -66,11 +77,7 @@ def is_passive(H: Complex) -> BooleanArray:
     """Return, for each frequency of H, whether the station absorbs power for every input."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
-    return (
-        (h11.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h11))
-        & (h22.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h22))
-        & (raisbeck_criterion(H) >= -_RELATIVE_ROUNDING_ERROR * size)
-    )
+    return _is_met(H, raisbeck_criterion(H), size)
 
 
 def scattering_norm(S: Complex) -> Array:
@@ -120,54 +127,44 @@ class ImpedanceRange:
             low, high = getattr(self, name)
             if not -np.inf < low <= high < np.inf:
                 raise DrakeTeleopError(
-                    f"{low} to {high} is no range", where=name, remedy="give (smallest, largest)"
+                    f"{low} to {high} is no range (both ends must be finite)",
+                    where=f"ImpedanceRange.{name}",
+                    remedy="give (smallest, largest)",
                 )
 
     def corners(self, omega: Array) -> Complex:
-        """Return the range's corners (..., 4) [N s/m] at omega, counter-clockwise."""
+        """Return the range's corners (..., 4) [N s/m], counter-clockwise from the lower left."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
-        least, most = self.damping
-        return np.stack(
-            [least + 1j * low, most + 1j * low, most + 1j * high, least + 1j * high], -1
-        )
+        b0, b1 = self.damping
+        return np.stack([b0 + 1j * low, b1 + 1j * low, b1 + 1j * high, b0 + 1j * high], -1)
 
     def contains(self, impedance: Complex, omega: Array) -> BooleanArray:
         corners = self.corners(omega)
-        low, high = corners[..., 0], corners[..., 2]
-        return (
-            (impedance.real >= low.real)
-            & (impedance.real <= high.real)
-            & (impedance.imag >= low.imag)
-            & (impedance.imag <= high.imag)
-        )
+        low, high, z = corners[..., 0], corners[..., 2], impedance
+        above = (z.real >= low.real) & (z.imag >= low.imag)
+        return above & (z.real <= high.real) & (z.imag <= high.imag)
 
 
 def impedance_range_of_grips() -> ImpedanceRange:
     from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
-    mass, damping, stiffness = (
-        (min(values), max(values))
-        for values in zip(
-            *((hand.mass, hand.damping, hand.stiffness) for hand in GRIP_IMPEDANCES.values()),
-            strict=True,
-        )
-    )
-    return ImpedanceRange(mass, damping, stiffness)
+    hands = [(hand.mass, hand.damping, hand.stiffness) for hand in GRIP_IMPEDANCES.values()]
+    return ImpedanceRange(*((min(values), max(values)) for values in zip(*hands, strict=True)))
 
 
 def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     """Return, for each omega, the softest wall [N/m] that oscillates with a hand in range (T57).
 
-    If all values on a dense grid are infinite, all hands are stable or all are unstable.
+    0: already in free motion. If all values on a dense grid are infinite, all hands are stable or
+    all are unstable.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
     stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
-    t, u = _oscillation_points_on_edges(
-        h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer
-    )
+    dz = np.roll(z, -1, axis=-1) - z
+    t, u = _oscillation_points_on_edges(h11, h12 * h21, h22, z, dz, wall, stiffer)
     limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
     return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
 
@@ -213,10 +210,6 @@ _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, Array]:
-    diagonal = corners[..., 2] - corners[..., 0]
-    right = (
-        diagonal.real[..., None] / 2
-        + np.abs(diagonal)[..., None] / 2 * _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS
-    )
-    middle = corners[..., 0] + 0.5j * diagonal.imag
-    return middle[..., None] + right, np.hypot(right, diagonal.imag[..., None] / 2)
+    half = (corners[..., 2:3] - corners[..., :1]) / 2
+    right = half.real + np.abs(half) * _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS
+    return corners[..., :1] + 1j * half.imag + right, np.hypot(right, half.imag)

@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import figures
+from drake_teleop.lab.analysis import summary_values
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
@@ -33,7 +33,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_TIP_DEPTH_IN_LEAF_M = 5e-3  # m, displacement of the tip into the leaf
+_TIP_DEPTH_IN_LEAF_M = 5e-3
 
 
 def analyze_command(
@@ -88,18 +88,17 @@ def _analyze_in_stages(
     points = [("free motion", free, axis)]
     if scenario.first_sheet_spring is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.first_sheet_spring)
-        pressed = linearize(
-            alone, load_estimate=estimate, displacement=master_displacement_into_leaf(alone)
-        )
+        depth = master_displacement_into_leaf(alone)
+        pressed = linearize(alone, load_estimate=estimate, displacement=depth)
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
     with_hand = hybrid_along(
-        close_other_directions(free, linear, along), figures.OMEGA, along.hand, along.tool
+        close_other_directions(free, linear, along), summary_values.OMEGA, along.hand, along.tool
     )
-    H = absorb_impedances(with_hand, hand=-figures.S_AT_OMEGA * axis.hand_mass)
-    closed_form = hybrid_matrix(axis, figures.S_AT_OMEGA)
+    H = absorb_impedances(with_hand, hand=-summary_values.S_AT_OMEGA * axis.hand_mass)
+    closed_form = hybrid_matrix(axis, summary_values.S_AT_OMEGA)
     progress(0.3)
     summary: dict[str, Any] = {
         "direction": direction,
@@ -110,20 +109,20 @@ def _analyze_in_stages(
         "wall_is": describe_wall_source(scenario, along.axis.wall_stiffness > 0.0),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            figures.summarise_diagram_stability(
+            summary_values.summarise_diagram_stability(
                 name, close_all_loops(system, linear), one_axis, sampling
             )
             for name, system, one_axis in points
         ],
-        "two_port": figures.two_port_deviations(with_hand, axis, sampling),
-        "margins": figures.margin_rows(axis, sampling, wall[0]),
-        "absolute": figures.absolute_stability_values(H, axis),
-        "bounded": figures.stiffest_stable_walls(H, axis, sampling),
-        "transparency": figures.transparency_values(H, axis, wall),
-        "z_width": figures.virtual_wall_limits(axis, sampling),
+        "two_port": summary_values.two_port_deviations(with_hand, axis, sampling),
+        "margins": summary_values.margin_rows(axis, sampling, wall[0]),
+        "absolute": summary_values.absolute_stability_values(H, axis),
+        "bounded": summary_values.stiffest_stable_walls(H, axis, sampling),
+        "transparency": summary_values.transparency_values(H, axis, wall),
+        "z_width": summary_values.virtual_wall_limits(axis, sampling),
     }
     progress(1.0)
-    maps = figures.parameter_maps(axis, wall, sampling, stage)
+    maps = summary_values.parameter_maps(axis, wall, sampling, stage)
     summary["maps"] = [
         {
             "title": title,
@@ -137,7 +136,7 @@ def _analyze_in_stages(
     summary["measured"] = None
     if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        summary["measured"] = figures.measure_free_impedance(
+        summary["measured"] = summary_values.measure_free_impedance(
             linear, along, close_other_directions(free, linear, along)
         )
         measured(1.0)
@@ -145,20 +144,19 @@ def _analyze_in_stages(
     summary["verdict"] = verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
-        loop = cut_loop(figures.axis_with_grip(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
-    return summary, ReportCurves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
+        loop = cut_loop(summary_values.axis_with_grip(contact, grip), sampling)
+        nyquist[grip] = -loop_response(loop, summary_values.OMEGA, axis.delay)
+    return summary, ReportCurves(axis, summary_values.OMEGA, H, closed_form, wall, nyquist, maps)
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
     """Return the source of the analysed wall stiffness as text."""
     if scenario.first_sheet_spring is not None:
         return "the leaf"
-    surroundings = scenario.surroundings
     if is_known:
         return "the wall, in series with the tool"
-    kinds = () if surroundings is None else surroundings.parts
-    names = " and ".join(type(part).__name__.lower() for part in kinds)
+    parts = () if scenario.surroundings is None else scenario.surroundings.parts
+    names = " and ".join(type(part).__name__.lower() for part in parts)
     return "the paper's" + (f", because a {names} is not analysed" if names else "")
 
 
@@ -173,7 +171,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 
 def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m] in its base frame B that bends the leaf by 5 mm."""
+    """Return the master's displacement [m], in B, that commands the tip 5 mm into the leaf."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -182,10 +180,8 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
             where="kinematic_scaling.translation_scale",
             remedy="choose a scale above 0, or leave the sheet spring (sheet_spring) out",
         )
-    tip = NominalSlave(scenario.slave).start_tip
-    displacement = (
-        np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _TIP_DEPTH_IN_LEAF_M] - tip
-    )
+    goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _TIP_DEPTH_IN_LEAF_M]
+    displacement = goal - NominalSlave(scenario.slave).start_tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ displacement / scaling.translation_scale)
 

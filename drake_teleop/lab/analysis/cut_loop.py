@@ -71,7 +71,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 0.0) -> Complex:
-    """Return the response (N, ...) at `omega` [rad/s]; stability limit: 1."""
+    """Return the response L (N, ...) with delay at `omega` (N,) [rad/s]; stability limit: 1."""
     dimensions = max(loop.period_s.ndim, np.ndim(one_way_delay_s))
     w = np.atleast_1d(np.asarray(omega, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period_s)[..., None]
@@ -81,13 +81,15 @@ def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 
 
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
-    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf."""
+    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf.
+
+    `response` (N,) is from `loop_response`, at increasing frequencies.
+    """
     if np.abs(response).max() < _MAX_GAIN_OF_NO_LOOP:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    lag = np.mod(
-        _interpolate_in_steps(np.unwrap(angle), _zero_crossing_fractions(log_gain)), 2 * np.pi
-    )
+    crossings = _zero_crossing_fractions(log_gain)
+    lag = np.mod(_interpolate_in_steps(np.unwrap(angle), crossings), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
     fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
@@ -106,7 +108,7 @@ def _interpolate_in_steps(value: Array, fraction: Array) -> Array:
 
 
 def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDArray[np.int64]:
-    """Return the number of unstable eigenvalues of the closed loop."""
+    """Return the number of multipliers outside the unit circle of the loop closed with delay."""
     D = (2 * np.asarray(one_way_delay_s) / loop.period_s)[..., None]
     angles = loop.gain_crossing_angles
     turns = (loop.gain_crossing_phases - D * angles) / (2 * np.pi)
@@ -145,9 +147,8 @@ def _gain_crossings_into(opened, closed, angles, found):
         if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        at, values = _angles_with_gain_extremes_and_responses(
-            _add_pole_angles(angles, poles), poles, zeros
-        )
+        more = _add_pole_angles(angles, poles)
+        at, values = _angles_with_gain_extremes_and_responses(more, poles, zeros)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase

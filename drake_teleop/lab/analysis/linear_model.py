@@ -16,8 +16,8 @@ from drake_teleop.lab.analysis.one_axis import Complex
 COMPONENT_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 _MAX_STATES_FOR_DENSE_EIGENVALUES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # Hz, limit of the sparse search
-_EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
+_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # limit of the sparse search
+_EIGENVALUES_PER_SHIFT = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +43,15 @@ class Linearization:
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
-        rows = self._find_component_indices(outputs, self.outputs)
-        columns = self._find_component_indices(inputs, self.inputs)
+        rows = self._component_indices(outputs, self.outputs)
+        columns = self._component_indices(inputs, self.inputs)
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
         A = self.A + self.B[:, columns] @ self.C[list(rows)]
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return the response (n, outputs, inputs) at omega (n,) [rad/s]."""
+        """Return the response (n, outputs, inputs) at omega (n,) [rad/s], with closed loops."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
         # Solve for each frequency: a chain of delays has no basis of eigenvectors.
@@ -132,9 +132,7 @@ class Linearization:
         )
 
     @staticmethod
-    def _find_component_indices(
-        names: str | Sequence[str], known: tuple[str, ...]
-    ) -> tuple[int, ...]:
+    def _component_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
         parts = port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})

@@ -1,4 +1,4 @@
-"""The station's Diagram, linearised at rest by simulation (long: all loops, states and steps).
+"""The station's Diagram, linearised at rest by simulations of one period with displaced states.
 
 The loops are cut at (T63)
 
@@ -56,9 +56,7 @@ _ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 = 20.0  # of a joint: within the motors' torque
 _JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
-_MAX_RELATIVE_MOTION_PER_PERIOD_AT_REST = (
-    1e-6  # motion per period at rest, relative to the displacements
-)
+_MAX_MOTION_PER_PERIOD_AT_REST = 1e-6  # relative to the displacements
 _MAX_EQUILIBRIUM_NEWTON_STEPS = 8  # of Newton's method
 _TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = 0.3, 0.1  # motion, then rest
 
@@ -84,18 +82,10 @@ def linearize(
     B = period.differentiate_by_input(x)
     affects = _states_affecting_outputs(A, C)
     names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
-    D = np.zeros((len(C), B.shape[1]))
+    inputs, outputs = port_component_names(*_INPUT_PORTS), port_component_names(*_OUTPUT_PORTS)
     A, B, C = A[np.ix_(affects, affects)], B[affects], C[:, affects]
-    return Linearization(
-        A,
-        B,
-        C,
-        D,
-        period.dt,
-        names,
-        port_component_names(*_INPUT_PORTS),
-        port_component_names(*_OUTPUT_PORTS),
-    )
+    D = np.zeros((len(outputs), len(inputs)))
+    return Linearization(A, B, C, D, period.dt, names, inputs, outputs)
 
 
 def linearize_station(
@@ -123,13 +113,12 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 
 def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
-    """Return the network delays of pose and wrench in hand periods."""
+    """Return the network delays of pose and wrench in whole hand periods; 0: no network."""
     lines = scenario.channel.networks_of_directions()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
         return 0, 0
-    ahead, back = (
-        max(1, round(max(line.delay, line.playout) * scenario.rates.hand_hz)) for line in lines
-    )
+    rate = scenario.rates.hand_hz
+    ahead, back = (max(1, round(max(line.delay, line.playout) * rate)) for line in lines)
     return ahead, back
 
 
@@ -206,12 +195,9 @@ class _PeriodSimulator:
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # The arm moves only a small part of a command in one period.
         self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 / gain)
-        has_contact = smooth.surroundings is not None
-        self._joint_step = (
-            min(self._command_step, _JOINT_DIFFERENCE_STEP_IN_CONTACT)
-            if has_contact
-            else self._command_step
-        )
+        self._joint_step = self._command_step
+        if smooth.surroundings is not None:
+            self._joint_step = min(self._command_step, _JOINT_DIFFERENCE_STEP_IN_CONTACT)
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
@@ -276,9 +262,8 @@ class _PeriodSimulator:
             if group.discrete_group is None:
                 parts.append(context.get_continuous_state_vector().CopyToVector())
             else:
-                parts.append(
-                    context.get_discrete_state(group.discrete_group).value()[group.indices]
-                )
+                state = context.get_discrete_state(group.discrete_group).value()
+                parts.append(state[group.indices])
         return np.concatenate(parts)
 
     def _set_state(self, x: Array) -> None:
@@ -294,9 +279,8 @@ class _PeriodSimulator:
 
     def _apply_input_changes(self, u: Array) -> None:
         self._fix_input_port("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix_input_port(
-            "inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12])
-        )
+        command = _displace_pose(self._pose, u[6:12])
+        self._fix_input_port("inverse_kinematics", "pose_command", command)
         self._fix_input_port("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
@@ -337,15 +321,9 @@ class _PeriodSimulator:
         pose_B[4:] += displacement
         q = self._device.inverse_kinematics(pose_B)
         context = self._get_context("master_device")
-        rest = (
-            np.append(q, np.zeros(len(q))),
-            pose_B,
-            np.zeros(6),
-            initial_display_state(
-                self._device.coordinates_for_force_display(q), self._device.parameters
-            ),
-        )
-        for group, value in enumerate(rest):
+        x_B = self._device.coordinates_for_force_display(q)
+        display = initial_display_state(x_B, self._device.parameters)
+        for group, value in enumerate((np.append(q, 0.0 * q), pose_B, np.zeros(6), display)):
             context.SetDiscreteState(group, value)
         target = self._evaluate_output("kinematic_scaling", "pose_command")
         ramp = round(_TIME_TO_OPERATING_POINT_S / self.dt) if displacement.any() else 0
@@ -355,9 +333,8 @@ class _PeriodSimulator:
             self._pose = start + share * (target - start)
             self._apply_input_changes(np.zeros(24))
             self._run_one_period()
-        return self._find_equilibrium_state_and_derivatives(
-            self._balance_hand_force_and_get_state()
-        )
+        x = self._balance_hand_force_and_get_state()
+        return self._find_equilibrium_state_and_derivatives(x)
 
     def _balance_hand_force_and_get_state(self) -> Array:
         self._wrench = self._evaluate_output("force_scaling", "wrench_B")
@@ -373,7 +350,7 @@ class _PeriodSimulator:
             free = slave & _states_affecting_outputs(A, C)
             self._set_state(x)
             moved = self._run_one_period() - x
-            if (np.abs(moved) < _MAX_RELATIVE_MOTION_PER_PERIOD_AT_REST * self._sizes)[free].all():
+            if (np.abs(moved) < _MAX_MOTION_PER_PERIOD_AT_REST * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
@@ -403,9 +380,8 @@ class _PeriodSimulator:
     def differentiate_by_input(self, x: Array) -> Array:
         B = np.empty((len(x), 24))
         pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
-        for k, step in enumerate(
-            np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
-        ):
+        steps = np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
+        for k, step in enumerate(steps):
             ends = []
             for sign in (1.0, -1.0):
                 self._set_state(x)
@@ -416,19 +392,13 @@ class _PeriodSimulator:
 
 
 def _displace_pose(pose: Array, change: Array) -> Array:
-    return np.concatenate(
-        [
-            quaternion_product(quaternion_exponential(tuple(change[3:])), pose[:4]),
-            pose[4:] + change[:3],
-        ]
-    )
+    rotated = quaternion_product(quaternion_exponential(tuple(change[3:])), pose[:4])
+    return np.concatenate([rotated, pose[4:] + change[:3]])
 
 
 def _pose_difference(pose: Array, other: Array) -> Array:
-    turn = quaternion_logarithm(
-        quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
-    )
-    return np.concatenate([pose[4:] - other[4:], turn])
+    rotation = quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
+    return np.concatenate([pose[4:] - other[4:], quaternion_logarithm(rotation)])
 
 
 def _without_nonlinear_parts(scenario: Scenario) -> Scenario:

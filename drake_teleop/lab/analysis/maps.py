@@ -30,9 +30,8 @@ from drake_teleop.lab.analysis.transparency import ideal_impedance
 RATE_NAME = "rate"
 _PARAMETER_NAMES = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {RATE_NAME, "low_pass_hz"}
 _NUM_STABILITY_LIMIT_BISECTIONS = 10
-_DISTORTION_FREQUENCIES_RAD_S = (
-    2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])
-)  # of deliberate movements
+# Frequencies of deliberate movements.
+_DISTORTION_FREQUENCIES_RAD_S = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class StabilityMap:
     x: Array  #: (nx,) values of the first parameter
     y: Array  #: (ny,) values of the second parameter
     num_unstable_multipliers: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
-    distortion: Array  #: (ny, nx), valid only where the loop is stable
+    distortion: Array  #: (ny, nx) `force_distortion`, valid only where the loop is stable
     boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
 
     @property
@@ -53,12 +52,7 @@ class StabilityMap:
 
 
 def stability_map(
-    axis: OneAxis,
-    sampling: Sampling,
-    x_name: str,
-    x: ArrayLike,
-    y_name: str,
-    y: ArrayLike,
+    axis: OneAxis, sampling: Sampling, x_name: str, x: ArrayLike, y_name: str, y: ArrayLike
 ) -> StabilityMap:
     """Return stability and distortion over increasing values of two parameters.
 
@@ -96,7 +90,10 @@ def stability_map(
 def force_distortion(
     axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_FREQUENCIES_RAD_S
 ) -> Array:
-    """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
+    """Return the largest relative error of the operator's force to an ideal station's.
+
+    The maximum is over `frequency` (N,) [rad/s].
+    """
     shape = np.broadcast_shapes(
         loop.period_s.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
     )
@@ -118,9 +115,9 @@ def _check_parameter_values(name: str, values: ArrayLike) -> Array:
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
         raise DrakeTeleopError(
-            "the values do not increase",
+            f"the values (shape {array.shape}) do not increase",
             where=f"stability_map:{name}",
-            remedy="give a list of increasing numbers",
+            remedy="give at least one number, each above the one before",
         )
     return array
 

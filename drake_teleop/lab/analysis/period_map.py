@@ -25,7 +25,7 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 (MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
-_MAX_RATE_OVER_HAND_RATE = 1000
+_MAX_RATE_RATIO = 1000  # over the hand's rate
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,8 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
     flows = {gap: rows.slave_rows(float(gap) * hand_period) for gap in set(gaps)}
-    shape = np.broadcast_shapes(
-        *(part.shape[:-2] for part in (hand, servo, sensor, *flows.values()))
-    )
+    parts = hand, servo, sensor, *flows.values()
+    shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
     M = np.broadcast_to(np.eye(n + 3), (*shape, n + 3, n + 3)).copy()
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
@@ -102,9 +101,8 @@ def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
 def closed_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
     """Return the model with its loop closed over the delay of both ways."""
     periods = 2 * one_way_delay_in_hand_periods(axis, sampling)
-    return cut_axis_model(axis, sampling).close_loop(
-        ["displayed_force"], ["received_force"], periods
-    )
+    cut = cut_axis_model(axis, sampling)
+    return cut.close_loop(["displayed_force"], ["received_force"], periods)
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
@@ -133,13 +131,11 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    if not (
-        1 <= count <= _MAX_RATE_OVER_HAND_RATE and (np.abs(ratios - count) <= 1e-9 * count).all()
-    ):
+    if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
         raise DrakeTeleopError(
-            "is no whole multiple of hand_hz",
+            f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)",
             where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_RATE_OVER_HAND_RATE} times as often",
+            remedy=f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand",
         )
     return count
 
@@ -164,9 +160,7 @@ class _PeriodMapRows:
         self._axis, self._size = axis, size
 
     def _make_row(self, entries: dict[int, Any]) -> Array:
-        values = np.broadcast_arrays(
-            *(np.asarray(value, dtype=float) for value in entries.values())
-        )
+        values = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in entries.values()))
         row = np.zeros((*values[0].shape, self._size))
         for index, value in zip(entries, values, strict=True):
             row[..., index] += value
@@ -176,13 +170,13 @@ class _PeriodMapRows:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
-        hand_force = {
+        force = {
             MASTER_X: -axis.hand_stiffness / mass,
             MASTER_V: -axis.hand_damping / mass,
             _HELD_HAND_FORCE: 1 / mass,
+            RECEIVED_FORCE: -1 / mass,
         }
-        force = self._make_row(hand_force) + self._make_row({RECEIVED_FORCE: -1 / mass})
-        ahead = [force * push[..., i, None] for i in range(2)]
+        ahead = [self._make_row(force) * push[..., i, None] for i in range(2)]
         for i in range(2):
             ahead[i] = ahead[i] + self._make_row({MASTER_X: x[..., i], MASTER_V: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
@@ -196,14 +190,13 @@ class _PeriodMapRows:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
-        contact_force = {
+        force = {
             SLAVE_X: scale * axis.wall_stiffness,
             SLAVE_V: scale * axis.wall_damping,
             _HELD_ENVIRONMENT_FORCE: scale,
+            SERVO_A: axis.force_scale * felt_mass,
         }
-        load_force = {SERVO_A: axis.force_scale * felt_mass}
-        value = self._make_row(contact_force) + self._make_row(load_force)
-        memory = []
+        value, memory = self._make_row(force), []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
             first, second = FIRST_FILTER_STATE + 2 * k, FIRST_FILTER_STATE + 2 * k + 1
@@ -219,19 +212,9 @@ class _PeriodMapRows:
         x, v, push = mass_spring_responses_to_unit_x_v_u(
             axis.wall_stiffness / mass, axis.wall_damping / mass, time
         )
-        rows = []
-        for i in range(2):
-            p = push[..., i]
-            rows.append(
-                self._make_row(
-                    {
-                        SLAVE_X: x[..., i],
-                        SLAVE_V: v[..., i],
-                        SERVO_A: p,
-                        _HELD_ENVIRONMENT_FORCE: -p / mass,
-                    }
-                )
-            )
+        by_force = -push / np.asarray(mass)[..., None]
+        ahead = {SLAVE_X: x, SLAVE_V: v, SERVO_A: push, _HELD_ENVIRONMENT_FORCE: by_force}
+        rows = [self._make_row({k: y[..., i] for k, y in ahead.items()}) for i in range(2)]
         return np.stack(rows, axis=-2)
 
 

@@ -14,14 +14,7 @@ from matplotlib.figure import Figure
 
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.style import (
-    BLACK,
-    COLOURS,
-    GREY,
-    VERMILION,
-    Picture,
-    plot_style,
-)
+from drake_teleop.common.style import BLACK, COLOURS, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.analysis import absolute_stability, transparency
 from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
@@ -211,11 +204,10 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
-        left.fill_between(
-            hertz, np.abs(width.free), np.abs(width.rigid), color=COLOURS[5], alpha=0.35
-        )
-        left.loglog(hertz, np.abs(width.rigid), color=COLOURS[0], label="rigid environment")
-        left.loglog(hertz, np.abs(width.free), color=COLOURS[2], label="free motion")
+        free, rigid = np.abs(width.free), np.abs(width.rigid)
+        left.fill_between(hertz, free, rigid, color=COLOURS[5], alpha=0.35)
+        left.loglog(hertz, rigid, color=COLOURS[0], label="rigid environment")
+        left.loglog(hertz, free, color=COLOURS[2], label="free motion")
         left.set_xlabel("frequency [Hz]")
         left.set_ylabel("|Z| displayed [N s/m]")
         left.set_title("Transmitted through the station")

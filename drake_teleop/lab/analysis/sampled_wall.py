@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, nonnegative_array, positive_array
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.period_map import mass_spring_responses_to_unit_x_v_u
 
@@ -21,8 +20,8 @@ _NUM_STIFFNESS_BISECTIONS = 60
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
     """Return the largest stiffness [N/m] of a passive virtual wall; 0: none is passive (T62)."""
-    b = _check_positive(device_damping, "damping of the device")
-    _check_positive(period, "period")
+    b = positive_array("device_damping", device_damping, *np.shape(device_damping))
+    positive_array("period", period)
     return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
 
 
@@ -34,9 +33,10 @@ def stable_stiffness(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Array:
-    """Return the wall stiffness [N/m] at which the loop becomes unstable; 0: always unstable.
+    """Return the largest stiffness [N/m] of a stable virtual wall with `wall_damping` [N s/m].
 
-    Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
+    0: none is stable. Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device
+    and hand together.
     """
     device = mass, damping, hand_stiffness
     push = _sampled_device_responses_to_unit_x_v_f(*device, period)[2]
@@ -59,7 +59,7 @@ def sampled_poles(
     wall_damping: ArrayLike,
     period: float,
 ) -> Complex:
-    """Return the closed loop's eigenvalues (..., 3) over a sample."""
+    """Return the eigenvalues (..., 3) of device, hand and wall over one period."""
     K, B = np.broadcast_arrays(wall_stiffness, wall_damping)
     x, v, push = _sampled_device_responses_to_unit_x_v_f(mass, damping, hand_stiffness, period)
     # States: position, velocity, last sampled position
@@ -74,22 +74,9 @@ def sampled_poles(
 def _sampled_device_responses_to_unit_x_v_f(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array, Array]:
-    m = _check_positive(mass, "mass of the device")
-    b = _check_positive(damping, "damping of the device")
-    k = np.asarray(stiffness)
-    _check_positive(period, "period")
-    if not np.all(k >= 0):
-        raise DrakeTeleopError(
-            "the stiffness of the hand is negative",
-            where="hand_stiffness",
-            remedy="give 0 or more [N/m]",
-        )
+    m = positive_array("mass", mass, *np.shape(mass))
+    b = positive_array("damping", damping, *np.shape(damping))
+    k = nonnegative_array("hand_stiffness", stiffness, *np.shape(stiffness))
+    positive_array("period", period)
     x, v, push = mass_spring_responses_to_unit_x_v_u(k / m, b / m, period)
     return x, v, push / m[..., None]
-
-
-def _check_positive(value: ArrayLike, what: str) -> Array:
-    value = np.asarray(value, dtype=float)
-    if not np.all(value > 0):
-        raise DrakeTeleopError(f"the {what} is not positive", remedy="give values above 0")
-    return value

@@ -59,9 +59,7 @@ def task_direction(
     check_scenario(scenario)
     n_W = finite_array("direction", direction, 3)
     if not np.linalg.norm(n_W) > 0.0:
-        raise DrakeTeleopError(
-            "has length zero", where="direction", remedy="give a vector (3,) in W"
-        )
+        raise DrakeTeleopError("has length zero", where="direction", remedy="give a vector in W")
     sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
         raise DrakeTeleopError(

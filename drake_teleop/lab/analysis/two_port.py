@@ -61,16 +61,10 @@ def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0,
     b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
     ratio = np.sqrt(b2 / b1)
     h11, h12, h21, h22 = h11 / b1, h12 * ratio, h21 * ratio, h22 * b2
-    determinant = (1 + h11) * (1 + h22) - h12 * h21
-    return (
-        two_port_matrix(
-            (h11 - 1) * (h22 + 1) - h12 * h21,
-            2 * h12,
-            -2 * h21,
-            (1 + h11) * (1 - h22) + h12 * h21,
-        )
-        / determinant[..., None, None]
-    )
+    product = h12 * h21
+    determinant = (1 + h11) * (1 + h22) - product
+    s11, s22 = (h11 - 1) * (h22 + 1) - product, (1 + h11) * (1 - h22) + product
+    return two_port_matrix(s11, 2 * h12, -2 * h21, s22) / determinant[..., None, None]
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.delayed_contact import (
     LEAF_THICKNESSES_M,
     delayed_contact,
     figures_of_station_run,
-    vertical_force_and_energy_traces,
+    force_and_energy_traces,
 )
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
@@ -137,7 +137,10 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none."""
+    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
+
+    `jitter` and `loss` are those of `NetworkConfig`; without both, only the first seed runs.
+    """
     longest = 0.0
     for round_trip in ROUND_TRIPS_S:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -150,7 +153,7 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, with the rates of the comparison."""
+    """Return the scenario without environment and detection, with the comparison's rates."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
@@ -175,7 +178,7 @@ def simulate_press(
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    shown = vertical_force_and_energy_traces(result, setup)
+    shown = force_and_energy_traces(result, setup)
     held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
@@ -198,9 +201,8 @@ def _run_while_stable(
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release_start)
     for part in (hold, task):
-        advance_without_garbage_collection(
-            simulator, 1e-3 * round(1e3 * (settle + part.end))
-        )  # exactly to the event
+        end = 1e-3 * round(1e3 * (settle + part.end))  # exactly at the event
+        advance_without_garbage_collection(simulator, end)
         result = read_recorded_signals(simulator, settle)
         found = figures_of_station_run(result, scenario, part)
         if not found.stable:
@@ -256,11 +258,7 @@ def _run_release_study(
 
 
 def _run_station_study(
-    base: Scenario,
-    networks: Sequence[str],
-    methods: Sequence[str],
-    jobs: int,
-    stage: StartStage,
+    base: Scenario, networks: Sequence[str], methods: Sequence[str], jobs: int, stage: StartStage
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, Array]]]:
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
@@ -272,19 +270,15 @@ def _run_station_study(
         jobs,
         stage("The whole station"),
     )
-    order = {
-        name: list(names).index
-        for name, names in (("network", networks), ("leaf", LEAF_THICKNESSES_M))
-    }
+    leaves = list(LEAF_THICKNESSES_M)
     rows = sorted(
         (row for row, _ in results),
-        key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
+        key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])),
     )
-    first = next(iter(LEAF_THICKNESSES_M))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results
-        if row["leaf"] == first and shown
+        if row["leaf"] == leaves[0] and shown
     }
     return rows, traces
 
@@ -307,9 +301,7 @@ def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     return rows
 
 
-def _run_in_processes(
-    function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any
-) -> list[Any]:
+def _run_in_processes(function: Any, cases: list[Any], jobs: int, progress: Any) -> list[Any]:
     from joblib import Parallel, delayed
 
     results = []

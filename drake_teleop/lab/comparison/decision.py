@@ -59,9 +59,8 @@ def _summarise_runs_of_method(
     runs: Sequence[Mapping[str, Any]], leaked_J_in_release_and_taps: float
 ) -> MethodResult:
     if not all(run["stable"] for run in runs):
-        return MethodResult(
-            VERDICT_UNSTABLE, motion_texts=tuple(map(_describe_motion_in_hold, runs))
-        )
+        motions = tuple(map(_describe_motion_in_hold, runs))
+        return MethodResult(VERDICT_UNSTABLE, motion_texts=motions)
     leaked = max(leaked_J_in_release_and_taps, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_POSITION_ERROR_M:

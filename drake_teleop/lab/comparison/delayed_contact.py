@@ -31,7 +31,7 @@ LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task for a round-trip delay [s]."""
+    """Return the times of the task; longer round trips [s] have longer waits."""
     return Task(
         swing_start=0.3,
         swing_end=1.8,
@@ -104,25 +104,18 @@ def leaf_thickness(stiffness: float) -> float:
 
 
 def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
-    """Return the measures of a run of the task."""
-    heights, turned = _slave_heights_and_rotations(result, scenario)
-    scaling = scenario.force_scaling
-    return figures_of_traces(
-        t=result.t,
-        master=result["pose_command"][:, 6],
-        slave=heights,
-        felt=result["force_to_master"][:, 2],
-        pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        energy=injected_energy(result, scenario),
-        task=task,
-        turned=turned,
-    )
+    """Return the measures of a station's run of the task, along z of the world."""
+    traces = force_and_energy_traces(result, scenario)
+    traces |= {"master": result["pose_command"][:, 6]}
+    traces["slave"], traces["turned"] = _slave_height_and_rotation(result, scenario)
+    return figures_of_traces(**traces, task=task)
 
 
-def vertical_force_and_energy_traces(
-    result: SimulationResult, scenario: Scenario
-) -> dict[str, Array]:
-    """Return a run's t [s], vertical forces at the master's scale [N] and energy [J]."""
+def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
+    """Return a run's t [s], vertical forces at the master's scale [N] and `injected_energy` [J].
+
+    "felt" is the displayed force, "pressed" the scaled true contact force.
+    """
     scaling = scenario.force_scaling
     return {
         "t": result.t,
@@ -140,9 +133,7 @@ def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 
 
-def _slave_heights_and_rotations(
-    result: SimulationResult, scenario: Scenario
-) -> tuple[Array, Array]:
+def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> tuple[Array, Array]:
     arm = slave_arm(scenario)
     poses = np.empty((len(result.t), 7))
     for pose, state in zip(poses, result["slave_state"], strict=True):

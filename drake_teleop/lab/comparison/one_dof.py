@@ -32,8 +32,8 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: period of the channel [s]
 _SUBSTEPS_PER_CHANNEL_PERIOD = 20
-_DEVICE_FRICTION_SPEED_M_S = 5e-3  # m/s, regularisation of the device's Coulomb friction
-_SLAVE_FRICTION_SPEED_M_S = 1e-3  # m/s, regularisation of the slave's friction
+# Speeds that regularise the Coulomb friction.
+_DEVICE_FRICTION_SPEED_M_S, _SLAVE_FRICTION_SPEED_M_S = 5e-3, 1e-3
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
@@ -81,11 +81,7 @@ class OneDof(AxisParameters):
 
 
 REFERENCE = OneDof(
-    hand_mass=0.2,
-    hand_damping=5.0,
-    hand_stiffness=300.0,
-    position_gain=58.5,
-    velocity_gain=234.0,
+    hand_mass=0.2, hand_damping=5.0, hand_stiffness=300.0, position_gain=58.5, velocity_gain=234.0
 )
 """Model of the figures in docs/delay.md, notebook 02 and benchmarks/README.md.
 
@@ -192,9 +188,8 @@ def run_one_dof(
     ]
     states = [network.initial_network_state(line, np.zeros(PACKET_SIZE)) for line in lines]
     ends = initial_state_of_ends(passivity.method, p, start)
-    stored = float(
-        ends[MASTER_METHOD_MEMORY][STORED_ENERGY][0] + ends[SLAVE_METHOD_MEMORY][STORED_ENERGY][0]
-    )
+    memories = ends[MASTER_METHOD_MEMORY], ends[SLAVE_METHOD_MEMORY]
+    stored = float(memories[0][STORED_ENERGY][0] + memories[1][STORED_ENERGY][0])
     numbers = (
         model.device_mass, model.device_friction, model.slave_mass, model.servo_stiffness,
         model.servo_damping, model.ideal_servo, model.slave_friction, model.motor_lag,
@@ -224,9 +219,8 @@ def operator_intent(task: Task = Task()) -> Array:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION_M)
-    fade = np.minimum(
-        _smooth_ramp(t, task.swing_start, 0.5), 1 - _smooth_ramp(t, task.swing_end - 0.5, 0.5)
-    )
+    fading_out = _smooth_ramp(t, task.swing_end - 0.5, 0.5)
+    fade = np.minimum(_smooth_ramp(t, task.swing_start, 0.5), 1 - fading_out)
     x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing_start))
     pressing = _smooth_ramp(t, task.press_start, task.press_end - task.press_start)
     releasing = _smooth_ramp(t, task.release_start, task.release_end - task.release_start)
@@ -240,6 +234,7 @@ def _smooth_ramp(t: Array, start: float, length: float) -> Array:
 
 
 def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
+    """Return the measures of a run with the intended motion of `task`."""
     return figures_of_traces(
         t=run.t,
         master=run.master_position,
@@ -277,11 +272,10 @@ def figures_of_traces(
 
     hold = window_slice(task.release_start - task.rest_window, task.release_start)
     rest = window_slice(task.end - task.rest_window, task.end)
-    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in (hold, rest))
-    angles = () if turned is None else turned.T
-    turning = max(
-        (_range_about_parabola(x[part]) for x in angles for part in (hold, rest)), default=0.0
-    )
+    swing = window_slice(task.swing_start, task.swing_end)
+    parts, angles = (hold, rest), () if turned is None else turned.T
+    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in parts)
+    turning = max((_range_about_parabola(x[part]) for x in angles for part in parts), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -296,9 +290,7 @@ def figures_of_traces(
         chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(
-            np.sqrt(np.mean(felt[window_slice(task.swing_start, task.swing_end)] ** 2))
-        ),
+        free_force=float(np.sqrt(np.mean(felt[swing] ** 2))),
         rise_delay=_rise_delay_in_samples(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
@@ -306,10 +298,6 @@ def figures_of_traces(
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
-    return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
-
-
-def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     s = 1j * _RESISTANCE_FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -318,8 +306,8 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     delay_factor = np.exp(-s * (round_trip + 1.5 * PERIOD))
     contact = model.gamma * model.wall_stiffness / s
     inertia = model.sigma * model.tool_mass * s
-    felt = model.force_scale * (contact + inertia) * closed_loop * delay_factor
-    return np.asarray(felt.real)
+    displayed = model.force_scale * (contact + inertia) * closed_loop * delay_factor
+    return max(0.0, -float(displayed.real.min()))
 
 
 def _range_about_parabola(x: Array) -> float:

@@ -66,7 +66,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
         release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
         release_way=float(np.abs(after - after[0]).max()),
         tap_shares=tuple(
-            _displayed_tap_impulse_share(found, scale, rate, 0.5 * round_trip)
+            _tap_impulse_share(found, scale, rate, 0.5 * round_trip)
             for found, rate in zip(tapping, TAP_RATES_HZ, strict=True)
         ),
         leaked=max(max(0.0, -found.least_energy_sum(ACTUAL)) for found in (released, *tapping)),
@@ -80,9 +80,7 @@ def _intended_tap_motion(rate: float, round_trip: float) -> Array:
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
-def _displayed_tap_impulse_share(
-    run: OneDofRun, scale: float, rate: float, one_way_delay_s: float
-) -> float:
+def _tap_impulse_share(run: OneDofRun, scale: float, rate: float, one_way_delay_s: float) -> float:
     first = int(np.argmax(run.wall_force < 0.0))
     second = first + round(0.75 / rate / PERIOD)  # between first and second contact
     pressed = scale * run.wall_force[second:].sum()

@@ -88,9 +88,7 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             x, y = networks.index(network), methods.index(method)
             mark, colour, text_colour = VERDICT_STYLES[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
-            lines = [
-                f"displays {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.force_pairs
-            ]
+            lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
             lines += cell.motion_texts
             offset = 0.12 * len(lines)
             axes.text(
@@ -121,18 +119,11 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
 
 def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
+    shares = [f"displayed share of taps at {rate:g} Hz [%]" for rate in TAP_RATES_HZ]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
-        (
-            f"displayed share of taps at {TAP_RATES_HZ[0]:g} Hz [%]",
-            "linear",
-            lambda row: 100 * row["tap_shares"][0],
-        ),
-        (
-            f"displayed share of taps at {TAP_RATES_HZ[1]:g} Hz [%]",
-            "linear",
-            lambda row: 100 * row["tap_shares"][1],
-        ),
+        (shares[0], "linear", lambda row: 100 * row["tap_shares"][0]),
+        (shares[1], "linear", lambda row: 100 * row["tap_shares"][1]),
     )
     with plot_style():
         figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))
@@ -176,9 +167,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
     figure = _draw_trace_grid(summary, traces, draw_run_energy, "energy [J]")
     figure.suptitle(
-        "Energy between hand and actual motion:\nbelow 0 the station is active",
-        x=0.01,
-        ha="left",
+        "Energy between hand and actual motion:\nbelow 0 the station is active", x=0.01, ha="left"
     )
     return figure
 

@@ -41,7 +41,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
         )
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
-    poses, motor = _sensor_poses_and_motor_wrenches(scenario, q, torque)
+    poses, motor = _poses_and_motor_wrenches(scenario, q, torque)
     contact = np.zeros_like(motor)
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
@@ -65,8 +65,8 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the work (N, 2) [J] of the load's displayed wrench, for translation and rotation."""
-    arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
-    q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
+    arm, t = slave_arm(scenario), result.t
+    q, v = np.split(np.ascontiguousarray(result["slave_state"]), [arm.num_joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))
     for k in range(len(t)):
         pose_into(arm.table, q[k], poses[k])
@@ -89,14 +89,13 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the passivity method's initial energy (2,) [J], for translation and rotation."""
+    """Return the energy (2,) stored at both ends at the start [J], by translation and rotation."""
     scales = _kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return (
-        2 * energy_balance(methods.initial_method_memory(scenario.passivity.method, p, pose)).stored
-    )
+    memory = methods.initial_method_memory(scenario.passivity.method, p, pose)
+    return 2 * energy_balance(memory).stored
 
 
 def _kinematic_scales(scenario: Scenario) -> Array:
@@ -105,10 +104,8 @@ def _kinematic_scales(scenario: Scenario) -> Array:
     return np.where(scales > 0.0, scales, 1.0)
 
 
-def _sensor_poses_and_motor_wrenches(
-    scenario: Scenario, q: Array, torque: Array
-) -> tuple[Array, Array]:
-    """Return X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight."""
+def _poses_and_motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
+    # X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight.
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)
     poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))

@@ -69,29 +69,25 @@ def check_motion(
 ) -> list[LimitUse]:
     """Return the use of every limit by q, qd, qdd (T, n) at times t (T,) [s], largest first."""
     names, limits = robot.arm.joint_names, robot.limits
-    torque, sensor, workspace, clearance, nearest = _evaluate_limited_quantities(
-        robot, q, qd, qdd, progress
-    )
+    quantities = _evaluate_limited_quantities(robot, q, qd, qdd, progress)
+    torque, sensor, workspace, clearance, nearest = quantities
     uses = [
-        _find_largest_limit_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
-        _find_largest_limit_use("velocity", np.abs(qd) / limits.velocity, t, names),
-        _find_largest_limit_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _find_largest_limit_use("torque", np.abs(torque) / limits.max_torques, t, names),
-        _find_largest_limit_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
-        _find_largest_limit_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
-        _find_largest_limit_use("clearance", clearance[:, np.newaxis], t, ("",)),
+        _largest_limit_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
+        _largest_limit_use("velocity", np.abs(qd) / limits.velocity, t, names),
+        _largest_limit_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
+        _largest_limit_use("torque", np.abs(torque) / limits.max_torques, t, names),
+        _largest_limit_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
+        _largest_limit_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _largest_limit_use("clearance", clearance[:, np.newaxis], t, ("",)),
     ]
     uses[-1] = replace(uses[-1], where=nearest[int(np.argmax(clearance))])
     without_end = {"position": limits.q_half, "workspace": limits.box_half}
     missing = [name for name, half in without_end.items() if np.isinf(half).all()]
-    return sorted(
-        (use for use in uses if use.limit_name not in missing), key=lambda use: -use.used_share
-    )
+    uses = [use for use in uses if use.limit_name not in missing]
+    return sorted(uses, key=lambda use: -use.used_share)
 
 
-def _find_largest_limit_use(
-    limit: str, shares: Array, t: Array, names: tuple[str, ...]
-) -> LimitUse:
+def _largest_limit_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> LimitUse:
     when, which = np.unravel_index(np.argmax(shares), shares.shape)
     return LimitUse(limit, float(shares[when, which]), float(t[when]), names[which])
 
@@ -131,9 +127,8 @@ def _evaluate_limited_quantities(
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = scene.scene_graph.get_query_output_port().Eval(scene_context)
-        distance, words = _nearest_shape_pair(
-            scene, query, limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
-        )
+        reach = limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
+        distance, words = _nearest_shapes(scene, query, reach)
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
@@ -151,9 +146,7 @@ def _norms_at_sensor(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) 
     return np.linalg.norm([force, torque, s, alpha], axis=2).T
 
 
-def _nearest_shape_pair(
-    scene: CollisionScene, query: QueryObject, reach: float
-) -> tuple[float, str]:
+def _nearest_shapes(scene: CollisionScene, query: QueryObject, reach: float) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all shapes are farther"

@@ -218,7 +218,7 @@ class CollisionScene:
     def bounding_capsules_and_pairs(
         self, candidates: dict[_ShapePair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
-        """Return links, ends, radii, pairs and minimum distances of capsules around the shapes."""
+        """Return capsules around the shapes, as the fields of `Limits` from `capsule_links` on."""
         inspector = self.scene_graph.model_inspector()
         motions = allocate_link_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
@@ -235,21 +235,17 @@ class CollisionScene:
             if row >= 0:
                 *_, p_WL, R_WL = np.split(motions[0, row], [9, 12])
                 X_WL = RigidTransform(RotationMatrix(R_WL.reshape(3, 3)), p_WL)
-            capsule = bounding_capsule(inspector.GetShape(shape))
-            capsules[shape] = (
-                row,
-                capsule.transformed(X_WL.InvertAndCompose(X_WB) @ inspector.GetPoseInFrame(shape)),
-            )
+            X_LG = X_WL.InvertAndCompose(X_WB) @ inspector.GetPoseInFrame(shape)
+            capsules[shape] = row, bounding_capsule(inspector.GetShape(shape)).transformed(X_LG)
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
-        outer_shapes = sorted({outer[shape] for shape in outer}, key=GeometryId.get_value)
+        outer_shapes = sorted(set(outer.values()), key=GeometryId.get_value)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
             first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
-            shape_distances[first, second] = np.minimum(
-                of_pair, shape_distances.get((first, second), np.inf)
-            )
+            known = shape_distances.get((first, second), np.inf)
+            shape_distances[first, second] = np.minimum(of_pair, known)
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         outer_capsules = [capsules[shape][1] for shape in outer_shapes]
@@ -266,12 +262,8 @@ class CollisionScene:
             if near.sum() >= _MIN_POSTURES_NEAR_CONTACT:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                useful = (
-                    near.any()
-                    or 0
-                    < np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M)
-                    < _MAX_SHARE_OF_RARE_CAPSULE_CONTACT
-                )
+                near_share = np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M)
+                useful = near.any() or 0 < near_share < _MAX_SHARE_OF_RARE_CAPSULE_CONTACT
             if useful:
                 used.append(k)
                 distances.append(distance)
@@ -280,19 +272,14 @@ class CollisionScene:
 
 def _required_capsule_distance(shape_distances: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
-    touching = (shape_distances > _NEAR_CONTACT_GAPS_M[0]) & (
-        shape_distances < _NEAR_CONTACT_GAPS_M[1]
-    )
+    low, high = _NEAR_CONTACT_GAPS_M
+    touching = (shape_distances > low) & (shape_distances < high)
     excess = np.zeros(1)
     if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT:
         excess = (shape_distances - capsules_apart)[touching]
+    required = MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE)
     free = capsules_apart[shape_distances > MIN_CLEARANCE_M]
-    return float(
-        min(
-            MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),
-            np.quantile(free, _BLOCKABLE_POSTURE_SHARE),
-        )
-    )
+    return float(min(required, np.quantile(free, _BLOCKABLE_POSTURE_SHARE)))
 
 
 def _exclude_coaxial_pairs(
@@ -327,9 +314,7 @@ def _add_load(
     moments, products = np.diag(unit), unit[np.triu_indices(3, 1)]
     inertia = SpatialInertia(mass, phi[1:4] / mass, UnitInertia(*moments, *products))
     body = plant.AddRigidBody("drake_teleop_reserve", instance, inertia)
-    plant.AddJoint(
-        WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform.Identity())
-    )
+    plant.AddJoint(WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform()))
 
 
 def _complete_collision_shapes(

@@ -54,7 +54,7 @@ def limited_gyration_radius(phi: Array) -> float:
 
 
 class Criterion:
-    """One of `CRITERIA` as a smooth function of the motion."""
+    """Criterion `name` in `CRITERIA`, exact and as a smooth function; smaller is better."""
 
     def __init__(self, name: str, scales: CriterionScales) -> None:
         if name not in CRITERIA:
@@ -97,7 +97,10 @@ class Criterion:
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
+        """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10).
+
+        The duration's factor is omitted.
+        """
         rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1])
@@ -150,15 +153,8 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
 
 def _acceptable_errors(phi: Array) -> Array:
     inertia = _MAX_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_MAX_OFFSET_ERRORS, 3)
-    return np.array(
-        [
-            *offsets,
-            _MAX_RELATIVE_MASS_ERROR * phi[0],
-            *3 * [_MAX_COM_ERROR_M * phi[0]],
-            *6 * [inertia],
-        ]
-    )
+    mass, moment = _MAX_RELATIVE_MASS_ERROR * phi[0], _MAX_COM_ERROR_M * phi[0]
+    return np.repeat([*_MAX_OFFSET_ERRORS, mass, moment, inertia], [3, 3, 1, 3, 6])
 
 
 def _smooth_maximum_and_weights(values: Array, sharpness: float) -> tuple[float, Array]:

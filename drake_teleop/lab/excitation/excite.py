@@ -124,22 +124,18 @@ def assemble_excitation(
     trajectory: FourierTrajectory,
     uses: list[LimitUse],
 ) -> Excitation:
+    motion = trajectory_sensor_motion(robot, trajectory)
+    noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
     best = accumulate((iterate.criterion_value for iterate in iterates), min)
+    history = [(it.num_evaluations, value) for it, value in zip(iterates, best, strict=True)]
     return Excitation(
         robot,
         trajectory,
         criterion,
         criterion_values(robot, trajectory),
-        predicted_deviations(
-            *trajectory_sensor_motion(robot, trajectory),
-            1 / CHECK_RATE_HZ,
-            robot.sensor_noise,
-            robot.limits.heaviest_phi,
-        ),
+        predicted_deviations(*motion, 1 / CHECK_RATE_HZ, noise, phi),
         uses,
-        np.array(
-            [(it.num_evaluations, value) for it, value in zip(iterates, best, strict=True)]
-        ).reshape(-1, 2),
+        np.array(history).reshape(-1, 2),
         iterates[-1].cpu_time_s if iterates else 0.0,
     )
 
@@ -171,7 +167,7 @@ def find_best_within_limits(
 
 
 def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
-    """Return the value of every criterion at 1 kHz."""
+    """Return the value of every criterion by name, from samples at 1 kHz over one period."""
     motion = trajectory_sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.criterion_scales).value(*motion, trajectory.period)

@@ -90,7 +90,7 @@ def write_sensor_motion(motions, out):
 
 
 @njit(cache=True)
-def add_criterion_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
+def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
     """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), from that by V (T, 6, 10)."""
     rows = motions.shape[1]
     seeds, g = np.zeros((rows, SEED_SIZE)), np.empty((3, 3))
@@ -145,7 +145,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
 
 @njit(cache=True)
 def _exact_and_smooth_maximum(use, sharpness):
-    """Return exact and smooth maximum over all of `use` (T, m); `use` becomes the gradient."""
+    # `use` (T, m) becomes the gradient of the smooth maximum.
     top = use.max()
     total = 0.0
     for t in range(use.shape[0]):
@@ -249,13 +249,9 @@ def _write_workspace_use(
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
         seeds[:] = 0.0
+        by_x = use[t] * sign[t]
         for k in range(P):
-            i = 3 * k
-            g = (
-                use[t, i] * sign[t, i],
-                use[t, i + 1] * sign[t, i + 1],
-                use[t, i + 2] * sign[t, i + 2],
-            )
+            g = (by_x[3 * k], by_x[3 * k + 1], by_x[3 * k + 2])
             add_point_to_seed(motions[t, -1], limits.points_S[k], g, seeds[-1])
         _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
@@ -276,16 +272,12 @@ def _write_clearance_use(
         for k in range(K):
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance = _DISTANCE_OF_FAR_CAPSULES_M
-            if not _are_segments_surely_apart(
-                ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M
-            ):
-                distance = (
-                    _segment_distance_and_nearest_into(ends[t, a], ends[t, b], nearest) - reach
-                )
-            use[t, k] = (
-                1.0 - (distance - limits.min_pair_distances[k]) / ZERO_USE_CLEARANCE_MARGIN_M
-            )
+            distance, far = _DISTANCE_OF_FAR_CAPSULES_M, reach + ZERO_USE_CLEARANCE_MARGIN_M
+            if not _are_segments_surely_apart(ends[t, a], ends[t, b], far):
+                distance = _segment_distance_and_nearest_into(ends[t, a], ends[t, b], nearest)
+                distance -= reach
+            excess = distance - limits.min_pair_distances[k]
+            use[t, k] = 1.0 - excess / ZERO_USE_CLEARANCE_MARGIN_M
     largest[6], smooth[6] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
@@ -313,18 +305,15 @@ def _write_clearance_use(
 
 @njit(cache=True)
 def capsule_distances(motions, rows, ends, radii, pairs):
-    """Return the distances (T, K) of K capsule pairs [m]."""
+    """Return the distances (T, K) of K capsule pairs [m]; arguments as in `Limits`."""
     distances = np.empty((len(motions), len(pairs)))
     placed, nearest = np.empty(ends.shape), np.empty(5)
     for t in range(len(motions)):
         _transform_capsules(motions[t], rows, ends, placed)
         for k in range(len(pairs)):
             a, b = pairs[k]
-            distances[t, k] = (
-                _segment_distance_and_nearest_into(placed[a], placed[b], nearest)
-                - radii[a]
-                - radii[b]
-            )
+            distance = _segment_distance_and_nearest_into(placed[a], placed[b], nearest)
+            distances[t, k] = distance - radii[a] - radii[b]
     return distances
 
 
@@ -355,10 +344,8 @@ def _are_segments_surely_apart(first, second, distance):
 
 @njit(cache=True)
 def _segment_distance_and_nearest_into(first, second, nearest):
-    """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
-
-    Write to `nearest` (5,): positions on both segments (0 to 1), unit vector to the first.
-    """
+    # Distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection). `nearest` (5,):
+    # positions on both segments (0 to 1), unit vector to the first.
     dd = ee = de = dr = er = 0.0
     for i in range(3):
         d, e = first[1, i] - first[0, i], second[1, i] - second[0, i]

@@ -124,10 +124,8 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, 
         w, a = vector_at(inboard, _OMEGA_IN_SEED), vector_at(inboard, _ALPHA_IN_SEED)
         gs, gw = plus(gs, vector_at(seed, _S_IN_SEED)), plus(gw, vector_at(seed, _OMEGA_IN_SEED))
         ga, gp = plus(ga, vector_at(seed, _ALPHA_IN_SEED)), plus(gp, vector_at(seed, _P_IN_SEED))
-        gt, gv = (
-            plus(gt, vector_at(seed, _THETA_IN_SEED)),
-            plus(gv, vector_at(seed, _VIRTUAL_V_IN_SEED)),
-        )
+        gt = plus(gt, vector_at(seed, _THETA_IN_SEED))
+        gv = plus(gv, vector_at(seed, _VIRTUAL_V_IN_SEED))
         go = plus(go, vector_at(seed, _VIRTUAL_W_IN_SEED))
         z, slides = (motion[14], motion[17], motion[20]), table[row, IS_PRISMATIC_COLUMN] != 0.0
         if row < n and slides:

@@ -28,7 +28,7 @@ from drake_teleop.station.replay_file import (
 )
 
 _TABLE_COLOUR, _LINK_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
-_TABLE_THICKNESS_M = 0.03  # of the drawn table [m]
+_TABLE_THICKNESS_M = 0.03
 _LINK_RADIUS_TO_LENGTH = 0.04  # radius of a bone over its length
 # Camera position from the middle of the motion, in sizes of the arm.
 _CAMERA_OFFSET_IN_ARM_SIZES = np.array([0.55, -0.75, 0.3])
@@ -43,12 +43,8 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
     poses = [_link_poses(robot, context, posture) for posture in q]
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
-    force = np.linalg.norm(
-        non_contact_wrench(*trajectory_sensor_motion(robot, trajectory), robot.limits.heaviest_phi)[
-            :, :3
-        ],
-        axis=1,
-    )
+    motion = trajectory_sensor_motion(robot, trajectory)
+    force = np.linalg.norm(non_contact_wrench(*motion, robot.limits.heaviest_phi)[:, :3], axis=1)
     samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
     film = ReplayFile(
         f"Excitation of {robot.name}",
@@ -64,9 +60,8 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
     )
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
-        _add_table_and_sensor_path(
-            meshcat, path_S, np.array([X_WB.translation() for X_WB in poses[0][0].values()])
-        )
+        bodies = np.array([X_WB.translation() for X_WB in poses[0][0].values()])
+        _add_table_and_sensor_path(meshcat, path_S, bodies)
         _AddLinkVisuals(meshcat, robot, context)
 
         def show(replay_time: float, frame: int) -> None:

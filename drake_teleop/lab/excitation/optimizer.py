@@ -17,7 +17,7 @@ from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     Limits,
-    add_criterion_gradient_by_joints,
+    add_gradient_by_joints,
     allocate_link_motions,
     finite_half_ranges,
     write_limit_uses,
@@ -98,12 +98,8 @@ class DesignProblem:
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period_s * np.sqrt(task.num_harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
-        spread = np.tile(
-            np.repeat(
-                _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, limits.q_half), task.num_harmonics - 1
-            ),
-            2,
-        )
+        amplitude = _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, limits.q_half)
+        spread = np.tile(np.repeat(amplitude, task.num_harmonics - 1), 2)
         q0 = task.home_posture + 0.1 * rng.standard_normal(len(size))
         if not near_home:
             half = finite_half_ranges(limits.q_half)
@@ -119,14 +115,12 @@ class DesignProblem:
         g[0] = 0.0
         s, omega, alpha = self._vectors
         value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        add_criterion_gradient_by_joints(
-            self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0]
-        )
+        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0])
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[1:])
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
     def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
-        """Return q, qd, qdd (3, T, n) of a motion, and write the motions of links and sensor."""
+        # q, qd, qdd (3, T, n); also writes the motions of links and sensor.
         n = len(self.task.home_posture)
         q_qd_qdd: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q_qd_qdd[0] += x[:n]
@@ -139,7 +133,7 @@ class DesignProblem:
     def _limit_uses(
         self, q_qd_qdd: Array, sharpness: float, gradients: Array
     ) -> tuple[Array, float]:
-        """Return smooth uses (7,) and the exact largest one; write the gradients (7, 3, T, n)."""
+        # Smooth uses (7,) and the exact largest one; writes the gradients (7, 3, T, n).
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
             self.task.arm_table, *q_qd_qdd, self._motions, self.task.limits, sharpness,
@@ -158,10 +152,8 @@ class DesignProblem:
         # (8, free, n), summed over position, velocity, acceleration and time.
         by_coefficients = (self._basis.transpose(0, 2, 1) @ g).sum(axis=1)
         count, free, n = by_coefficients.shape
-        by_coefficients = (
-            by_coefficients.reshape(count, 2, free // 2, n).swapaxes(2, 3).reshape(count, -1)
-        )
-        return np.hstack([by_q0, by_coefficients])
+        by_coefficients = by_coefficients.reshape(count, 2, free // 2, n).swapaxes(2, 3)
+        return np.hstack([by_q0, by_coefficients.reshape(count, -1)])
 
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
@@ -282,20 +274,19 @@ class _DescentSearch:
     def _run_slsqp(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, iterations: int
     ) -> Array:
+        def evaluate(x: Array) -> Evaluation:
+            return self._evaluate_once(x, criterion_sharpness, limit_sharpness)
+
         found: Array = self._minimize(
-            lambda x, *sharpness: self._evaluate_once(x, *sharpness).log_criterion,
+            lambda x: evaluate(x).log_criterion,
             x,
-            (criterion_sharpness, limit_sharpness),
-            "SLSQP",
-            jac=lambda x, *sharpness: self._evaluate_once(x, *sharpness).gradients[0],
+            method="SLSQP",
+            jac=lambda x: evaluate(x).gradients[0],
             bounds=self._problem.bounds(x),
             constraints={
                 "type": "ineq",
-                "fun": lambda x, *sharpness: (
-                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).smooth_limit_uses
-                ),
-                "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
-                "args": (criterion_sharpness, limit_sharpness),
+                "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).smooth_limit_uses,
+                "jac": lambda x: -evaluate(x).gradients[1:],
             },
             options={"maxiter": iterations, "ftol": _SLSQP_TOLERANCE},
         ).x
@@ -319,9 +310,7 @@ class _DescentSearch:
             self._key = key
             if self._last.largest_limit_use <= _MAX_LIMIT_USE_OF_FEASIBLE_MOTION:
                 self._record_iterate(x)
-            elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and self._best_of_start == float(
-                "inf"
-            ):
+            elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and np.isinf(self._best_of_start):
                 raise _InfeasibleStartError
         return self._last
 
@@ -332,9 +321,8 @@ class _DescentSearch:
             self._best = min(value, self._best)
             seconds = time.thread_time() - self._start_time
             trajectory = self._problem.trajectory(x)
-            self.found.append(
-                FeasibleIterate(seconds, self._all_evaluations, self.start, value, trajectory)
-            )
+            counts = self._all_evaluations, self.start
+            self.found.append(FeasibleIterate(seconds, *counts, value, trajectory))
 
     def _count_evaluation(self) -> None:
         self._evaluations += 1

@@ -13,10 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
-from drake_teleop.station.sensor.motion_estimation import (
-    MotionEstimationConfig,
-    fusion_gains,
-)
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_gains
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 
@@ -67,7 +64,10 @@ def predicted_deviations(
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3)."""
+    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3).
+
+    `step` is the sample period [s], `phi` the load (10,).
+    """
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.assumed_wrench_std[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)
@@ -79,11 +79,11 @@ def predicted_covariance(
     if noise.motion_error_filters is not None:
         of_s, of_alpha = noise.motion_error_filters
         of_motion = -spatial_inertia_matrix(phi) @ influence[:, :6]
-        through_s = _filter_backwards_in_time(of_s, of_motion[:, :3], step)
+        through_s = _filter_backwards(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.p_SoAo_S).T @ through_s
         influence[:, 6:9] = through_s
-        influence[:, 9:] = _filter_backwards_in_time(of_alpha, through_alpha, step)
+        influence[:, 9:] = _filter_backwards(of_alpha, through_alpha, step)
     # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
     of_white = _covariance_from_noise_influence(influence, noise.white_noise_densities) / step
@@ -101,9 +101,7 @@ def _motion_error_polynomials(gains: Array, period: float) -> tuple[Array, Array
     return numerator, denominator
 
 
-def _filter_backwards_in_time(
-    polynomials: tuple[Array, Array], signals: Array, step: float
-) -> Array:
+def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
     # Imported late: slower than the station's import.
     from scipy.signal import bilinear, lfilter
 

@@ -20,10 +20,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.arm_from_plant import (
-    check_arm_lengths,
-    fill_missing_joint_limits,
-)
+from drake_teleop.station.slave.arm_from_plant import check_arm_lengths, fill_missing_joint_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import (
@@ -33,7 +30,7 @@ from drake_teleop.station.slave.plant import (
 )
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random postures for distances of shapes
+_NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random
 # Usable share of joint limits; the rest is for tracking errors and feedback.
 _USABLE_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
@@ -185,11 +182,11 @@ def _make_robot(
     postures = middle + finite_half_ranges(half) * random
     candidates, touching = scene.find_collision_candidates_and_touching(postures, start)
     if touching:
-        assumptions.append(
-            f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
-        )
+        names = ", ".join(touching)
+        assumptions.append(f"no clearance required, as they touch in the start posture: {names}")
     rows, ends, radii, pairs, distances = scene.bounding_capsules_and_pairs(candidates, postures)
     phi, std = arm.phi_load, sensor.wrench_std()
+    noise = float(std[0]), float(std[3])
     force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)
     torque = _USABLE_SENSOR_TORQUE_SHARE * min(sensor.torque_range)
     alpha = sensor.angular_acceleration_range
@@ -216,9 +213,7 @@ def _make_robot(
         scene=scene,
         arm=arm,
         limits=limits,
-        criterion_scales=CriterionScales(
-            (float(std[0]), float(std[3])), limited_gyration_radius(phi), phi
-        ),
+        criterion_scales=CriterionScales(noise, limited_gyration_radius(phi), phi),
         sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home_posture=middle if start is None else start,
         assumptions=tuple(assumptions),

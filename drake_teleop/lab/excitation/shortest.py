@@ -26,7 +26,7 @@ from drake_teleop.lab.excitation.excite import (
     find_best_within_limits,
     trajectory_sensor_motion,
 )
-from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_criterion_gradient_by_joints
+from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_gradient_by_joints
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
     DesignProblem,
@@ -94,9 +94,8 @@ def design_shortest_motion(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi) * sidak_factor(
-        len(tolerance.required_entry_names)
-    )
+    errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
+    errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
     task = DesignTask(
         robot.arm.table,
@@ -131,9 +130,8 @@ def design_shortest_motion(
         around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
-            vain_rounds += 1
-            if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period:
-                vain_rounds = 0
+            progressed = trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
+            vain_rounds = 0 if progressed else vain_rounds + 1
             if trajectory.period < shortest_period:
                 excitation = assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
@@ -176,10 +174,9 @@ class ShortestMotionProblem(DesignProblem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = white_noise_densities_over_wrench_noise(
-            robot.sensor_noise, robot.limits.heaviest_phi
-        )
-        self._roots = np.sqrt(robot.sensor_noise.white_noise_densities[:6])
+        noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
+        self._noise = white_noise_densities_over_wrench_noise(noise, phi)
+        self._roots = np.sqrt(noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
@@ -202,13 +199,9 @@ class ShortestMotionProblem(DesignProblem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds of the unknowns; only log T is bounded."""
-        shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
-        around = (
-            np.clip(x[-1] + step, shortest_period, largest)
-            for step in (-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP)
-        )
-        low, high = (float(each) for each in around)
+        """Return bounds of the unknowns; only log T is bounded, near that of x."""
+        ends = x[-1] + np.array([-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP])
+        low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
@@ -218,12 +211,9 @@ class ShortestMotionProblem(DesignProblem):
         self._period = T = float(np.exp(log_period))
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._largest_error_over_tolerance(
-            _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
-        )
-        add_criterion_gradient_by_joints(
-            self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1]
-        )
+        sharpness = _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
+        use, worst, g_V = self._largest_error_over_tolerance(sharpness)
+        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
@@ -242,9 +232,8 @@ class ShortestMotionProblem(DesignProblem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(
-            self._variances_of_estimates(self._weighted_regressor_rows(*motion), period)[0]
-        )
+        rows = self._weighted_regressor_rows(*motion)
+        return np.sqrt(self._variances_of_estimates(rows, period)[0])
 
     def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)

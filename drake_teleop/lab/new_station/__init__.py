@@ -1,7 +1,6 @@
 """`drake-teleop new DIR --arm FILE --sensor-frame NAME`: creation of a station with a custom arm.
 
-It finds a start pose, chooses scales, writes a commented scenario and a picture, and runs it: free
-motion, then contact with a wall.
+It chooses start and scales, writes a commented scenario and a picture, and runs the scenario.
 """
 
 from __future__ import annotations

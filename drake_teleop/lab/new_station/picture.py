@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import (  # type: ignore[import-untyped]
-    Line3DCollection,
-    Poly3DCollection,
-)
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 from scipy.spatial import ConvexHull, QhullError
 
 from drake_teleop.common.numeric import Array
@@ -54,9 +51,8 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
     with plot_style():
         figure = Picture(figsize=(10.0, 5.0), facecolor="white")
         figure.suptitle(f"{title}: start posture", x=0.02, ha="left", fontsize=11)
-        side = np.degrees(
-            np.arctan2(*(plan.lowest_tool_point_W - shapes.arm.table[0, 9:12])[1::-1])
-        )
+        x, y, _ = plan.lowest_tool_point_W - shapes.arm.table[0, 9:12]
+        side = np.degrees(np.arctan2(y, x))
         for k, (elevation, azimuth) in enumerate(_VIEW_ANGLES_DEG):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
             collection = Poly3DCollection(

@@ -90,7 +90,6 @@ class StartPlace(NamedTuple):
         posture_score: merit of the posture, see `posture_scores`, without the cost of overlaps.
         wall_edge_m: edge of the wall that fits below the tool [m].
         moves_only_vertically: True if the arm can only move up and down by `cube_half_m`.
-        has_overlaps: True if shapes of the arm overlap.
     """
 
     pose: Array
@@ -135,9 +134,8 @@ class TrialWalls(Environment):
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
             AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
             shape = Box(edge, edge, _SPACE_ABOVE_TOOL_POINT_M + _SPACE_BELOW_TOOL_POINT_M)
-            plant.RegisterCollisionGeometry(
-                body, RigidTransform(), shape, name, ProximityProperties()
-            )
+            X_BG, properties = RigidTransform(), ProximityProperties()
+            plant.RegisterCollisionGeometry(body, X_BG, shape, name, properties)
 
 
 def _trial_wall_name(edge: float) -> str:
@@ -145,11 +143,7 @@ def _trial_wall_name(edge: float) -> str:
 
 
 def find_start_place(
-    arm: ArmModel,
-    shapes: PostureShapes | None = None,
-    *,
-    plane: float = 0.0,
-    axis: str = "z",
+    arm: ArmModel, shapes: PostureShapes | None = None, *, plane: float = 0.0, axis: str = "z"
 ) -> StartPlace:
     """Find a start at which the tool points down.
 
@@ -162,24 +156,21 @@ def find_start_place(
     pointed = rotate_sensor_frame_of_arm(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
-    can_move_in_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6
+    has_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6
     found = list[StartPlace]()
     for rows in _order_postures_to_solve(pointed, postures, region, shapes):
-        solved = _solve_candidates(
-            pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, can_move_in_six_dof
-        )
+        solved = _solved_starts(pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, has_six_dof)
         found += [_with_largest_wall(shapes, place, region) for place in solved]
         if not all(place.has_overlaps for place in found):
             break
     found.sort(key=lambda place: place.posture_score, reverse=True)
-    good = [
-        place for place in found if place.posture_score > found[0].posture_score - _MAX_SCORE_LOSS
-    ]
+    least_score = found[0].posture_score - _MAX_SCORE_LOSS if found else 0.0
+    good = [place for place in found if place.posture_score > least_score]
     best = None
     for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
         if best is None or best.cube_half_m == 0.0:
             cubes = [
-                _with_reachable_cube(pointed, place, can_move_in_six_dof, vertical)
+                _with_reachable_cube(pointed, place, has_six_dof, vertical)
                 for place in places[:_MAX_TESTED_CUBES]
             ]
             best = max(cubes, key=_merit_of_start_place, default=None)
@@ -230,10 +221,10 @@ def _order_postures_to_solve(
         yield few[clear]
 
 
-def _solve_candidates(
-    arm: ArmModel, postures: Postures, region: StartRegion, can_move_in_six_dof: bool
+def _solved_starts(
+    arm: ArmModel, postures: Postures, region: StartRegion, has_six_dof: bool
 ) -> Iterator[StartPlace]:
-    if not can_move_in_six_dof:  # position and orientation are coupled
+    if not has_six_dof:  # position and orientation are coupled
         solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
         solved = [
@@ -243,9 +234,8 @@ def _solve_candidates(
         ]
     if not solved:
         return
-    solved = [
-        solved[k] for k in _find_roomy_holdable_postures(arm, np.array([q for q, _, _ in solved]))
-    ]
+    rows = _find_roomy_holdable_postures(arm, np.array([q for q, _, _ in solved]))
+    solved = [solved[k] for k in rows]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), least_joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
@@ -261,7 +251,7 @@ def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
 def _starts_at_rounded_position(
     arm: ArmModel, q: Array, position: Array
 ) -> Iterator[tuple[Array, Array, bool]]:
-    """Yield joint positions near q, their pose, and whether `slave.position` specifies them."""
+    # Joint positions near q, their pose, and whether `slave.position` specifies them.
     position = np.round(position, 2)
     for yaw_deg in _TOOL_YAWS_DEG:
         R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
@@ -279,7 +269,7 @@ def _starts_at_rounded_position(
 def _with_largest_wall(
     shapes: PostureShapes | None, place: StartPlace, region: StartRegion
 ) -> StartPlace:
-    """Return the place with its largest free wall; overlaps reduce its score."""
+    # Overlaps reduce the score; without `shapes` wall and score are unchanged.
     if shapes is None:
         return place
     shapes.move_to(place.q)
@@ -305,17 +295,15 @@ def _with_largest_wall(
     cost += list(depths.values())[rank]
     score = place.posture_score - _OVERLAP_COST_PER_M * cost - _COST_OF_ANY_OVERLAP * overlaps
     score -= _COST_OF_SMALLER_WALL * (rank - large)
-    return place._replace(
-        posture_score=score, wall_edge_m=WALL_EDGES_M[rank], has_overlaps=overlaps
-    )
+    edge = WALL_EDGES_M[rank]
+    return place._replace(posture_score=score, wall_edge_m=edge, has_overlaps=overlaps)
 
 
 def _move_walls_below_tool_and_get_edges(shapes: PostureShapes) -> dict[BodyIndex, float]:
     plant, walls = shapes.plant, {}
     x, y, z = lowest_tool_point(shapes)
-    middle = RigidTransform(
-        [x, y, z + (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0]
-    )
+    offset = (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0
+    middle = RigidTransform([x, y, z + offset])
     for edge in WALL_EDGES_M:
         body = plant.GetBodyByName(_trial_wall_name(edge))
         plant.SetFreeBodyPose(shapes.context, body, middle)
@@ -334,7 +322,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
 
 
 def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
-    """Return how far bodies extend beyond S along an axis of S [m]."""
+    """Return how far bodies extend beyond So along an axis of S [m], at least 0."""
     points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
@@ -346,18 +334,16 @@ def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]
 
 
 def _with_reachable_cube(
-    arm: ArmModel, place: StartPlace, can_move_in_six_dof: bool, vertical: bool
+    arm: ArmModel, place: StartPlace, has_six_dof: bool, vertical: bool
 ) -> StartPlace:
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    if vertical or not can_move_in_six_dof:
+    if vertical or not has_six_dof:
         signs = np.vstack([np.eye(3), -np.eye(3)])
     if vertical:
         signs = signs[[2, 5]]
     largest = 0.0
     for half in _CUBE_HALF_EDGES_M:
-        if not all(
-            _can_reach_corner(arm, place, half * each, can_move_in_six_dof) for each in signs
-        ):
+        if not all(_can_reach_corner(arm, place, half * each, has_six_dof) for each in signs):
             break
         largest = half
     room = place.joint_margin if largest else 0.0
@@ -365,11 +351,11 @@ def _with_reachable_cube(
 
 
 def _can_reach_corner(
-    arm: ArmModel, place: StartPlace, displacement: Array, can_move_in_six_dof: bool
+    arm: ArmModel, place: StartPlace, displacement: Array, has_six_dof: bool
 ) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, status = find_posture(arm, target, place.q)
-    if can_move_in_six_dof:
+    if has_six_dof:
         return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_MOVE_TO_CORNER)
     error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
     return bool(error < _MAX_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
@@ -395,12 +381,11 @@ def sensor_axis_along_last_joint(arm: ArmModel) -> str:
     """Return the axis of S that points away from the last joint along it; empty: none."""
     row = arm.table[arm.num_joints]
     along = row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)[2]
-    return nearest_sensor_axis(
-        -along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_TOLERANCE_M else along
-    )
+    is_behind = row[TRANSLATION_COLUMN + 2] < -_ROUNDING_TOLERANCE_M
+    return nearest_sensor_axis(-along if is_behind else along)
 
 
-def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:
+def tool_frame_advice(model: Path, sensor_frame: str, axis: str) -> str:
     """Return advice on a sensor frame with z along the tool; empty: not needed."""
     if axis == "z":
         return ""

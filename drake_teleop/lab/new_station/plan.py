@@ -55,17 +55,12 @@ class StationPlan:
     """Start, scales and motions of a new station.
 
     Args:
-        stand_in_tool: stand-in for a missing tool, or None.
         tool_mass_kg: mass beyond the sensor [kg].
-        has_own_tool: True if the model contains the tool.
         swing_amplitude_m: amplitude of the slave in free motion [m].
         lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
         tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
         tool_axis_advice: advice if the tool is not along z_S.
-        overlap_warnings: sentences about overlaps of shapes at the start.
-        base_plane_height: height of the base plane [m].
         weak_joints: joints whose torque limits cannot hold the arm.
-        posture_shapes: shapes of arm and tool, at the start.
     """
 
     joint_names: tuple[str, ...]
@@ -142,7 +137,7 @@ def plan_station(
         lowest_tool_point_W=lowest,
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
-        tool_axis_advice=tool_frame_advice(model, arm, sensor_frame, axis),
+        tool_axis_advice=tool_frame_advice(arm, sensor_frame, axis),
         overlap_warnings=tuple(overlap_warnings(shapes, of_arm=True)),
         base_plane_height=plane,
         weak_joints=weak_joints,
@@ -165,9 +160,8 @@ def _find_start_and_tool_axis(
             if axis != "z" or slave.tool.shapes[0].position[2] != _STAND_IN_LENGTH_M:
                 shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
-            found.append(
-                (find_start_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes)
-            )
+            place = find_start_place(shapes.arm, shapes, plane=plane, axis=axis)
+            found.append((place, axis, shapes))
         except DrakeTeleopError as error:
             errors.append(error)
         if found and found[-1][0].posture_score > _SUFFICIENT_POSTURE_SCORE:
@@ -181,7 +175,7 @@ def _find_start_and_tool_axis(
 
 
 def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
-    """Return the axis of S towards the model's own load, or else along the last joint; else z."""
+    # Axis of S towards the model's own load, or else along the last joint; else z.
     if load[0] > _MIN_TOOL_MASS_KG and (axis := nearest_sensor_axis(load[1:] / load[0])):
         return axis
     return sensor_axis_along_last_joint(shapes.arm) or "z"
@@ -189,9 +183,8 @@ def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
 
 def _tool_extends_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
-    link_end = extent_beyond_sensor(
-        shapes, shapes.bodies_welded_to_sensor() - shapes.tool_bodies, axis
-    )
+    link_bodies = shapes.bodies_welded_to_sensor() - shapes.tool_bodies
+    link_end = extent_beyond_sensor(shapes, link_bodies, axis)
     return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
@@ -207,9 +200,8 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
 def _stand_in_tool(axis: str, length: float) -> Tool:
     along = TOOL_AXES[axis].matrix()[:, 2]
     ball = Ball(_STAND_IN_BALL_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
-    return Tool(
-        mass=_STAND_IN_MASSES_KG[0], com=(_STAND_IN_COM_M * along).round(6).tolist(), shapes=[ball]
-    )
+    com = (_STAND_IN_COM_M * along).round(6).tolist()
+    return Tool(mass=_STAND_IN_MASSES_KG[0], com=com, shapes=[ball])
 
 
 def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
@@ -220,10 +212,9 @@ def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
 def _without_weak_torque_limits(
     arm: ArmModel, q: Array, load_share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
-    """Return the arm without torque limits too low to hold it at q, their joints, and texts.
+    """Return the arm without torque limits that cannot hold it at q, their joints, and texts.
 
-    Args:
-        load_share: share of the load that the arm must hold.
+    The arm must hold `load_share` of its load.
     """
     torque = np.abs(holding_torque(arm.with_load(load_share * arm.phi_load), q))
     weak = torque > MAX_HOLDING_TORQUE_USE * arm.effort_limit

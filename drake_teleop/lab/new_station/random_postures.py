@@ -65,7 +65,6 @@ class StartRegion:
     """Region in which a start is searched.
 
     Attributes:
-        plane_height: height of the base plane [m].
         tool_length: distance of the tool's end from S [m].
         first_joint_W: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
@@ -183,14 +182,11 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     margin = np.minimum(least_joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
     # Only as many singular values as the arm has degrees of freedom.
-    smallest = _jacobian_singular_values(arm, postures)[
-        :, sensor_degrees_of_freedom(arm, postures) - 1
-    ]
+    rank = sensor_degrees_of_freedom(arm, postures)
+    smallest = _jacobian_singular_values(arm, postures)[:, rank - 1]
     sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
-    elbow = (
-        np.minimum(upward_share_of_elbow_offset(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
-        / _SUFFICIENT_ELBOW_UP_SHARE
-    )
+    upward = upward_share_of_elbow_offset(postures, region.reach)
+    elbow = np.minimum(upward, _SUFFICIENT_ELBOW_UP_SHARE) / _SUFFICIENT_ELBOW_UP_SHARE
     origins = postures.origins[:, region.is_joint_above_plane, 2]
     low = np.maximum(region.plane_height + _MIN_JOINT_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach
@@ -243,7 +239,7 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
 
 
 def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with its sensor frame rotated by R_SA, to z along the tool."""
+    """Return the arm with its sensor frame rotated by R_SA."""
     table = arm.table.copy()
     R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
     table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()

@@ -129,9 +129,8 @@ def simulate_ideal_motion(progress: UpdateProgress) -> IdealSensorRun:
     place = list(plant.GetJointIndices()).index(weld.index())
     wrenches = np.empty((round((simulation.settle + simulation.duration) * rate) + 1, 6))
     for k in range(len(wrenches)):
-        advance_without_garbage_collection(
-            simulator, k * (1 / rate)
-        )  # the same product as Drake's event times
+        # The same product as Drake's event times.
+        advance_without_garbage_collection(simulator, k * (1 / rate))
         reaction = reactions.Eval(context)[place]
         wrenches[k] = *reaction.translational(), *reaction.rotational()
         if k % 256 == 0:
@@ -178,6 +177,7 @@ def peaks_and_residuals_of_free_run(run: FreeMotionRun, component: int, unit: st
 
 
 def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedValues:
+    """Return times of contact and detection, peaks and residuals by name, as in Fig. 8."""
     t, force_norm = run.contact_result.t, _force_norms(run.calculated_wrench)
     detected = force_norm > run.threshold_N
     window = _contact_window(run)
@@ -199,20 +199,21 @@ def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedV
 
 
 def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array:
-    """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
+    """Return how far raw f_x, f_y, f_z, |f| (4,) leave their contact-free range in contact [N].
+
+    Negative: a value stays within, so that no threshold on it detects the contact.
+    """
     touched, free = (
         np.column_stack([raw[:, :3], _force_norms(raw)])
         for raw in (run.measured_wrench[_contact_window(run)], run.measured_wrench_free)
     )
     if not len(touched):
         return np.full(4, -np.inf)
-    return np.maximum(
-        touched.max(axis=0) - free.max(axis=0), free.min(axis=0) - touched.min(axis=0)
-    )
+    return np.maximum(touched.max(0) - free.max(0), free.min(0) - touched.min(0))
 
 
 def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> NamedValues:
-    """Return errors and expected accuracy of the load estimate, by name."""
+    """Return errors of the load estimate and the expected deviation of its mass, by name."""
     truth = true_offsets_and_phi(scenario)
     error = load.estimate - truth
     mass, moment = load.estimate[6], load.estimate[7:10]
@@ -285,5 +286,5 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _time_of_first_true(t: Array, happened: NDArray[np.bool_]) -> float | None:
-    return float(t[np.argmax(happened)]) if happened.any() else None
+def _time_of_first_true(t: Array, flags: NDArray[np.bool_]) -> float | None:
+    return float(t[np.argmax(flags)]) if flags.any() else None

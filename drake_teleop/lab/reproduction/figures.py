@@ -43,12 +43,9 @@ def scaling_figure(
             axes.plot(time, trace, color=BLUE if sigma else GREEN)
             axes.set_title(_sigma_title(sigma))
             peak = float(np.abs(trace).max())
-            _write_note_above_axes(
-                axes,
-                f"peak {_format_number(peak)} {unit}"
-                f"   ·   {_format_number(peak / downscaling)} {unit}"
-                " at the master",
-            )
+            slave, master = _format_number(peak), _format_number(peak / downscaling)
+            note = f"peak {slave} {unit}   ·   {master} {unit} at the master"
+            _write_note_above_axes(axes, note)
             axes.set_ylabel(f"{symbol} [{unit}]")
             _add_axis_at_master_scale(axes, downscaling, f"at the master [{unit}]")
         rows[0].set_ylim(*_common_value_range(traces))
@@ -68,7 +65,7 @@ def contact_figure(
     threshold: float,
     turning_s: float | None = None,
 ) -> Figure:
-    """Draw Fig. 8: measured force and calculated contact force, with shaded contact.
+    """Draw Fig. 8: measured force and calculated contact force [N], with shaded contact (N,).
 
     `threshold` [N] and `detected_s` are of the detection; `turning_s`: reversal without contact.
     """
@@ -92,12 +89,9 @@ def contact_figure(
         _draw_time_mark(rows[1], detected_s * per_second, "detected", VERMILION)
         for level in (-threshold, threshold):
             rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
-        _write_note_above_axes(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
-        _write_note_above_axes(
-            rows[1],
-            f"peak {_format_number(np.abs(traces[1]).max())} N"
-            f"   ·   threshold {_format_number(threshold)} N",
-        )
+        peaks = [f"peak {_format_number(np.abs(trace).max())} N" for trace in traces]
+        _write_note_above_axes(rows[0], peaks[0])
+        _write_note_above_axes(rows[1], f"{peaks[1]}   ·   threshold {_format_number(threshold)} N")
         rows[0].set_ylim(*_common_value_range(traces))
         rows[0].set_xlim(time[0], time[-1])
         rows[1].set_xlabel(f"t [{time_unit}]")

@@ -75,14 +75,11 @@ def reproduce_command(
             for k, each in enumerate(map(LoadScenario, names), 1)
         )
         load = identify_load(identification_scenario(force, seed), stage)
-        force_run = simulate_free_motion(
-            force, load.estimate, stage("Fig. 6: vertical free motion")
-        )
-        torque_run = simulate_free_motion(
-            torque, load.estimate, stage("Fig. 7: horizontal free motion")
-        )
+        estimate = load.estimate
+        force_run = simulate_free_motion(force, estimate, stage("Fig. 6: vertical free motion"))
+        torque_run = simulate_free_motion(torque, estimate, stage("Fig. 7: horizontal free motion"))
         ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
-        contact_run = simulate_contact(contact, load.estimate, stage)
+        contact_run = simulate_contact(contact, estimate, stage)
         summary = {
             "free_force": peaks_and_residuals_of_free_run(force_run, _FORCE_Z_INDEX, "N"),
             "free_torque": peaks_and_residuals_of_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
@@ -139,13 +136,9 @@ def draw_figures(
 
 def _measure_simulation_speed(progress: UpdateProgress) -> NamedValues:
     scenario = LoadScenario("free_motion_force")
-    cost = cpu_time_per_simulated_second(
-        {
-            "bare": MakeBarePlantSimulator(scenario),
-            "station": MakeSettledStationSimulator(scenario),
-        },
-        progress=progress,
-    )
+    bare, station = MakeBarePlantSimulator(scenario), MakeSettledStationSimulator(scenario)
+    simulators = {"bare": bare, "station": station}
+    cost = cpu_time_per_simulated_second(simulators, progress=progress)
     return {
         "real_time_factor": 1 / cost["station"],
         "cost_over_bare_plant": cost["station"] / cost["bare"],
@@ -237,9 +230,8 @@ def _print_comparison(rows: list[Comparison], out: Path) -> None:
     colours = {"agrees": "green", "differs": "bold red", "": "dim"}
     for row in rows:
         verdict = f"[{colours[row.css_class]}]{row.verdict}[/]"
-        table.add_row(
-            row.quantity, row.paper_value, row.reproduced_value, row.set_or_found, verdict
-        )
+        values = row.paper_value, row.reproduced_value, row.set_or_found
+        table.add_row(row.quantity, *values, verdict)
     console = Console()
     console.print(table)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -189,11 +189,11 @@ class Master:
     def check(self, where: str) -> None:
         if self.model == PHANTOM_NAME and self.figures is not None:
             what = "the Phantom has fixed dynamics and accepts no data sheet"
-            remedy = "leave them out, or choose another model, such as custom"
+            remedy = "leave figures out, or choose another model, such as custom"
             raise DrakeTeleopError(what, where=f"{where}.figures", remedy=remedy)
         if self.model != PHANTOM_NAME and self.friction != PhantomJointFriction():
             what = f"only the Phantom accepts joint friction, not model '{self.model}'"
-            remedy = "leave it out, and set figures.friction and figures.damping"
+            remedy = "leave friction out, and set figures.friction and figures.damping"
             raise DrakeTeleopError(what, where=f"{where}.friction", remedy=remedy)
         if (self.leader is None) == (self.model == LEADER_NAME):
             what = "`model: leader` and the settings `leader` require each other"
@@ -203,7 +203,7 @@ class Master:
             self.leader.check(f"{where}.leader")
             if self.figures is not None:
                 what = "the dynamics of a leader arm are from its model file, not a data sheet"
-                raise DrakeTeleopError(what, where=f"{where}.figures", remedy="leave them out")
+                raise DrakeTeleopError(what, where=f"{where}.figures", remedy="leave figures out")
         if self.figures is not None and self.figures.turn[1] > _MAX_DEVICE_PITCH_RAD:
             raise DrakeTeleopError(
                 f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "

@@ -14,7 +14,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step_d
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 
-_MAX_DEVICE_PERIOD_S = 1e-3  # s, slower than any haptic device
+_MAX_DEVICE_PERIOD_S = 1e-3  # slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
 _MAX_STABLE_RATE_TIMES_PERIOD = 2.0
 
@@ -33,8 +33,8 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_DEVICE_PERIOD_S:
         raise DrakeTeleopError(
-            f"a period of {period:g} s is too long to simulate a haptic device (at most"
-            f" {_MAX_DEVICE_PERIOD_S:g} s)",
+            f"gives a period of {period:g} s (a simulated haptic device needs a positive one of at"
+            f" most {_MAX_DEVICE_PERIOD_S:g} s)",
             where="rates.hand_hz",
             remedy="choose 1000 Hz or more; the paper uses above 2 kHz",
         )

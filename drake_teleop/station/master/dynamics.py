@@ -59,18 +59,15 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     torques or forces at the joints; `work` and `stages` are scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
+    q, v, vdot = stage[:6], stage[6:], slope[6:]
     copy_into(stage, 0, state, 0, 12)
     total[:] = 0.0
     for i in range(4):
         copy_into(slope, 0, stage, 6, 6)
         if device.in_task_space:
-            task_space.joint_acceleration_into(
-                stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
-            )
+            task_space.joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot)
         else:
-            phantom.joint_acceleration_into(
-                stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
-            )
+            phantom.joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot)
         weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
         ahead = 1.0 if i == 2 else 0.5
         for k in range(12):
@@ -149,12 +146,12 @@ class HapticDevice(HapticDeviceBase):
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """Return the mass matrix (6, 6), including the hand."""
+        """Return the joints' mass matrix (6, 6), including the hand."""
         J, M, device = self.jacobian(q), np.empty((6, 6)), self.parameters
         if self.is_phantom:
             phantom.mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
         else:
-            task_space.mass_matrix_into(q, J, device, M)
+            task_space.mass_matrix_into(J, device, M)
         return M
 
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:

@@ -32,20 +32,11 @@ from drake_teleop.station.passivity.safe_state import (
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
-_display_memory_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
-_JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = (
-    _display_memory_layout.vector(6),
-    _display_memory_layout.vector(6),
-)
-DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = (
-    _display_memory_layout.vector(6),
-    _display_memory_layout.number(),
-)
-_IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = (
-    _display_memory_layout.number(),
-    _display_memory_layout.number(),
-)
-_SAFE_STATE_MONITOR_SLOTS = _display_memory_layout.vector(MASTER_MONITOR_SIZE)
+_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
+_JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
+DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
+_IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
+_SAFE_STATE_MONITOR_SLOTS = _layout.vector(MASTER_MONITOR_SIZE)
 _DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
@@ -60,15 +51,17 @@ def _peak_force_and_torque_of_device(parameters):
 def initial_display_state(q: Array, parameters: DeviceParameters) -> Array:
     display = np.zeros(_SAFE_STATE_MONITOR_SLOTS.stop)
     display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
-    display[_SAFE_STATE_MONITOR_SLOTS] = initial_master_monitor(
-        _peak_force_and_torque_of_device(parameters)
-    )
+    peaks = _peak_force_and_torque_of_device(parameters)
+    display[_SAFE_STATE_MONITOR_SLOTS] = initial_master_monitor(peaks)
     return display
 
 
 @njit(cache=True)
 def limit_wrench_into(wrench, parameters, J, displayed):
-    """Write `wrench` (6,) [f; tau] at E, in B, reduced to the device's limits, into `displayed`."""
+    """Write `wrench` (6,) [f; tau] at E, in B, reduced to the device's limits, into `displayed`.
+
+    Force and torque keep their directions. A wrench that is not finite gives zero.
+    """
     for k in range(6):
         if not math.isfinite(wrench[k]):
             displayed[:] = 0.0
@@ -160,9 +153,8 @@ class DeviceBlock(LeafSystem):
         self._advance, self._constants, self._period = advance, constants, period
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
-        display = initial_display_state(
-            device.coordinates_for_force_display(q_initial), device.parameters
-        )
+        coordinates = device.coordinates_for_force_display(q_initial)
+        display = initial_display_state(coordinates, device.parameters)
         self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are states because they are read more often than they change.
         for name, start in (
@@ -220,8 +212,7 @@ class ForceDisplay(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
     def _wrench_to_display(self, context: Context) -> Array:
-        wrench: Array = self._command.Eval(context)
-        return wrench
+        return np.asarray(self._command.Eval(context))
 
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         inputs = self._wrench_to_display(context), self._device.Eval(context)

@@ -131,12 +131,11 @@ def step_leader(
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
         limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
+        q, v, vdot = stage[:n], stage[n:], slope[n:]
         copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
             copy_into(slope, 0, stage, n, n)
-            leader_acceleration_into(
-                arm, joint_table, stage[:n], stage[n:], applied, motor, slope[n:]
-            )
+            leader_acceleration_into(arm, joint_table, q, v, applied, motor, vdot)
             weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
             ahead = 1.0 if i == 2 else 0.5
             for k in range(2 * n):
@@ -239,7 +238,7 @@ class LeaderDevice(HapticDeviceBase):
         for k in np.flatnonzero((q < lower) | (q > upper)):
             raise DrakeTeleopError(
                 f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
-                f" {lower[k]:.3g} and {upper[k]:.3g} (rad or m)",
+                f" {lower[k]:.3g} to {upper[k]:.3g} (rad or m)",
                 where="master.leader.home",
                 remedy="start within the limits of its joints",
             )
@@ -250,10 +249,7 @@ class LeaderDevice(HapticDeviceBase):
         The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         tables = self.compiled_constants
-        flags: NDArray[np.bool_] = _flag_rows_with_motor_at_limit(
-            *tables, q.copy(), F.copy(), share
-        )
-        return flags
+        return np.asarray(_flag_rows_with_motor_at_limit(*tables, q.copy(), F.copy(), share))
 
     def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)

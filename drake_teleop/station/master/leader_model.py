@@ -12,6 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.leader import LeaderDevice, make_leader_joint_table
 from drake_teleop.station.slave.arm import (
@@ -94,10 +95,8 @@ class Leader:
         coulomb = values_per_joint(arm, self.friction, "master.leader.friction", 0.0)
         viscous = values_per_joint(arm, self.damping, "master.leader.damping", 0.0)
         limits = self.torque_limit, "master.leader.torque_limit", arm.effort_limit
-        limit = values_per_joint(arm, *limits)
-        joint_table = make_leader_joint_table(
-            held, home, coulomb, viscous, limit, self.weight_carried
-        )
+        rows = coulomb, viscous, values_per_joint(arm, *limits)
+        joint_table = make_leader_joint_table(held, home, *rows, self.weight_carried)
         peak = self.peak_force, np.full(3, self.peak_torque)
         parameters = as_compiled_arguments(DeviceParameters(hand_mass, hand_inertia, *peak))
         return LeaderDevice(held, arm_without_hand, joint_table, home, parameters)
@@ -110,7 +109,7 @@ class Leader:
 
 
 def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
-    """Return the arm with E as end frame, and its base moved so that E is at p_BE (3,) at home."""
+    # The base moves so that E is at p_BE (3,) at home.
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
@@ -118,9 +117,7 @@ def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) ->
     # R rotates the hand's frame into B, so that E has B's axes at home.
     R_LS = table[n, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
     table[n, ROTATION_COLUMN:TRANSLATION_COLUMN] = (R_LS @ R.T).ravel()
-    phi, upper = table[n, PHI_COLUMN:ROTOR_COLUMN], np.triu_indices(3)
-    inertia = np.zeros((3, 3))
-    inertia[upper] = phi[4:]
-    inertia = inertia + np.triu(inertia, 1).T
-    phi[1:4], phi[4:] = R @ phi[1:4], (R @ inertia @ R.T)[upper]
+    phi = table[n, PHI_COLUMN:ROTOR_COLUMN]
+    inertia = inertia_about_origin(phi)
+    phi[1:4], phi[4:] = R @ phi[1:4], (R @ inertia @ R.T)[np.triu_indices(3)]
     return dataclasses.replace(arm, table=table)

@@ -36,7 +36,7 @@ def jacobian_into(q, J):
 
 
 @njit(cache=True)
-def mass_matrix_into(q, J, device, M):
+def mass_matrix_into(J, device, M):
     M[:, :] = 0.0
     inertia = device.inertia + device.hand_inertia
     for i in range(3):
@@ -132,9 +132,8 @@ def _is_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDAr
 
 
 def is_any_axis_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
-    return (
-        _is_past_end_stop(q, device, 0.0) & np.append([True] * 3, device.max_rotation > 0.0)
-    ).any(axis=1)
+    has_end_stop = np.append([True] * 3, device.max_rotation > 0.0)
+    return (_is_past_end_stop(q, device, 0.0) & has_end_stop).any(axis=1)
 
 
 def check_limits(q: Array, device: DeviceParameters) -> None:

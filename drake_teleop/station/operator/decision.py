@@ -172,10 +172,8 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
-        noise = person.vision_noise * _draw_normal_number(
-            person, step // _EYE_FIXATION_STEPS, 4 + i
-        )
-        seen_W[i] = displacement_W[i] + noise
+        draw = _draw_normal_number(person, step // _EYE_FIXATION_STEPS, 4 + i)
+        seen_W[i] = displacement_W[i] + person.vision_noise * draw
 
 
 @njit(cache=True)
@@ -297,9 +295,8 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         error[i] -= seen_W[i]
         off += error[i] * error[i]
     off = math.sqrt(off)
-    met = _update_criterion_with_hysteresis(
-        memory, time, off <= 0.8 * task.radius, off <= task.radius
-    )
+    inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
+    met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
     if task.kind == KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
@@ -314,16 +311,11 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
 
 @njit(cache=True)
 def _approach_contact(task, person, time, seen_W, felt, state, memory):
-    if task.kind == KIND_INSERT:
-        if state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt):
-            plan_stop(memory, time)
-            _enter_phase(
-                state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person.force_delay
-            )
-            return
-    elif state[CONTACT_PERCEIVED_INDEX] > 0.0:
+    inserts = task.kind == KIND_INSERT
+    if state[CONTACT_PERCEIVED_INDEX] > 0.0 and (not inserts or _is_tool_stuck(task, person, felt)):
         plan_stop(memory, time)
-        _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person.force_delay)
+        phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING
+        _enter_phase(state, memory, phase, time + STOP_DURATION_S + person.force_delay)
         return
     if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
@@ -342,9 +334,8 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_contact_force(task, person, felt, memory):
-    error = person.weber_fraction * _draw_normal_number(
-        person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3
-    )
+    draw = _draw_normal_number(person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3)
+    error = person.weber_fraction * draw
     return (1.0 + error) * _contact_force_at_tool_along_approach(task, person, felt)
 
 
@@ -366,9 +357,8 @@ def _displacement_to_set_force(task, memory, force):
 def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
     error = abs(task.force - force)
-    met = _update_criterion_with_hysteresis(
-        memory, time, error <= 0.5 * task.tolerance, error <= task.tolerance
-    )
+    good, still_good = error <= 0.5 * task.tolerance, error <= task.tolerance
+    met = _update_criterion_with_hysteresis(memory, time, good, still_good)
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:

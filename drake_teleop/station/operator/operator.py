@@ -5,13 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DependencyTicket,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
@@ -254,10 +248,8 @@ def _perceive_and_decide(
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE_INDEX] > decision.PHASE_MOVING
     felt = perceived_forces[step % perceived_forces.shape[0]]
-    period, force, velocity = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
-    update_perception_into(
-        force_memory, senses, period, hand_mass, force, velocity, attentive, felt
-    )
+    period, force, v = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
+    update_perception_into(force_memory, senses, period, hand_mass, force, v, attentive, felt)
     # The next entry to be overwritten is the oldest.
     seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
     felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
@@ -313,19 +305,17 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intended_motion_inputs() | {self.time_ticket()}
+        self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
+        moving = {self._intended_pose.ticket(), self._intended_twist.ticket(), self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
-                raise ValueError("a task requires the arguments training, arm and tip")
-            moving.add(self._declare_task(config, config.task, training, arm, tip))
+                raise ValueError("Operator: a task requires the arguments training, arm and tip")
+            self._declare_task(config, config.task, training, arm, tip)
+            moving.add(self.discrete_state_ticket(self._groups[1]))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
-
-    def _declare_intended_motion_inputs(self) -> set[DependencyTicket]:
-        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
-        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
-        return {pose.ticket(), twist.ticket()}
 
     def _declare_task(
         self,
@@ -334,7 +324,7 @@ class Operator(LeafSystem):
         training: OperatorTraining,
         arm: ArmModel,
         tip: Array,
-    ) -> DependencyTicket:
+    ) -> None:
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
         self._seen_displacements = _make_ring_buffer(
@@ -363,7 +353,6 @@ class Operator(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             decision.DECISION_PERIOD_S, 0.0, self._update_perception_and_decision
         )
-        return self.discrete_state_ticket(self._groups[1])
 
     def _update_perception_and_decision(
         self, context: Context, discrete_state: DiscreteValues

@@ -19,9 +19,8 @@ from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
 _FORCE_MODEL_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
 _INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_FORCE_NOISE_DENSITY_N_PER_SQRT_HZ = (
-    0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
-)
+# Measurement noise of the filter, 0.1 N at 200 Hz, estimate.
+_FORCE_NOISE_DENSITY_N_PER_SQRT_HZ = 0.007
 _FRICTION_SMOOTHING_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
 _NUM_MODEL_PARAMETERS = 6
 
@@ -122,10 +121,8 @@ def _update_force_model(theta, P, rows, excess, dt):
         P[j, j] += _FORCE_MODEL_DRIFT_STD[j] * _FORCE_MODEL_DRIFT_STD[j] * dt
     before = theta.copy()
     for i in range(3):
-        residual, variance = (
-            excess[i],
-            _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ * _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ / dt,
-        )
+        noise, residual = _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ, excess[i]
+        variance = noise * noise / dt
         for j in range(_NUM_MODEL_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0

@@ -56,7 +56,10 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def summarise_diagram_stability(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion of linearised Diagram and one-axis model."""
+    """Return stability, decay rate and frequency of linearised Diagram and one-axis model.
+
+    Decay and frequency are those of the largest multiplier.
+    """
     stable = bool(count_unstable_multipliers(cut_loop(axis, sampling), axis.delay) == 0)
     return {
         "point": name,
@@ -80,9 +83,10 @@ def _slowest_motion(system: Linearization, stable: bool) -> dict[str, Any]:
 
 
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest relative deviations to 30 Hz of a two-port from the one-axis models.
+    """Return the largest deviations of H from the one-axis models up to 30 Hz.
 
-    `H` (N, 2, 2) is the linearised Diagram's hybrid matrix at `OMEGA`, with the hand's mass.
+    They are relative to the largest magnitude of each entry. `H` (N, 2, 2) is the linearised
+    Diagram's at `OMEGA`, with the hand's mass.
     """
     compared = OMEGA <= COMPARISON_BAND_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
@@ -139,7 +143,7 @@ def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
 
 
 def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the stiffest stable wall [N/m]: for all hands between light and firm, and per grip."""
+    """Return the stiffest stable wall [N/m]: for any hand between light and firm, and per grip."""
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
@@ -216,7 +220,10 @@ def virtual_wall_limits(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measure_free_impedance(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Return the impedance displayed in free motion, measured in a simulation without friction."""
+    """Return the impedance displayed in free motion, from a simulation without Coulomb friction.
+
+    The errors are those of the linear model `system`.
+    """
     frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
     free = scenario.without_environment()
     smooth = replace(free, master=frictionless, slave__friction=[])
