@@ -35,8 +35,8 @@ class Cause:
     Attributes:
         name: such as "axes", "gravity direction", "load change" or "cable".
         message: cause, value with its interval, and remedy.
-        start_s, stop_s: time span since the start of the record [s]; None: unlimited.
-        values: figures by name, in SI.
+        start_s, stop_s: time span on the clock of the log [s]; None: unlimited.
+        values: figures by name, in SI; `angle_deg` in [deg].
         fields: corrected values of fields of the log description, as in YAML.
     """
 

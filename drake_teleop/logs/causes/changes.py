@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
-from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
+from drake_teleop.logs.causes.model import Model, StepChange
 from drake_teleop.logs.causes.state import (
     FittedModel,
     TimeSpans,
@@ -112,7 +112,10 @@ def fit_steps_at_middle_of_ramps(
     spans: TimeSpans,
     widths: Sequence[float] | None = None,
 ) -> FittedModel:
-    """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
+    """Add changes of "offsets" or "load" (`kinds`) at the estimated middles of ramps.
+
+    The ramps are near `times` [s] and `widths` [s] long; their rows are not used.
+    """
     least = MIN_OMITTED_RAMP_SPAN_S
     widths = [max(least, w + least) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
@@ -122,9 +125,11 @@ def fit_steps_at_middle_of_ramps(
     found = FittedModel.fit_record(
         state.data, model, model.start_parameters(state.x, state.model), (*spans, *around)
     )
-    owners = [k for k, both in enumerate(kinds) for _ in both]
-    middles = [_estimate_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
-    steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
+    steps = []
+    for both, span in zip(kinds, around, strict=True):
+        own = range(first + len(steps), first + len(steps) + len(both))
+        middle = _estimate_ramp_middle(found, own, span)
+        steps += [StepChange(kind, middle) for kind in both]
     model = replace(model, steps=(*state.model.steps, *steps))
     return FittedModel.fit_record(state.data, model, found.x, found.contact_spans)
 
@@ -138,25 +143,17 @@ def remove_small_steps(state: FittedModel) -> FittedModel:
         least = min(small, key=lambda i: _squared_step_over_variance(state, i))
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
-        x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
+        x = model.start_parameters(state.x, Model())
         state = FittedModel.fit_record(state.data, model, x, state.contact_spans)
 
 
 def _squared_step_over_variance(state: FittedModel, i: int) -> float:
-    where = state.model.parameter_slices[f"step {i}"]
-    x, covariance = state.x[where], state.covariance[where, where]
+    x, covariance = state.parameters_of_extension(f"step {i}")
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _estimate_ramp_middle(
-    state: FittedModel,
-    kinds: Sequence[Sequence[str]],
-    first_added_step: int,
-    k: int,
-    span: tuple[float, float],
-) -> float:
-    data, at = state.data, first_added_step + sum(len(both) for both in kinds[:k])
-    own = range(at, at + len(kinds[k]))
+def _estimate_ramp_middle(state: FittedModel, own: range, span: tuple[float, float]) -> float:
+    data = state.data
     rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
@@ -193,17 +190,14 @@ def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> F
 
 
 def _is_step_significant(state: FittedModel, i: int) -> bool:
-    where = state.model.parameter_slices[f"step {i}"]
-    values = state.x[where]
-    deviations = np.sqrt(np.diag(state.covariance[where, where]))
+    values, covariance = state.parameters_of_extension(f"step {i}")
+    deviations = np.sqrt(np.diag(covariance))
     if state.model.steps[i].kind == "offsets":
         clear = np.abs(values) > _MIN_STEP_OVER_DEVIATION * deviations
         large = np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise
         return bool((clear & large).any())
-    mass = max(abs(state.x[6]), 1e-3)
-    heavier = abs(values[0]) > max(
-        _MIN_STEP_OVER_DEVIATION * deviations[0], _MIN_MASS_STEP_OVER_MASS * mass
-    )
+    mass, limit = max(abs(state.x[6]), 1e-3), _MIN_STEP_OVER_DEVIATION * deviations[0]
+    heavier = abs(values[0]) > max(limit, _MIN_MASS_STEP_OVER_MASS * mass)
     size, moment = np.linalg.norm(values[1:4]), np.linalg.norm(deviations[1:4])
     moved = size > max(2.0 * _MIN_STEP_OVER_DEVIATION * moment, _MIN_MOMENT_STEP_OVER_MASS_M * mass)
     return bool(heavier or moved)
@@ -296,7 +290,7 @@ class _NormalEquationsOfBlocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks `among` with a residual far above the calmest; None for few."""
+        """Return flags of blocks `among` with a residual far above the usual; None for few."""
         found = self._residual_levels_by_calm_fit(np.flatnonzero(among))
         if found is None:
             return None
@@ -375,10 +369,10 @@ def _residuals_by_motion_errors(
     bend[1:-1] = np.where(both, (second * second).sum(axis=1), 0.0)
     blocks = np.add.reduceat(bend, np.arange(0, len(y), rows)) / rows
     fast = np.sqrt(blocks[: len(level)])
-    accelerates_enough = usable & (fast > np.median(fast[usable]))
-    if accelerates_enough.sum() < 8:
+    fastest = usable & (fast > np.median(fast[usable]))
+    if fastest.sum() < 8:
         return np.zeros(len(level))
-    ratio = level[accelerates_enough] / np.maximum(fast[accelerates_enough], 1e-12)
+    ratio = level[fastest] / np.maximum(fast[fastest], 1e-12)
     return np.asarray(2.0 * np.quantile(ratio, quantile) * fast)
 
 
@@ -393,7 +387,7 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
             continue
         kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
         model = replace(state.model, steps=kept)
-        x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
+        x = model.start_parameters(state.x, Model())
         dt = state.data.dt
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):

@@ -132,14 +132,6 @@ def may_be_coloured_noise(state: FittedModel) -> bool:
     )
 
 
-def is_clear_misfit(state: FittedModel) -> bool:
-    """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
-    return (
-        state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
-        or state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
-    )
-
-
 def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
     state = FittedModel.fit_record(data, model)
     start = start_parameters_of_tilt_fit(state) if "gravity" in model.extensions else None
@@ -285,7 +277,9 @@ class MisfitExplanation:
 
     @property
     def is_misfit(self) -> bool:
-        return not self.explained and is_clear_misfit(self.state)
+        """Whether the residual is clearly not noise: large, or explained by smooth signals."""
+        large = self.state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
+        return not self.explained and (large or self.state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT)
 
     @property
     def has_several_gains(self) -> bool:
