@@ -57,7 +57,8 @@ class LoadFitQuality:
     """Least squares fit of a load to a log, Eq. (5).
 
     Attributes:
-        unexplained, noise_share: shares of the wrench's variance: unexplained, white noise.
+        unexplained: share of the wrench's variance that is in the residual.
+        noise_share: share of white noise in this variance.
         mass: fitted mass [kg].
         independent_samples: number of samples with independent noise.
     """
@@ -101,9 +102,7 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     total = float(w.var(axis=0).sum()) + 1e-30
     unexplained = float((w - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
-        return LoadFitQuality(
-            unexplained, float(theta[0]), independent_samples=max(1.0, len(w) - 8.0)
-        )
+        return LoadFitQuality(unexplained, float(theta[0]), 0.0, max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
     noise_share = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
@@ -120,7 +119,7 @@ def _fit_load_parameters(V: Array, w: Array) -> Array:
 
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
-    """Return the variance of a residual (N, 6) over that of the wrench (N, 6)."""
+    """Return the variance of a residual (N, 6) over the wrench's; force and torque count alike."""
     scale = _wrench_channel_scales(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
@@ -141,7 +140,6 @@ def min_unexplained_reduction_by_edit(fit: LoadFitQuality) -> float:
 UNDETERMINED_UNEXPLAINED_SHARE = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
 MIN_REPORTED_LAG_S = 0.002
-"""Smallest reported delay [s]."""
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
@@ -366,11 +364,8 @@ def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     slope, late = np.polyfit(t, delays, 1)
     change = abs(slope) * span
     deviation = float(np.std(delays - late - slope * t))
-    if (
-        change < _MIN_DELAY_DRIFT_S
-        or deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
-        or abs(slope) > 0.2
-    ):
+    uneven = deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
+    if change < _MIN_DELAY_DRIFT_S or uneven or abs(slope) > 0.2:
         return None
     return float(late + slope * log.t[0]), float(slope)
 

@@ -43,12 +43,9 @@ from drake_teleop.logs.read.tables import Table
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
-"""Fewest poses that allow a check of the fit."""
 _MIN_GRAVITY_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
-_MIN_WRENCH_CHANGE_OVER_LARGEST = (
-    1e-6  # smallest change of a live wrench, as a share of the largest reading
-)
+_MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest reading
 
 
 @dataclass(frozen=True)
@@ -169,20 +166,16 @@ def check_conventions(
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    return bool(
-        (
-            np.ptp(log.wrench, axis=0) <= _MIN_WRENCH_CHANGE_OVER_LARGEST * np.abs(log.wrench).max()
-        ).all()
-    )
+    limit = _MIN_WRENCH_CHANGE_OVER_LARGEST * np.abs(log.wrench).max()
+    return bool((np.ptp(log.wrench, axis=0) <= limit).all())
 
 
 def _check_description(data: LogData, description: Description) -> ConventionCheckResult:
     log = data.read_whole_log(description)
     if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
-        return ConventionCheckResult(
-            (Finding("dead channel", message),), LoadFitQuality(1.0, 0.0), None, None
-        )
+        dead_wrench = Finding("dead channel", message)
+        return ConventionCheckResult((dead_wrench,), LoadFitQuality(1.0, 0.0), None, None)
     # Determine gravity once, not for each edit.
     if "gravity" in log.estimated and log.described is not None:
         description = description.model_copy(update={"gravity": log.described.gravity})
@@ -224,8 +217,8 @@ def _merge_clock_findings(
     mounting: Mounting | None,
     delay: float | None,
 ) -> list[Finding]:
-    clocks = [finding for finding in findings if finding.name == "clock"]
-    if len(clocks) < 2 or mounting is None or mounting.clock_drift or delay is None:
+    num_clocks = sum(finding.name == "clock" for finding in findings)
+    if num_clocks < 2 or mounting is None or mounting.clock_drift or delay is None:
         return findings
     if abs(mounting.lag_s + delay) > MIN_LAG_OF_WRONG_CLOCK_S:
         return findings

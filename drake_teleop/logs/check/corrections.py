@@ -77,7 +77,9 @@ def correct_accelerometer_unit(
     }
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     ratio = median / float(np.linalg.norm(description.gravity_W))
-    for path, sensor in ((path, x) for path, x in sensors.items() if x is not None):
+    for path, sensor in sensors.items():
+        if sensor is None:
+            continue
         read = ratio / description.unit_in_si(sensor.unit)
         text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in {sensor.unit}"
         for unit in ("m/s^2", "g", "mm/s^2"):

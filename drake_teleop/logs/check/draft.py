@@ -131,10 +131,8 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
         streams = whole | streams
     streams = streams or drafts[0].streams
-    lines = dict.fromkeys(line for draft in drafts for line in draft.comment_lines)
-    return Draft(
-        {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}, list(lines)
-    )
+    ordered = {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}
+    return Draft(ordered, [*dict.fromkeys(x for draft in drafts for x in draft.comment_lines)])
 
 
 def _is_template(stream: dict[str, Any]) -> bool:
@@ -368,10 +366,10 @@ def _draft_quantity(
     table: Table, plain: _NamesAndUnits, kind: str, columns: list[str]
 ) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(columns)}
-    if kind in ("force", "torque") and _are_raw_counts(table, columns):
-        group["scale"] = _FILL_IN_TEXT
     if _FILL_IN_TEXT in columns:
         return group
+    if kind in ("force", "torque") and _are_raw_counts(table, columns[0]):
+        group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
         unit = _known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
@@ -388,13 +386,10 @@ def _draft_quantity(
     return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 
-def _are_raw_counts(table: Table, columns: list[str]) -> bool:
-    if _FILL_IN_TEXT in columns:
-        return False
-    first = table.numbers_with_nan(columns[0], columns[0])
-    if not np.nanmedian(np.abs(first)) > _MIN_MEDIAN_RAW_COUNT:
-        return False
-    return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
+def _are_raw_counts(table: Table, column: str) -> bool:
+    x = table.numbers_with_nan(column, column)
+    large = np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT
+    return bool(large and (np.nan_to_num(x) % 1.0 == 0.0).all())
 
 
 def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
@@ -424,11 +419,8 @@ def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, A
         return {"column": _FILL_IN_TEXT}
     if beside in table.columns:
         structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
-
-        def distance(name: str) -> tuple[bool, bool]:
-            return name.rpartition(".")[0] != structure, len(table.columns[name]) != rows
-
-        named.sort(key=distance)
+        named.sort(key=lambda name: len(table.columns[name]) != rows)
+        named.sort(key=lambda name: name.rpartition(".")[0] != structure)
     unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
@@ -455,7 +447,7 @@ def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
 
 
 def _guess_time_unit(table: Table, column: str) -> str:
-    step = float(np.median(np.abs(np.diff(table.single_column(column, column)))))
+    step = float(np.nanmedian(np.abs(np.diff(table.single_column(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:
             return unit

@@ -38,7 +38,7 @@ _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0
 
 
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Return contradictions among the signals of an IMU, and the corrected description."""
+    """Return a contradiction among an IMU's signals, if any, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
@@ -120,10 +120,8 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     alike = given_alpha.T @ derived_alpha / size
     best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     largest = np.sum(alike * best)
-    if (
-        largest < _MIN_ALPHA_CORRELATION
-        or np.trace(alike) > _MAX_UNSWAPPED_OVER_BEST_CORRELATION * largest
-    ):
+    limit = _MAX_UNSWAPPED_OVER_BEST_CORRELATION * largest
+    if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > limit:
         return None
     return Finding(
         "swapped axes",
@@ -185,8 +183,8 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
         "gravity",
         f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
         f" {100 * off:.2g} % (+- {100 * deviation:.1g})"
-        f" {'more' if ratio > 1 else 'less'} than the description says:"
-        f" the mass would be wrong by as much; {remedy}",
+        f" {'more' if ratio > 1 else 'less'} than described: the mass would be wrong by as much;"
+        f" {remedy}",
     )
 
 
@@ -226,7 +224,8 @@ def check_imu_against_pose(
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
-    if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
+    least, most = RANGE_OF_DEGREES_PER_RADIAN
+    if given.speed_ratio is not None and least < given.speed_ratio < most:
         text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
         findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
         description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
@@ -238,11 +237,9 @@ def check_imu_against_pose(
         findings.append(Finding("swapped axes", text))
     elif given.rotation_angle_deg > 10:
         assert description.imu is not None
-        old = np.eye(3)
-        if isinstance(description.imu.frame, tuple):
-            old = np.array(description.imu.frame)
+        old = description.imu.frame
         R = given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI
-        frame = R @ old
+        frame = R @ (np.array(old) if isinstance(old, tuple) else np.eye(3))
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
         text = f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S;"

@@ -78,8 +78,6 @@ class LogData:
         return lag, lines, edit_field(edited, f"{name}.time.scale", factor)
 
     def _start_time_of_stream(self, stream: Any) -> float:
-        if stream.time.column is None:
-            return float(stream.time.offset)
         return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
 
     def _thinning_stride(self, stream: Any) -> int:

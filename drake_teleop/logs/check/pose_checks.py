@@ -28,7 +28,7 @@ _MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
 MIN_POSES_DURATION_S = 4.0
-"""Shorter records have too few frequencies for an estimate by poses alone [s]."""
+"""Shortest record [s] with enough frequencies for an estimate by poses alone."""
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
 _CONFUSED_TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _WRONG_TORQUE_UNIT_RATIOS = (
@@ -82,11 +82,12 @@ def position_unit_or_origin_findings(
         return []
     if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_ERROR_OVER_DEVIATION * deviation):
         return []
-    place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
+    place, other = shift + np.array(pose.position_in_sensor), np.array(imu.position) - shift
     text = (
-        f"the pose's origin is {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}) from the"
-        f" accelerometer; if imu.position is right, set pose.position_in_sensor:"
-        f" {place.tolist()}, otherwise set imu.position: {(0.0 - place).tolist()}"
+        f"the described positions of the pose's origin and the accelerometer disagree by"
+        f" {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}); if imu.position is right, set"
+        f" pose.position_in_sensor: {round_for_yaml(place)}, otherwise set imu.position:"
+        f" {round_for_yaml(other)}"
     )
     return [Finding("pose frame", text)]
 
