@@ -96,9 +96,6 @@ class LogData:
         return self.tables[stream.source].rows_with_any_number(stream.columns)
 
     def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
-        if stream.time.column is None:
-            rows = np.arange(self._table_of_stream(stream).rows)
-            return rows / stream.time.rate, rows
         t, _ = time_stamps_and_num_episodes(stream.time, self._table_of_stream(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]

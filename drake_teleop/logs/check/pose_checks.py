@@ -16,7 +16,7 @@ from drake_teleop.logs.read.auto_frames import round_for_yaml
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.mounting import lever_matrix
+from drake_teleop.logs.read.mounting import lever_matrix, rotation_angle_deg
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -168,8 +168,7 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
         )
         lines.append(f"pose.position_in_sensor: {round_for_yaml(place)}")
     if frame.is_rotated:
-        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
-        deviation = float(frame.rotation_stds_deg.max())
+        angle, deviation = rotation_angle_deg(frame.R_SP), float(frame.rotation_stds_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
         lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
     text = f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}"

@@ -74,9 +74,8 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
         padded[pad : pad + n] = column
         padded[:pad] = 2 * column[0] - column[pad:0:-1]
         padded[pad + n : 2 * pad + n] = 2 * column[-1] - column[-2 : -2 - pad : -1]
-        padded[2 * pad + n :] = np.linspace(
-            padded[2 * pad + n - 1], padded[0], length - 2 * pad - n
-        )
+        end = 2 * pad + n
+        padded[end:] = np.linspace(padded[end - 1], padded[0], length - end)
         filtered[:] = np.fft.irfft(np.fft.rfft(padded) * gain, length)[pad : pad + n]
     return out.reshape(x.shape)
 
@@ -107,7 +106,7 @@ def smooth_derivatives(
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return noise (3,) of `smooth_derivatives` over white noise of x: [1], [1/s], [1/s^2]."""
+    """Return noise (3,) of `smooth_derivatives` over white noise of x [1, 1/s, 1/s^2]."""
     weights = polynomial_fit_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
@@ -190,9 +189,8 @@ def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
-    return ~widen_flags(
-        log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
-    )
+    reach = 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
+    return ~widen_flags(log.bridged, reach)
 
 
 def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
@@ -243,7 +241,12 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
-    return _refine_delay_shift(cost, float(shifts[best]), step)
+    delay = float(shifts[best])
+    while step > 1e-5:
+        step /= 4
+        candidates = delay + step * np.arange(-4, 5)
+        delay = float(candidates[int(np.argmin([cost(shift) for shift in candidates]))])
+    return delay
 
 
 def choose_delay(
@@ -263,14 +266,6 @@ def choose_delay(
         )
     found = estimate_delay(log, cutoff_hz, phi)
     return (0.0, "undetermined") if found is None else (found, "estimated")
-
-
-def _refine_delay_shift(cost: Callable[[float], float], best: float, step: float) -> float:
-    while step > 1e-5:
-        step /= 4
-        candidates = best + step * np.arange(-4, 5)
-        best = float(candidates[int(np.argmin([cost(shift) for shift in candidates]))])
-    return best
 
 
 def _cost_of_shift(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:

@@ -85,7 +85,7 @@ _MAT_COMPRESSED_TYPE = 15
 _MAT_STRUCTURE_CLASS = 2
 _MAT_COMPLEX_FLAG = 1 << 11
 _MAX_MAT_STRUCTURE_DEPTH = 20
-_MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
+_MAT_NUMERIC_CLASSES = range(6, 16)
 _DTYPE_OF_MAT_TYPE = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
@@ -151,9 +151,8 @@ def _add_mat_variable(
     if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _MAT_COMPLEX_FLAG:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        _add_mat_array_unless_scalar(
-            name, _parse_mat_numbers(parts[3], order).reshape(size, order="F"), found
-        )
+        array = _parse_mat_numbers(parts[3], order).reshape(size, order="F")
+        _add_mat_array_unless_scalar(name, array, found)
     elif flags & 0xFF == _MAT_STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
         (length, *_), names = _parse_mat_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
@@ -166,9 +165,8 @@ def _parse_mat_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     kind, content = part
     if kind not in _DTYPE_OF_MAT_TYPE:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
-    return np.frombuffer(content, f"{order}{_DTYPE_OF_MAT_TYPE[kind]}").astype(
-        _DTYPE_OF_MAT_TYPE[kind]
-    )
+    dtype = _DTYPE_OF_MAT_TYPE[kind]
+    return np.frombuffer(content, f"{order}{dtype}").astype(dtype)
 
 
 def _add_mat_array_unless_scalar(name: str, array: NDArray, found: dict[str, NDArray]) -> None:

@@ -55,12 +55,10 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 
     A row that repeats the time stamp and the values in `columns` of the previous row is removed.
     """
-    if time.column is None:
-        assert time.rate is not None
-        rows = np.arange(table.rows)
-        return Clock(_apply_clock_scale_and_offset(rows / time.rate, time), rows, table.rows)
     t, episodes = time_stamps_and_num_episodes(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
+    if time.column is None:
+        return Clock(_apply_clock_scale_and_offset(t, time), rows, total)
     notes = []
     if len(rows) < len(t):
         notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
@@ -90,11 +88,16 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 
 
 def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
-    """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
+    """Return the times (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
-    Episodes are joined in the whole table, so that all its streams keep one clock.
+    Episodes are joined in the whole table, so that all its streams keep one clock. A rate is that
+    of the usual rows of the stream; missing rows are gaps.
     """
-    assert time.column is not None
+    if time.column is None:
+        assert time.rate is not None
+        rows = np.arange(table.rows) if table.kept_rows is None else table.kept_rows
+        spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
+        return rows / spacing / time.rate, 1
     whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:

@@ -57,9 +57,8 @@ def lag_of_imu_clock(
 
     def unexplained_at_shift(shift: float) -> float:
         moved = remove_arm_effects(resample(t + shift, t_imu, sensed))
-        return sum(
-            _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
-        )
+        parts = np.split(moved, len(expected), axis=1)
+        return sum(_unexplained_share(y, x) for y, x in zip(expected, parts, strict=True))
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
@@ -167,9 +166,7 @@ MAX_LEVER_ARM_DEVIATION_M = 0.005
 MAX_UNEXPLAINED_SHARE = 0.05
 """Largest unexplained share of the variance of a valid fit."""
 IMU_COMPARISON_CUTOFF_HZ = 8.0
-"""Cut-off of the low-pass on all signals [Hz]."""
 NUM_COMPARED_SAMPLES = 1500
-"""Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _MIN_MOTION_OVER_NOISE_POWER = 20.0
 
@@ -296,7 +293,7 @@ class Mounting:
 
     @property
     def rotation_angle_deg(self) -> float:
-        return _rotation_angle_deg(self.R_SI)
+        return rotation_angle_deg(self.R_SI)
 
     @property
     def nearest_right_angled_rotation(self) -> Array:
@@ -305,7 +302,7 @@ class Mounting:
 
     @property
     def angle_to_right_angled_deg(self) -> float:
-        return _rotation_angle_deg(self.nearest_right_angled_rotation.T @ self.R_SI)
+        return rotation_angle_deg(self.nearest_right_angled_rotation.T @ self.R_SI)
 
     @property
     def is_right_angled(self) -> bool:
@@ -375,11 +372,8 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     )
     lever = None
     if position:
-        lever = LeverArm(
-            x[4:7],
-            np.where(are_lever_arm_axes_observable(K, pose, cutoff), deviations[4:7], np.inf),
-            "pose",
-        )
+        observable = are_lever_arm_axes_observable(K, pose, cutoff)
+        lever = LeverArm(x[4:7], np.where(observable, deviations[4:7], np.inf), "pose")
     powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
@@ -431,5 +425,5 @@ def _rotated_about_fixed_axes(R: Array, vector: Array) -> Array:
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 
-def _rotation_angle_deg(R: Array) -> float:
+def rotation_angle_deg(R: Array) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
