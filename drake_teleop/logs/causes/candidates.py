@@ -254,9 +254,8 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     best = next(x for x in fits if x.likelihood > most - _EQUAL_LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
-    by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * min(
-        best.residual_ratio, state.residual_ratio
-    )
+    usual = min(best.residual_ratio, state.residual_ratio)
+    by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * usual
     if by_residual:
         low = (x for x in fits if x.residual_ratio < 2.0 * least)
         best = max(low, key=lambda x: x.likelihood)

@@ -81,9 +81,8 @@ class _StepScan:
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
         self._rows = rows = state.data.rows_per_search_block
         starts = range(0, len(state.data.t), rows)
-        gram, right = map(
-            np.stack, zip(*(self._equations_of_rows(n, n + rows) for n in starts), strict=True)
-        )
+        equations = [self._equations_of_rows(n, n + rows) for n in starts]
+        gram, right = map(np.stack, zip(*equations, strict=True))
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
@@ -122,9 +121,8 @@ def fit_steps_at_middle_of_ramps(
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
     model = replace(state.model, steps=(*state.model.steps, *steps))
-    found = FittedModel.fit_record(
-        state.data, model, model.start_parameters(state.x, state.model), (*spans, *around)
-    )
+    start = model.start_parameters(state.x, state.model)
+    found = FittedModel.fit_record(state.data, model, start, (*spans, *around))
     steps = []
     for both, span in zip(kinds, around, strict=True):
         own = range(first + len(steps), first + len(steps) + len(both))
@@ -224,10 +222,8 @@ def find_contact_spans(state: FittedModel) -> TimeSpans:
     wide[1:] |= contact_blocks[:-1]
     t, rows = state.data.t, state.data.rows_per_search_block
     half, last = 0.5 * float(t[1] - t[0]), len(t) - 1
-    return tuple(
-        (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
-        for a, b in find_runs_of_true(wide)
-    )
+    ends = rows * find_runs_of_true(wide)
+    return tuple((float(t[a]) - half, float(t[min(b - 1, last)]) + half) for a, b in ends)
 
 
 def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
@@ -250,10 +246,8 @@ def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
     t = larger.data.t[0] + dt * rows * np.arange(len(number))
     times = [float(0.5 * (t[a] + dt * rows + t[b])) for a, b in borders]
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
-    found = fit_steps_at_middle_of_ramps(
-        larger, [("offsets", "load")] * len(times), times, (), widths
-    )
-    found = remove_small_steps(found)
+    both = [("offsets", "load")] * len(times)
+    found = remove_small_steps(fit_steps_at_middle_of_ramps(larger, both, times, (), widths))
     limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
     return found if found.residual_ratio < limit else None
 
@@ -297,13 +291,10 @@ class _NormalEquationsOfBlocks:
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_CALM_RMS_MARGIN * calm) ** 2, 0.0))
         quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_RMS_OVER_CALM * calm)))
-        by_motion = _residuals_by_motion_errors(
-            self._state, self._state.x + move, excess, among, quantile
-        )
-        usual = np.hypot(calm, by_motion)
-        return np.asarray(
-            (level > _CONTACT_RMS_OVER_NOISE) & (level > _CONTACT_RMS_OVER_CALM * usual) & among
-        )
+        x = self._state.x + move
+        by_motion = _residuals_by_motion_errors(self._state, x, excess, among, quantile)
+        usual = _CONTACT_RMS_OVER_CALM * np.hypot(calm, by_motion)
+        return np.asarray((level > np.maximum(_CONTACT_RMS_OVER_NOISE, usual)) & among)
 
     def _residual_levels_by_calm_fit(
         self, blocks: NDArray[np.intp]
@@ -403,10 +394,9 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
 def shrink_contacts(state: FittedModel) -> FittedModel:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
-    spans = [_shrunk_contact_span(state, span) for span in state.contact_spans]
-    return FittedModel.fit_record(
-        state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans)
-    )
+    shrunk = (_shrunk_contact_span(state, span) for span in state.contact_spans)
+    spans = tuple((a - dt, b + dt) for a, b in shrunk)
+    return FittedModel.fit_record(state.data, state.model, state.x, spans)
 
 
 def _shrunk_contact_span(state: FittedModel, span: tuple[float, float]) -> tuple[float, float]:

@@ -65,11 +65,9 @@ _FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE = 80.0, 0.1
 
 
 def residual_is_noise(state: FittedModel) -> bool:
-    if (
-        has_negative_inertia(state)
-        or state.residual_ratio > MAX_NOISE_RESIDUAL_RATIO
-        or state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
-    ):
+    if state.residual_ratio > MAX_NOISE_RESIDUAL_RATIO or has_negative_inertia(state):
+        return False
+    if state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT:
         return False
     model = state.model
     parts = ["frame", "linear drift", "rotation"]
@@ -97,9 +95,8 @@ def search_causes(
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
-        opposite = _search_causes_from(
-            _initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay
-        )
+        mirrored = _initial_state(data, replace(plain, axes=-np.eye(3)))
+        opposite = _search_causes_from(mirrored, 0.0, with_delay)
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
         is_wrench = opposite[0].model.torque_factor > 0.0
         # An equal residual is sufficient for a positive mass, because a negative one is impossible.
@@ -112,12 +109,9 @@ def search_causes(
     if abs(delay_s - found[1]) < _EQUAL_DELAY_TOLERANCE_S:
         return found
     repeated = _search_causes_from(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
-    better = (
-        residual_is_noise(repeated[0])
-        or repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
-        or _is_residual_much_smaller(repeated[0], found[0])
-    )
-    return repeated if better else found
+    likelier = repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
+    better = likelier or _is_residual_much_smaller(repeated[0], found[0])
+    return repeated if better or residual_is_noise(repeated[0]) else found
 
 
 def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
@@ -126,10 +120,8 @@ def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
 
 def may_be_coloured_noise(state: FittedModel) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
-    return (
-        state.smooth_misfit < GOOD_SMOOTH_MISFIT
-        and state.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
-    )
+    small = state.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
+    return small and state.smooth_misfit < GOOD_SMOOTH_MISFIT
 
 
 def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
@@ -146,9 +138,8 @@ def _search_causes_from(
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
             return state, delay_s, []
-        found = _remove_cable_if_weight_explains_as_much(
-            list(fit_candidates(state, is_first_round=number == 0))
-        )
+        found = list(fit_candidates(state, is_first_round=number == 0))
+        found = _remove_cable_if_weight_explains_as_much(found)
         rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]
         winner = _most_plausible_of_best_candidates(effective)
@@ -179,9 +170,8 @@ def _search_causes_from(
 
 
 def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Candidate]:
-    best = max(
-        (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
-    )
+    weights = (x for x in found if x.name == "weight" and not is_plausible(x.state))
+    best = max((x.score for x in weights), default=0)
     return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
@@ -189,13 +179,11 @@ def _apply_fitted_delay(
     state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
 ) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
-        if (
-            with_delay is None
-            or abs(state.x[DELAY_INDEX]) < _MIN_CORRECTED_DELAY_S
-            or abs(delay_s) > _MAX_CORRECTED_DELAY_S
-        ):
+        more = float(state.x[DELAY_INDEX])
+        large = abs(delay_s) > _MAX_CORRECTED_DELAY_S
+        if with_delay is None or abs(more) < _MIN_CORRECTED_DELAY_S or large:
             break
-        delay_s += float(state.x[DELAY_INDEX])
+        delay_s += more
         x = state.x.copy()
         x[DELAY_INDEX] = 0.0
         state = FittedModel.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
@@ -224,11 +212,9 @@ def _is_misfit_reduced(candidate: Candidate, state: FittedModel) -> bool:
     smaller = fitted.residual_ratio < _MAX_EFFECTIVE_MISFIT_SHARE * state.residual_ratio
     if candidate.name == "cable":
         return smaller  # the force of a cable far exceeds the noise
-    if (
-        candidate.name not in _STEP_CAUSES
-        and fitted.residual_ratio > _MAX_CANDIDATE_RESIDUAL_INCREASE * state.residual_ratio
-    ):
-        return False  # the candidate increases the residual, and coloured noise predicts it
+    increased = fitted.residual_ratio > _MAX_CANDIDATE_RESIDUAL_INCREASE * state.residual_ratio
+    if increased and candidate.name not in _STEP_CAUSES:
+        return False  # coloured noise predicts the increased residual
     better = smaller or fitted.smooth_misfit < _MAX_EFFECTIVE_MISFIT_SHARE * state.smooth_misfit
     return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_CAUSE_SCORE)
 

@@ -153,9 +153,8 @@ def block_means_of_record(
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _MIN_WRENCH_NOISE_OVER_SPREAD * spread)
     share = _smooth_noisy_alpha_and_get_noise_share(y, used) if gravity_W is None else 0.0
-    out = BlockMeans(
-        middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
-    )
+    noise = white / np.sqrt(size)
+    out = BlockMeans(middle, y, used, noise, gravity_W, positions, acceleration_noise, share)
     return out.with_other_rows_zeroed(used)
 
 

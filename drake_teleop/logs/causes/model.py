@@ -178,12 +178,8 @@ class Model:
         parts = self.parameter_slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
-        for rows, where in (
-            (slice(0, 3), SPECIFIC_FORCE_SIGNALS),
-            (slice(3, 6), ALPHA_SIGNALS),
-            (slice(6, 12), OMEGA_PRODUCTS),
-        ):
-            M[:, rows, where] = np.eye(rows.stop - rows.start)
+        M[:, 0:3, SPECIFIC_FORCE_SIGNALS] = M[:, 3:6, ALPHA_SIGNALS] = np.eye(3)
+        M[:, 6:12, OMEGA_PRODUCTS] = np.eye(6)
         if "gravity" in parts:
             d = x[:, parts["gravity"]]
             for i in range(3):

@@ -80,12 +80,11 @@ class UsedRows:
         e = self.y @ residual_coefficients.T
         filters = np.zeros((6, MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
-        history = np.stack(
-            [e[self.rows_with_predecessors - d] for d in range(MAX_NOISE_LAG + 1)], axis=2
-        )
+        now = self.rows_with_predecessors
+        history = np.stack([e[now - d] for d in range(MAX_NOISE_LAG + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
-        products /= max(len(self.rows_with_predecessors), 1)
-        if is_white or len(self.rows_with_predecessors) < _MIN_ROWS_FOR_AUTOREGRESSION:
+        products /= max(len(now), 1)
+        if is_white or len(now) < _MIN_ROWS_FOR_AUTOREGRESSION:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(MAX_NOISE_LAG)
         inner += 1e-300 * np.eye(MAX_NOISE_LAG)

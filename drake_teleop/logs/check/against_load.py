@@ -71,9 +71,8 @@ class LoadFitQuality:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < self.max_unexplained_including_noise(
-            GOOD_UNEXPLAINED
-        )
+        limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
+        return self.mass > 0 and self.unexplained < limit
 
     def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
         """Return the largest accepted `unexplained`: that of the noise plus the given share."""

@@ -84,11 +84,9 @@ def findings_if_load_is_suspicious(
     its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
     """
     if _is_wrench_constant(log):
-        raise DrakeTeleopError(
-            "the wrench is the same in all samples: no load can be identified",
-            where=log.source,
-            remedy="check the sensor's cable; a driver may repeat its last value",
-        )
+        what = "the wrench is the same in all samples: no load can be identified"
+        remedy = "check the sensor's cable; a driver may repeat its last value"
+        raise DrakeTeleopError(what, where=log.source, remedy=remedy)
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < MIN_LAG_OF_WRONG_CLOCK_S)
@@ -179,10 +177,8 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
     # Determine gravity once, not for each edit.
     if "gravity" in log.estimated and log.described is not None:
         description = description.model_copy(update={"gravity": log.described.gravity})
-    dead, broken = (
-        dead_or_repeated_channel_findings(name, description, data.tables)
-        for name in ("imu", "wrench")
-    )
+    dead = dead_or_repeated_channel_findings("imu", description, data.tables)
+    broken = dead_or_repeated_channel_findings("wrench", description, data.tables)
     if dead:  # A dead channel would cause wrong findings about motion and load.
         fit = fit_load(data.read_thinned_log(description))
         return ConventionCheckResult((*dead, *broken), fit, None, None)

@@ -131,7 +131,8 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
         streams = whole | streams
     streams = streams or drafts[0].streams
-    ordered = {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}
+    order = ["wrench", "imu", "pose", "static"]
+    ordered = {name: streams[name] for name in order if name in streams}
     return Draft(ordered, [*dict.fromkeys(x for draft in drafts for x in draft.comment_lines)])
 
 
@@ -185,20 +186,14 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     if not draft:
         draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
-    used = {
-        name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
-    }
+    used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
-    times = {
-        stream.get("time", {}).get(name) for stream in draft.values() for name in _STAMP_FIELDS
-    }
+    times = {x.get("time", {}).get(name) for x in draft.values() for name in _STAMP_FIELDS}
     used |= times - {None}
     arrays = _names_of_array_columns(table)
     used |= {name.partition("[")[0] for name in used}
-    parts = {
-        name for name in table.columns if name not in arrays and name.partition("[")[0] in arrays
-    }
+    parts = {x for x in table.columns if x not in arrays and x.partition("[")[0] in arrays}
     unused = [name for name in table.columns if name not in used | parts]
     head = [
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
@@ -242,9 +237,7 @@ def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, li
 
 
 def _find_vectors(plain: _NamesAndUnits) -> _Columns:
-    groups = {
-        kind: _group_axes(plain, kind, names) for kind, names in _VECTOR_NAME_PATTERNS.items()
-    }
+    groups = {kind: _group_axes(plain, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
     found: _Columns = {}
     for pair in _VECTORS_OF_ONE_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
@@ -269,10 +262,7 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
         if match and _known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
     whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
-    return {
-        name: [group[axis] for axis in axes if axis in group]
-        for name, group in (whole or groups).items()
-    }
+    return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
 
 
 def _known_unit(text: str) -> str:
@@ -427,10 +417,9 @@ def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, A
     for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
-    return {
-        "column": named[0],
-        "unit": unit if unit in _ALLOWED_UNITS["time"] else _guess_time_unit(table, named[0]),
-    }
+    if unit not in _ALLOWED_UNITS["time"]:
+        unit = _guess_time_unit(table, named[0])
+    return {"column": named[0], "unit": unit}
 
 
 def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:

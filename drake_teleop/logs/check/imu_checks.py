@@ -251,7 +251,8 @@ def check_imu_against_pose(
 
 def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
     assert description.imu is not None
-    if not found.clock_drift:
+    drift = found.clock_drift
+    if not drift:
         offset = description.imu.time.offset - found.lag_s
         finding = Finding(
             "clock",
@@ -259,14 +260,12 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
             f" set imu.time.offset: {offset:.3f}",
         )
         return finding, edit_field(description, "imu.time.offset", offset)
-    late = found.mid_record_lag_s - found.clock_drift * found.mid_record_time_s
-    lag, lines, edited = data.start_lag_and_clock_drift_correction(
-        "imu", description, late, found.clock_drift
-    )
+    late = found.mid_record_lag_s - drift * found.mid_record_time_s
+    lag, lines, edited = data.start_lag_and_clock_drift_correction("imu", description, late, drift)
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
-        f" {1e3 * found.clock_drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
+        f" {1e3 * drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
         f" constant); set {lines}",
     )
     return finding, edited

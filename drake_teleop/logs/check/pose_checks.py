@@ -140,9 +140,8 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
     pose = None if log.described is None else log.described.pose
     seen = found.units_and_axes
     if pose is not None and pose.position is not None and seen.is_usable and not seen.is_mirrored:
-        unit = _position_unit_finding(
-            pose.position.unit, seen.position_unit_ratio, seen.position_unit_ratio_std
-        )
+        ratio, std = seen.position_unit_ratio, seen.position_unit_ratio_std
+        unit = _position_unit_finding(pose.position.unit, ratio, std)
         if unit is not None:
             return unit
     return pose_frame_finding(found, log.posed)

@@ -261,9 +261,8 @@ def choose_delay(
     if not isinstance(delay, str):
         return float(finite_array("delay", to_float("delay", delay))), "given"
     if delay != "auto":
-        raise DrakeTeleopError(
-            f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"
-        )
+        what = f"{delay!r} is neither seconds nor auto"
+        raise DrakeTeleopError(what, where="delay", remedy="give a number or auto")
     found = estimate_delay(log, cutoff_hz, phi)
     return (0.0, "undetermined") if found is None else (found, "estimated")
 

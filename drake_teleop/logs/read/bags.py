@@ -244,9 +244,8 @@ def _columns_of_messages(messages: list[Any]) -> dict[str, NDArray]:
         get = attrgetter(path)
         values = [get(message) for message in messages]
         if hasattr(sample, "nanosec"):
-            columns[path] = np.array([v.sec for v in values]) + 1e-9 * np.array(
-                [v.nanosec for v in values]
-            )
+            seconds, rest = np.array([(v.sec, v.nanosec) for v in values]).T
+            columns[path] = seconds + 1e-9 * rest
         elif not isinstance(sample, np.ndarray):
             columns[path] = np.array(values)
         elif all(len(v) == len(sample) for v in values):

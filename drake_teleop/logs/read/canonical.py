@@ -208,8 +208,8 @@ def describe_canonical(path: Path, table: Table) -> Description:
 
 
 def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
-    where, q = str(table.path), "orientation" in fields
-    if not q and "specific_force" not in fields:
+    where, oriented = str(table.path), "orientation" in fields
+    if not oriented and "specific_force" not in fields:
         return False
     if "angular_velocity" in fields:
         speed = table.finite_numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
@@ -223,10 +223,9 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
     steps = np.diff(t)
     if not len(steps) or not np.median(steps) > 1 / MIN_RATE_HZ:
         return False
-    if q:
-        vertical = rotation_matrices(
-            table.finite_numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
-        )[:, 2]
+    if oriented:
+        quaternions = table.finite_numbers(QUATERNION_COLUMNS, 4, where)
+        vertical = rotation_matrices(quaternions, "quaternion_wxyz")[:, 2]
     else:
         vertical = table.finite_numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)

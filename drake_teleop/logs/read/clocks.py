@@ -248,9 +248,7 @@ def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
         return
     counts = step / SI_VALUE_OF_UNIT[time.unit]
     # Typical sensor rates are 20 Hz to 10 kHz.
-    likely = [
-        unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * SI_VALUE_OF_UNIT[unit] <= 0.05
-    ]
+    likely = [x for x in ("s", "ms", "us", "ns") if 1e-4 <= counts * SI_VALUE_OF_UNIT[x] <= 0.05]
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
     if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"

@@ -394,8 +394,7 @@ def _is_field_or_index(part: str | int) -> bool:
 def _allowed_fields_at(location: Sequence[str | int]) -> Iterator[str]:
     model: Any = Description
     for part in location:
-        options = typing.get_args(model.model_fields[part].annotation) or (
-            model.model_fields[part].annotation,
-        )
+        annotation = model.model_fields[part].annotation
+        options = typing.get_args(annotation) or (annotation,)
         model = next(option for option in options if option is not types.NoneType)
     yield from model.model_fields

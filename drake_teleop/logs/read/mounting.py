@@ -217,9 +217,8 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     target = (wrench - wrench.mean(axis=0)).ravel()
     phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_VALUE_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = least_squares_with_deviations(
-        residual_at, np.concatenate([np.zeros(4), offsets, phi])
-    )
+    start = np.concatenate([np.zeros(4), offsets, phi])
+    x, deviations = least_squares_with_deviations(residual_at, start)
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
     if (left > MAX_UNEXPLAINED_SHARE * whole).any():
         return None
@@ -229,9 +228,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 def times_outside_gaps(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, NUM_COMPARED_SAMPLES)
-    known = [
-        np.interp(t, log.t, is_far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs
-    ]
+    known = [np.interp(t, x.t, is_far_from_gaps(x, cutoff).astype(float)) > 0.99 for x in logs]
     return t[np.all(known, axis=0)]
 
 
@@ -353,12 +350,10 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
     lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
-    middle, drift = mid_record_lag_and_clock_drift(
-        t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0])
-    )
-    R, mirrored = _kabsch_rotation_and_is_mirrored(
-        resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected
-    )
+    independent = 2 * cutoff * float(t[-1] - t[0])
+    middle, drift = mid_record_lag_and_clock_drift(t, pairs, imu.t, lag, independent)
+    shifted = resample(t + middle + drift * (t - centre), imu.t, pairs[0][1])
+    R, mirrored = _kabsch_rotation_and_is_mirrored(shifted, expected)
 
     # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
@@ -367,9 +362,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     pose_omega = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(pose_omega, resample(t, pose.t, smooth.angular_acceleration))
 
-    x, deviations, left = _refine_rotation_lag_and_lever_arm(
-        t, drift * (t - centre), imu.t, pairs, K, R, middle
-    )
+    x, deviations, left = _refine_mounting(t, drift * (t - centre), imu.t, pairs, K, R, middle)
     lever = None
     if position:
         observable = are_lever_arm_axes_observable(K, pose, cutoff)
@@ -392,7 +385,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     )
 
 
-def _refine_rotation_lag_and_lever_arm(
+def _refine_mounting(
     t: Array, drift_lag: Array, t_imu: Array, pairs: SignalPairs, K: Array, R: Array, lag: float
 ) -> tuple[Array, Array, Array]:
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))

@@ -161,12 +161,12 @@ class _LogReader:
         t = uniform_times_of_streams(clock.t, streams, self._source)
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
-        gain_std = self._description.wrench.gain_std
-        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
+        posed, gain_std = None, self._description.wrench.gain_std
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
             posed = self._description.poses_with_frame(pose.recorded_poses, inertial)
-            log = replace(log, posed=posed)
+        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
+        log = replace(log, posed=posed)
         log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
@@ -284,7 +284,7 @@ class _LogReader:
         if s is not None and any(stream.position):
             s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt  # outside of gaps
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
         return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
 
@@ -296,12 +296,10 @@ class _LogReader:
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._no_orientation_error(name)
+            raise self._no_R_WS_error(name)
         return rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
-    def _no_orientation_error(
-        self, name: str, remedy: str = "add a pose stream"
-    ) -> DrakeTeleopError:
+    def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
         return DrakeTeleopError(what, where=f"{self._source}:{name}.frame", remedy=remedy)
 
@@ -324,7 +322,7 @@ class _LogReader:
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
-                raise self._no_orientation_error("static", remedy)
+                raise self._no_R_WS_error("static", remedy)
             wrench = rotate_wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
@@ -390,8 +388,7 @@ class _LogReader:
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
-                values = None if stream is None else getattr(stream, field)
-                if stream is not None and values is not None:
+                if stream is not None and (values := getattr(stream, field)) is not None:
                     return resample_to_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
@@ -404,7 +401,7 @@ class _LogReader:
             if in_base:
                 wrench = rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
-            raise self._no_orientation_error("wrench")
+            raise self._no_R_WS_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
             self._notes.append(

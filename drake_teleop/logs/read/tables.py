@@ -51,15 +51,14 @@ class Table:
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.numbers_with_nan(names[0], "")).all():
             return self
-        columns = [self.numbers_with_nan(name, "") for name in names]
-        if len({len(column) for column in columns}) > 1:
+        numbers = [self.numbers_with_nan(name, "") for name in names]
+        if len({len(column) for column in numbers}) > 1:
             return self
-        rows = np.flatnonzero(np.isfinite(np.hstack(columns)).any(axis=1))
+        rows = np.flatnonzero(np.isfinite(np.hstack(numbers)).any(axis=1))
         if not 0 < len(rows) < self.rows:
             return self
-        return replace(
-            self, columns=_SelectedRows(self.columns, rows), whole_table=self, kept_rows=rows
-        )
+        columns = _SelectedRows(self.columns, rows)
+        return replace(self, columns=columns, whole_table=self, kept_rows=rows)
 
     @property
     def rows(self) -> int:
@@ -112,11 +111,10 @@ class Table:
         """Return the numbers (N,) of a column, with NaN and infinity."""
         numbers = self.numbers_with_nan(name, where)
         if numbers.shape[1] != 1:
-            raise DrakeTeleopError(
-                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1",
-                where=where,
-                remedy="name a column that has one",
+            what = (
+                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1"
             )
+            raise DrakeTeleopError(what, where=where, remedy="name a column that has one")
         return numbers[:, 0]
 
     def check_magnitude(
