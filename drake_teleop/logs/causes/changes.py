@@ -71,8 +71,6 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Likelihood gain by a change of offsets or load at any instant, for white noise."""
-
     def __init__(self, state: FittedModel, kind: str) -> None:
         power = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
         J = state.model.wrench_derivative(state.x) / power[:, None]
@@ -133,7 +131,7 @@ def fit_steps_at_middle_of_ramps(
 
 
 def remove_small_steps(state: FittedModel) -> FittedModel:
-    """Remove insignificant changes of offsets or load one by one, and refit the model."""
+    """Refit without insignificant changes of offsets or load."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:

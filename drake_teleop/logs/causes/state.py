@@ -98,10 +98,8 @@ class UsedRows:
 
 
 def is_in_time_spans(data: BlockMeans, spans: TimeSpans) -> NDArray[np.bool_]:
-    inside = np.zeros(len(data.t), bool)
-    for start, stop in spans:
-        inside |= (data.t >= start) & (data.t <= stop)
-    return inside
+    inside = [(data.t >= start) & (data.t <= stop) for start, stop in spans]
+    return np.any([np.zeros(len(data.t), bool), *inside], axis=0)
 
 
 _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
@@ -282,7 +280,6 @@ def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tu
 
 
 def _symmetric_stiffness_signals_matrix() -> Array:
-    """Return the matrix (18, 27) from rotation-position products to signals of a stiffness."""
     out = np.zeros((6, 3, 27))
     for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
         for i in range(3):

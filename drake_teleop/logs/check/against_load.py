@@ -340,12 +340,8 @@ def clock_drift_finding_and_correction(
     limit = _MAX_UNEXPLAINED_AFTER_OVER_BEFORE * _unexplained_after_delay_removal(log)
     if _unexplained_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
-    finding = Finding(
-        "clock",
-        f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against that of the"
-        f" wrench; set {lines}",
-    )
-    return [finding], edited
+    text = f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against the wrench's"
+    return [Finding("clock", f"{text}; set {lines}")], edited
 
 
 def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:

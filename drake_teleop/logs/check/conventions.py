@@ -111,11 +111,9 @@ def findings_if_load_is_suspicious(
         raise DrakeTeleopError(f"{what}: {found[0].message}", where=log.source)
     if negative:
         sensor = "static" if log.static else "wrench"
-        raise DrakeTeleopError(
-            f"the fitted mass is {load.mass:.4g} kg: the sign of the wrench is probably inverted",
-            where=f"{log.source}:{sensor}.sign",
-            remedy="set `sign: -1` in the log description (or remove it if it is there)",
-        )
+        what = f"the fitted mass is {load.mass:.4g} kg: the sign of the wrench is probably inverted"
+        remedy = "set `sign: -1` in the log description (or remove it if it is there)"
+        raise DrakeTeleopError(what, where=f"{log.source}:{sensor}.sign", remedy=remedy)
     return tuple(found)
 
 
@@ -219,11 +217,9 @@ def _merge_clock_findings(
     if abs(mounting.lag_s + delay) > MIN_LAG_OF_WRONG_CLOCK_S:
         return findings
     assert description.pose is not None
-    finding = Finding(
-        "clock",
-        f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench;"
-        f" set pose.time.offset: {description.pose.time.offset - delay:.3f}",
-    )
+    text = f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench"
+    offset = description.pose.time.offset - delay
+    finding = Finding("clock", f"{text}; set pose.time.offset: {offset:.3f}")
     return [finding, *(other for other in findings if other.name != "clock")]
 
 

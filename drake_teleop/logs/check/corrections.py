@@ -133,7 +133,6 @@ def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -
 
 
 def call_or_none_if_unreadable(function: Callable[[Description], Any], edited: Description) -> Any:
-    """Return `function(edited)`, or None if the edited description cannot be read."""
     try:
         return function(edited)
     except DrakeTeleopError:

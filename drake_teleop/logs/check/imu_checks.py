@@ -254,11 +254,8 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
     drift = found.clock_drift
     if not drift:
         offset = description.imu.time.offset - found.lag_s
-        finding = Finding(
-            "clock",
-            f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
-            f" set imu.time.offset: {offset:.3f}",
-        )
+        text = f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s"
+        finding = Finding("clock", f"{text}; set imu.time.offset: {offset:.3f}")
         return finding, edit_field(description, "imu.time.offset", offset)
     late = found.mid_record_lag_s - drift * found.mid_record_time_s
     lag, lines, edited = data.start_lag_and_clock_drift_correction("imu", description, late, drift)

@@ -102,11 +102,8 @@ def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding 
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(kappa) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
-    return Finding(
-        "units",
-        f"{text} their unit is not known; multiply pose.position.scale (1 by default) by"
-        f" {kappa:.4g}",
-    )
+    remedy = f"multiply pose.position.scale (1 by default) by {kappa:.4g}"
+    return Finding("units", f"{text} their unit is not known; {remedy}")
 
 
 def _fit_centred_signals(
@@ -129,7 +126,7 @@ def _fit_centred_signals(
 
 
 def has_usable_poses(log: Log) -> bool:
-    """Return whether a log has poses over at least 4 s, as splines require."""
+    """Return whether a log of motion has poses over at least 4 s, as splines require."""
     duration_s = float(log.t[-1] - log.t[0])
     return log.posed is not None and not log.static and duration_s >= MIN_POSES_DURATION_S
 

@@ -152,39 +152,28 @@ def estimate_auto_pose_frame(
     frame = found.frame
     changes: dict[str, Any] = {}
     notes: list[str] = []
-    if pose.position_in_sensor == "auto":
-        _require_determined_axes(
-            frame.is_position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
+    mm, deg = 1e3 * frame.position_stds_m.max(), frame.rotation_stds_deg.max()
+    for name, value, known, quantity, deviation in (
+        ("position", frame.p_SoPo_S, frame.is_position_known, "origin along", f"{mm:.2g} mm"),
+        ("rotation", frame.R_SP, frame.is_rotation_known, "turn about", f"{deg:.2g} deg"),
+    ):
+        field = f"{name}_in_sensor"
+        if getattr(pose, field) != "auto":
+            continue
+        if not known.all():
+            what = f"the data do not determine the pose's {quantity} {_unknown_axes(known)}"
+            remedy = "turn the sensor faster, about more axes, without contact; or give the values"
+            raise DrakeTeleopError(what, where=f"{source}:pose.{field}", remedy=remedy)
+        changes[field] = tuple(map(tuple, value.tolist()) if value.ndim == 2 else value.tolist())
+        notes.append(
+            f"pose.{field} found, standard deviation {deviation}; write it into the description as"
+            f" pose.{field}: {round_for_yaml(value)}"
         )
-        changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
-        deviation = 1e3 * float(frame.position_stds_m.max())
-        notes.append(_pose_frame_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
-    if pose.rotation_in_sensor == "auto":
-        _require_determined_axes(
-            frame.is_rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
-        )
-        changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
-        deviation = float(frame.rotation_stds_deg.max())
-        notes.append(_pose_frame_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
-
-
-def _require_determined_axes(known: Any, where: str, quantity: str) -> None:
-    if not known.all():
-        what = f"the data do not determine {quantity} {_unknown_axes(known)}"
-        remedy = "turn the sensor faster, about more axes, without contact; or give the values"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _unknown_axes(known: Any) -> str:
     return ", ".join(axis for axis, is_known in zip("xyz", known, strict=True) if not is_known)
-
-
-def _pose_frame_note(name: str, value: Any, deviation: str) -> str:
-    return (
-        f"pose.{name} found, standard deviation {deviation}; write it into the description as"
-        f" pose.{name}: {round_for_yaml(value)}"
-    )
 
 
 def block_means_of_log(log: Log) -> BlockMeans:

@@ -123,7 +123,6 @@ class Log:
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
     def with_times_relative_to(self, start: float) -> Log:
-        """Return the log with times relative to `start` [s]."""
         posed = None if self.posed is None else self.posed.with_times_relative_to(start)
         return replace(self, t=self.t - start, posed=posed)
 

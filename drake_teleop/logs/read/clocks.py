@@ -46,7 +46,6 @@ class Clock:
     num_episodes: int = 1
 
     def select_timed_rows(self, x: Array) -> Array:
-        """Return the rows of x (num_rows, ...) that have a time."""
         return x if len(self.kept_rows) == self.num_rows else x[self.kept_rows]
 
 
@@ -90,8 +89,8 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the times (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
-    Episodes are joined in the whole table, so that all its streams keep one clock. A rate is that
-    of the usual rows of the stream; missing rows are gaps.
+    Episodes are joined in the whole table, so that all its streams keep one clock. `time.rate` is
+    that of the stream's usual rows; missing rows are gaps.
     """
     if time.column is None:
         assert time.rate is not None
@@ -118,11 +117,11 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
 def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
     """Return a note about the episodes of a wrench's clock; raise an error for several files."""
     if num_files > 1:
-        raise DrakeTeleopError(
-            f"the clock starts {clock.num_episodes} times, which requires all streams in one file",
-            where=where,
-            remedy="write all streams into one table, or each episode into files of its own",
+        what = (
+            f"the clock starts {clock.num_episodes} times, which requires all streams in one file"
         )
+        remedy = "write all streams into one table, or each episode into files of its own"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     if not where.endswith("wrench.time"):
         return []
     return [

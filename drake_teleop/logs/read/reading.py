@@ -328,11 +328,9 @@ class _LogReader:
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
         if n < MIN_STATIC_POSES:
-            raise DrakeTeleopError(
-                f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)",
-                where=f"{self._source}:static",
-                remedy="record 12 or more, with different orientations",
-            )
+            what = f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)"
+            remedy = "record 12 or more, with different orientations"
+            raise DrakeTeleopError(what, where=f"{self._source}:static", remedy=remedy)
         rest = np.zeros((n, 3))
         return Log(
             *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),

@@ -92,7 +92,7 @@ def specific_force_at_So(
 
 
 class OrientationColumns:
-    """Columns of a table that contain orientations of S in any form."""
+    """Columns of a table with orientations of S, or of the posed frame P, in any form."""
 
     def __init__(
         self,
@@ -113,14 +113,14 @@ class OrientationColumns:
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:
-        """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
+        """Return R_WS or R_WP (n, 3, 3) of n rows; raise an error if these are no rotations."""
         orientation = self._orientation
         R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
         self._check_rotation_errors(orthogonality_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
-        """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z]."""
+        """Return R_WS or R_WP of n rows as quaternions (n, 4) [w, x, y, z]."""
         if not self._orientation.form.startswith("quaternion"):
             return quaternions_from_matrices(self.rotations(rows))
         q = self._columns[rows]

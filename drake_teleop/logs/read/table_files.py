@@ -106,7 +106,7 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
     columns = _column_expressions(frame)
     rows = frame.select(pl.len()).collect().item()
     if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
-        return _LazyColumns(frame, columns)
+        return _LazyColumns(frame, columns)  # each is read on access, to limit memory
     return _collect_columns(frame, columns)
 
 
@@ -173,8 +173,6 @@ def _expand_nested_column(
 
 
 class _LazyColumns(UserDict[str, Any]):
-    """Columns of a Polars frame, each read on access to limit memory."""
-
     def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
         super().__init__(columns)
         self._frame = frame

@@ -153,13 +153,10 @@ class Table:
         numbers = self.numbers_with_nan(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
         if bad.any():
-            first = int(np.argmax(bad))
-            raise DrakeTeleopError(
-                f"no finite number in {int(bad.sum())} rows, the first is row"
-                f" {self.line_in_file(first)}",
-                where=f"{self.path}:{name}",
-                remedy="cut the log before it or repair the rows",
-            )
+            row = self.line_in_file(int(np.argmax(bad)))
+            what = f"no finite number in {int(bad.sum())} rows, the first is row {row}"
+            remedy = "cut the log before it or repair the rows"
+            raise DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
         return numbers
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
@@ -180,8 +177,6 @@ def decimal_resolution(values: Array) -> float:
 
 
 class _SelectedRows(UserDict[str, Any]):
-    """Columns of another table, reduced to some of its rows on access."""
-
     def __init__(self, columns: MutableMapping[str, NDArray], rows: NDArray[np.intp]) -> None:
         super().__init__(dict.fromkeys(columns))
         self._columns, self._rows = columns, rows
