@@ -23,8 +23,7 @@ from drake_teleop.logs.causes.state import (
 _MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
 _STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
-MIN_OMITTED_RAMP_SPAN_S = 0.5
-"""Shortest omitted time around a gradual step [s]."""
+MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
 _NUM_TRIED_STEP_TIMES = 2
 _MIN_STEP_OVER_DEVIATION = 5.0
 _MIN_OFFSET_STEP_OVER_NOISE = 2.0
@@ -224,9 +223,9 @@ def find_contact_spans(state: FittedModel) -> TimeSpans:
     return tuple((float(t[a]) - half, float(t[min(b - 1, last)]) + half) for a, b in ends)
 
 
-def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
+def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
     """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
-    blocks = _NormalEquationsOfBlocks(larger)
+    blocks = _NormalEquationsOfBlocks(state)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_NUM_LOADS):
         contact_blocks = blocks.find_contact_blocks(left)
@@ -240,13 +239,13 @@ def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
     if not 0 < len(borders) <= _MAX_LOAD_STEPS:
         return None
-    dt, rows = larger.data.dt, larger.data.rows_per_search_block
-    t = larger.data.t[0] + dt * rows * np.arange(len(number))
+    dt, rows = state.data.dt, state.data.rows_per_search_block
+    t = state.data.t[0] + dt * rows * np.arange(len(number))
     times = [float(0.5 * (t[a] + dt * rows + t[b])) for a, b in borders]
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
     both = [("offsets", "load")] * len(times)
-    found = remove_small_steps(fit_steps_at_middle_of_ramps(larger, both, times, (), widths))
-    limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
+    found = remove_small_steps(fit_steps_at_middle_of_ramps(state, both, times, (), widths))
+    limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * state.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
     return found if found.residual_ratio < limit else None
 
 

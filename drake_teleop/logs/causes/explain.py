@@ -58,9 +58,7 @@ _CERTAIN_CAUSE_SCORE = 1000.0
 _MIN_WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
 _STEP_CAUSES, _MAX_CANDIDATE_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
 _CAUSES_LIKE_COLOURED_NOISE = ("axes", "gravity", "weight", "torque factor", "contact")
-"""Causes whose misfit may be as smooth as coloured noise."""
-_FLEXIBLE_CAUSES = ("cable", "drift")
-"""Causes with many columns, which resemble others and require margins of their scores."""
+_FLEXIBLE_CAUSES = ("cable", "drift")  # with many columns, which resemble other causes
 _FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE = 80.0, 0.1
 
 
@@ -293,8 +291,8 @@ def explain_misfit(
         causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
         noisy = only_noise or may_be_coloured_noise(state)
-        if not causes and noisy and _is_load_absent(state, covariance):
-            causes = [_no_load_cause(state, covariance)]
+        if not causes and noisy:
+            causes = _no_load_cause(state, covariance)
         removed = None
         if "weight" in state.model.extensions:
             removed = state.x[state.model.parameter_slices["weight"]]
@@ -312,13 +310,11 @@ def explain_misfit(
         )
 
 
-def _is_load_absent(state: FittedModel, covariance: Array) -> bool:
+def _no_load_cause(state: FittedModel, covariance: Array) -> list[Cause]:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     largest = min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation)
-    return bool(mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1)
-
-
-def _no_load_cause(state: FittedModel, covariance: Array) -> Cause:
-    most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
+    if not (mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1):
+        return []
+    most = mass + 1.96 * deviation
     text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
-    return Cause("no load", text, values={"mass_limit": most})
+    return [Cause("no load", text, values={"mass_limit": most})]

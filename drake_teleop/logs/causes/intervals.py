@@ -25,7 +25,6 @@ _LARGE_RESIDUAL_RATIO = 20.0
 _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL = 2.2
 _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL = 6.0
 _CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
-"""Causes whose effects are included in the jackknife."""
 _TRIED_SENSOR_GAIN_STDS = np.geomspace(1e-4, 0.1, 31)
 _MIN_LIKELIHOOD_RISE_BY_GAINS = 20.0
 _MIN_SHARE_EXPLAINED_BY_GAINS = 0.5

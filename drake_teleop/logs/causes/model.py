@@ -27,8 +27,7 @@ from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
 )
 
-OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16
-"""Positions of the 16 parameters [offsets; phi] and of the delay."""
+OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter vector
 _NUM_EXTENSION_PARAMETERS = {
     "gravity": 3,
     "weight": 4,

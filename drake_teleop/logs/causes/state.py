@@ -14,15 +14,13 @@ from drake_teleop.logs.causes.instants import (
     OMEGA_PRODUCTS,
     ROTATION_POSITION_PRODUCTS,
     ROTATION_SIGNALS,
-    SYMMETRIC_MATRIX_ENTRIES,
     WRENCH_SIGNALS,
     BlockMeans,
 )
-from drake_teleop.logs.causes.model import Model
+from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, Model
 
 _MIN_ROWS_FOR_AUTOREGRESSION = 50
-TimeSpans = tuple[tuple[float, float], ...]
-"""(start, stop) of contacts [s]."""
+TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +103,9 @@ def is_in_time_spans(data: BlockMeans, spans: TimeSpans) -> NDArray[np.bool_]:
 _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 _NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
+# (18, 27) from rotation-position products to the signals of a symmetric stiffness.
+_STIFFNESS_ENTRIES = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
+_STIFFNESS_SIGNALS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRIES])
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +202,7 @@ class FittedModel:
         if self.data.gravity_W is not None:
             parts.append(y[:, ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, ROTATION_POSITION_PRODUCTS] @ _symmetric_stiffness_signals_matrix().T)
+            parts.append(y[:, ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_predecessors, self.noise_filters
@@ -277,12 +278,3 @@ def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     kept = values > 1e-7 * values[-1]
     part = vectors[:, kept].T @ (scale * right[used])
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
-
-
-def _symmetric_stiffness_signals_matrix() -> Array:
-    out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
-        for i in range(3):
-            for a, b in {(j, k), (k, j)}:
-                out[row, i, 9 * i + 3 * a + b] = 1.0
-    return out.reshape(18, 27)

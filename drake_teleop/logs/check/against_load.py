@@ -41,14 +41,12 @@ GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
 VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
-MIN_REDUCTION_BY_EDIT = 4.0
-"""Smallest factor by which an edit must reduce the unexplained share."""
+MIN_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _LOAD_FIT_CUTOFF_HZ = 15.0
 _FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
 """Findings with the sign; mirrored axes are a cause that `identify` names."""
-_CONTACT_FREE_SHARE = 0.75
-"""Share of a record that is without contact, if any is."""
+_CONTACT_FREE_SHARE = 0.75  # of a record with contact
 _MAX_FITTED_SAMPLES = 1500
 
 
@@ -136,8 +134,7 @@ def min_unexplained_reduction_by_edit(fit: LoadFitQuality) -> float:
     return max(MIN_REDUCTION_BY_EDIT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
 
 
-UNDETERMINED_UNEXPLAINED_SHARE = 0.9
-"""Unexplained share of the wrench's variance above which a load is undetermined."""
+UNDETERMINED_UNEXPLAINED_SHARE = 0.9  # of the variance; above it a load is undetermined
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
@@ -273,7 +270,7 @@ def undetermined_payload_finding(load: Identification, unexplained: float) -> Fi
     if load.verdicts[6] != "not" and unexplained < UNDETERMINED_UNEXPLAINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
-    fitted = "nothing here depends on its mass"
+    fitted = "no signal of the record depends on its mass"
     if np.isfinite(deviation):
         share = max(0.0, 100 * (1 - unexplained))
         fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit, which explains {share:.0f} % of"

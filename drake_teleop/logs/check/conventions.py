@@ -43,8 +43,7 @@ from drake_teleop.logs.read.tables import Table
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
-_MIN_GRAVITY_DIRECTION_SPREAD = 0.15
-"""Smallest deviation of gravity's direction that separates offsets from a load."""
+_MIN_GRAVITY_DIRECTION_SPREAD = 0.15  # that separates offsets from a load
 _MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest reading
 
 

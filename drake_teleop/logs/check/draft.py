@@ -142,10 +142,8 @@ def _is_template(stream: dict[str, Any]) -> bool:
     return bool(columns) and set(columns) == {_FILL_IN_TEXT}
 
 
-_NamesAndUnits = dict[str, tuple[str, str]]
-"""Normalized name and unit of each column, from the column's name."""
-_Columns = dict[str, list[str]]
-"""Names of the columns of each recognized vector."""
+_NamesAndUnits = dict[str, tuple[str, str]]  # normalized, of each column, from its name
+_Columns = dict[str, list[str]]  # names of the columns of each recognized vector
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:

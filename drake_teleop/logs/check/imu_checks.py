@@ -27,8 +27,7 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
 RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
-MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02
-"""Smallest reported error of gravity; calibrated sensors are within 1 %."""
+MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION = 5.0
 _MIN_ALPHA_CORRELATION = 0.8
 _ALPHA_COMPARISON_CUTOFF_HZ = 5.0
@@ -105,7 +104,7 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
         return Finding(
             "swapped axes",
             f"{text}: its x, y, z should be its {', '.join(axis_names_of_rows(P))}; correct"
-            " imu.angular_velocity.columns, in the file where a sign is wrong",
+            " imu.angular_velocity.columns, and signs by imu.angular_velocity.scale",
         ), None
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
     text = f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
@@ -232,7 +231,7 @@ def check_imu_against_pose(
     if given.is_mirrored:
         text = (
             "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"
-            " has the wrong sign; correct imu.specific_force.columns"
+            " has the wrong sign; correct imu.specific_force.columns or imu.specific_force.scale"
         )
         findings.append(Finding("swapped axes", text))
     elif given.rotation_angle_deg > 10:

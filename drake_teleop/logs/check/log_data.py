@@ -18,7 +18,7 @@ from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_num_episodes
-from drake_teleop.logs.read.description import Description, Time
+from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_described_log
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
@@ -81,8 +81,7 @@ class LogData:
         return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
 
     def _thinning_stride(self, stream: Any) -> int:
-        time: Time | None = getattr(stream, "time", None)
-        if time is None:
+        if getattr(stream, "time", None) is None:
             return 1
         t, _ = self._times_and_rows(stream)
         if len(t) < 2:  # read_log raises the error

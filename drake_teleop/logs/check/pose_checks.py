@@ -27,8 +27,7 @@ _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
-MIN_POSES_DURATION_S = 4.0
-"""Shortest record [s] with enough frequencies for an estimate by poses alone."""
+MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
 _CONFUSED_TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _WRONG_TORQUE_UNIT_RATIOS = (

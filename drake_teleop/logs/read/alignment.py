@@ -20,8 +20,7 @@ _MIN_SAMPLES_AFTER_DELAY = 8
 _INTERPOLATED_CHUNK_ROWS = 2**18
 _MIN_SMOOTHER_WINDOW_SAMPLES = 9
 _SMOOTHER_DEGREE = 5
-SMOOTHER_WINDOW_OVER_PERIOD = 1.8
-"""Window length [s] of the smoother times its bandwidth [Hz]."""
+SMOOTHER_WINDOW_OVER_PERIOD = 1.8  # window [s] of the smoother times its bandwidth [Hz]
 
 
 def mean_time_step(t: Array) -> float:

@@ -20,7 +20,6 @@ from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
 MIN_WARNED_IMU_LAG_S = 0.05
-"""Lag between the clocks of IMU and pose that causes a warning [s]."""
 
 
 def estimate_auto_imu_mounting(

@@ -15,12 +15,9 @@ from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
-EPISODE_SPACING_S = 1.0
-"""Least time between two episodes of a file [s]."""
-MIN_GAP_STEPS = 4.0
-"""Least length of a gap in median steps."""
-MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
-"""Range of plausible rates [Hz]; other rates indicate a wrong unit."""
+EPISODE_SPACING_S = 1.0  # least time between two episodes of a file
+MIN_GAP_STEPS = 4.0  # median steps
+MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5  # other rates indicate a wrong unit
 _MAX_MEAN_OVER_MEDIAN_STEP = 4.0
 # Limits of an episode, in median steps: distance of its start from that of the first episode, and
 # each of its first steps. Least number of its rows.
@@ -74,7 +71,11 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     shared = int((np.diff(t) == 0).sum())
     if shared:
         even = spread_shared_stamps(t)
-        _check_stamps_increase(even, rows, table, where)
+        if (np.diff(even) <= 0).any():
+            row = table.line_in_file(rows[int(np.argmax(np.diff(even) <= 0))])
+            what = f"the time stamps do not increase around row {row} of {table.path.name}"
+            remedy = "cut the log there, or give time.rate instead of the stamps"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         notes.append(
             f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
             f" over {_SMOOTHING_WINDOW_STAMPS} stamps, which changes times by up to"
@@ -193,10 +194,7 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     sums = np.concatenate([[0.0], np.cumsum(deviation)])
     smooth = np.empty(n)
     smooth[half : n - half] = (sums[width:] - sums[:-width]) / width
-    for ends, window in (
-        (slice(0, half), slice(0, width)),
-        (slice(n - half, n), slice(n - width, n)),
-    ):
+    for ends, window in (slice(half), slice(width)), (slice(n - half, n), slice(n - width, n)):
         index = np.arange(n)[window]
         slope = np.polyfit(index - index.mean(), deviation[window], 1)[0] if half else 0.0
         smooth[ends] = deviation[window].mean() + slope * (np.arange(n)[ends] - index.mean())
@@ -228,15 +226,6 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
     if len(t) > 1 and t[0] == t[-1]:
         what = f"the time stamps of {table.path.name} never increase"
         raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
-
-
-def _check_stamps_increase(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
-    steps = np.diff(t)
-    if (steps <= 0).any():
-        row = table.line_in_file(rows[int(np.argmax(steps <= 0))])
-        what = f"the time stamps do not increase around row {row} of {table.path.name}"
-        remedy = "cut the log there, or give time.rate instead of the stamps"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:

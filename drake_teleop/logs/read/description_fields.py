@@ -10,8 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 
 from drake_teleop.common.rotations import nearest_rotation, orthogonality_error
 
-ROTATION_TOLERANCE = 0.01
-"""Largest deviation of entries of R^T R from the identity."""
+ROTATION_TOLERANCE = 0.01  # of the entries of R^T R
 _MIN_SCALE_FACTOR = 1e-12
 STANDARD_GRAVITY = 9.80665
 SI_VALUE_OF_UNIT = {

@@ -161,10 +161,8 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     return np.where(unknown, np.inf, deviations)
 
 
-MAX_LEVER_ARM_DEVIATION_M = 0.005
-"""Largest standard deviation of a determined coordinate [m]."""
-MAX_UNEXPLAINED_SHARE = 0.05
-"""Largest unexplained share of the variance of a valid fit."""
+MAX_LEVER_ARM_DEVIATION_M = 0.005  # of a determined coordinate
+MAX_UNEXPLAINED_SHARE = 0.05  # of the variance, for a valid fit
 IMU_COMPARISON_CUTOFF_HZ = 8.0
 NUM_COMPARED_SAMPLES = 1500
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
@@ -249,10 +247,8 @@ def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[
     return alone > _MIN_MOTION_OVER_NOISE_POWER * (noise.sum() - noise)
 
 
-MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
-"""Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
-MAX_ROTATION_DEVIATION_DEG = 1.0
-"""Largest standard deviation of a determined rotation [deg]."""
+MAX_RIGHT_ANGLE_ERROR_DEG = 5.0  # of a right-angled mounting
+MAX_ROTATION_DEVIATION_DEG = 1.0  # of a determined rotation
 MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS = 0.005
 """Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
 _MAX_IMU_LAG_S = 1.0

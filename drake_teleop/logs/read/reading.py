@@ -273,7 +273,7 @@ class _LogReader:
                 return None
             values = self._read_vectors("imu", field, quantity, table, clock.num_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
-            return self._rotate_to_S("imu", stream.frame, values, t, pose)
+            return self._imu_to_S(stream.frame, values, t, pose)
 
         s = imu_vectors("specific_force", stream.sign)
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
@@ -288,15 +288,13 @@ class _LogReader:
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
         return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
 
-    def _rotate_to_S(
-        self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
-    ) -> Array:
+    def _imu_to_S(self, frame: Any, vectors: Array, t: Array, pose: Stream | None) -> Array:
         if isinstance(frame, tuple):
             return vectors @ np.array(frame).T
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._no_R_WS_error(name)
+            raise self._no_R_WS_error("imu")
         return rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
     def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:

@@ -35,8 +35,7 @@ _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
 _WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
-_MAX_CELLS_IN_MEMORY = 2**24
-"""Number of cells above which columns of a Parquet file are read on access."""
+_MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
 
 
 def note_that_table_needs_description(source: str) -> str:

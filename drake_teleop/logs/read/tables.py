@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
-MAX_PLAUSIBLE_NUMBER = 1e25
-"""Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
+MAX_PLAUSIBLE_NUMBER = 1e25  # in any unit; nanoseconds since 1970 are 2e18
 _MAX_RESOLUTION_DECIMALS = 12
 
 
