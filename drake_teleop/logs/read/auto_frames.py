@@ -20,11 +20,11 @@ from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
 MIN_WARNED_IMU_LAG_S = 0.05
+ReadLog = Callable[[Description], Log]
+Estimate = tuple[Description, tuple[str, ...]]  # description with estimates, and notes
 
 
-def estimate_auto_imu_mounting(
-    description: Description, source: str, read: Callable[[Description], Log]
-) -> tuple[Description, tuple[str, ...]]:
+def estimate_auto_imu_mounting(description: Description, source: str, read: ReadLog) -> Estimate:
     """Return the description with estimates for `auto` in the IMU's mounting, and notes."""
     imu = description.imu
     assert imu is not None
@@ -134,9 +134,7 @@ def _format_arm_mm(lever: LeverArm) -> str:
     )
 
 
-def estimate_auto_pose_frame(
-    description: Description, source: str, read: Callable[[Description], Log]
-) -> tuple[Description, tuple[str, ...]]:
+def estimate_auto_pose_frame(description: Description, source: str, read: ReadLog) -> Estimate:
     """Return the description with estimates for `auto` in the pose frame, and notes."""
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 
@@ -202,9 +200,7 @@ def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
 _MAX_GRAVITY_DIRECTION_STD_DEG = 2.0
 
 
-def estimate_auto_gravity(
-    description: Description, source: str, read: Callable[[Description], Log]
-) -> tuple[Description, tuple[str, ...]]:
+def estimate_auto_gravity(description: Description, source: str, read: ReadLog) -> Estimate:
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf

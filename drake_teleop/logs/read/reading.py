@@ -28,6 +28,7 @@ from drake_teleop.logs.read.alignment import (
     uniform_times,
 )
 from drake_teleop.logs.read.auto_frames import (
+    Estimate,
     estimate_auto_gravity,
     estimate_auto_imu_mounting,
     estimate_auto_pose_frame,
@@ -68,7 +69,7 @@ MIN_STATIC_POSES = 3
 MIN_BANDWIDTH_HZ = 1e-3
 _CONVERTED_CHUNK_ROWS = 2**16
 _MIN_IMU_GAP_OVER_STEP = 4.0
-_EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
+_EstimateAuto = Callable[..., Estimate]
 
 
 def read_log(
