@@ -37,12 +37,10 @@ TORQUE_UNIT_FACTORS = tuple(
 _MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.0
 _MIN_GRAVITY_TILT_DEG, _MAX_GRAVITY_ERROR_TILTED, _MAX_GRAVITY_ERROR_UPRIGHT = 0.25, 0.05, 0.02
 _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
-_MIN_CHANNEL_GAIN_ERROR = 0.003
-_MAX_CHANNEL_GAIN_ERROR = 0.25
-_MIN_POSE_SHIFT_M = 0.010
+_MIN_CHANNEL_GAIN_ERROR, _MAX_CHANNEL_GAIN_ERROR = 0.003, 0.25
+_MIN_POSE_SHIFT_M, _MAX_POSE_SHIFT_M = 0.010, 1.5
 _MIN_SENSOR_ROTATION_DEG = 1.0
 _MIN_LOAD_MASS_OVER_DEVIATION = 10.0
-_MAX_POSE_SHIFT_M = 1.5
 _MAX_CABLE_STIFFNESS_N_M = 1000.0
 _MIN_DRIFT_OVER_NOISE = 3.0
 _NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
@@ -132,8 +130,7 @@ def _fit_extension(
     is_significant: Callable[[FittedModel], bool],
 ) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
-    fits = [state.refit(model, start) for start in starts]
-    best = max(fits, key=lambda x: x.likelihood)
+    best = max((state.refit(model, start) for start in starts), key=lambda x: x.likelihood)
     if is_significant(best):
         yield _scored_candidate(name, state, best)
 
@@ -210,8 +207,7 @@ def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
     force = np.eye(width)[WRENCH_SIGNALS][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     right = np.einsum("pci,ij,cj->p", J, sums, state.model.axes.T @ force)
-    found = np.linalg.lstsq(gram, right, rcond=1e-12)[0]
-    u = found[4:]
+    u = np.linalg.lstsq(gram, right, rcond=1e-12)[0][4:]
     given, size = state.data.gravity_W, float(np.linalg.norm(u))
     assert given is not None
     if size == 0.0:

@@ -43,8 +43,7 @@ from drake_teleop.logs.causes.state import FittedModel
 
 MAX_SEARCH_ROUNDS = 4
 BlockMeansAtDelay = Callable[[float], BlockMeans]
-_MIN_CORRECTED_DELAY_S = 5e-4
-_MAX_CORRECTED_DELAY_S = 0.3
+_MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S = 0.004
 _MAX_DELAY_ITERATIONS = 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
@@ -290,8 +289,7 @@ def explain_misfit(
         covariance = load_covariance(state, rejected, blocks, gains)
         causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
-        noisy = only_noise or may_be_coloured_noise(state)
-        if not causes and noisy:
+        if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _no_load_cause(state, covariance)
         removed = None
         if "weight" in state.model.extensions:

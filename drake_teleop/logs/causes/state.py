@@ -139,8 +139,7 @@ class FittedModel:
     def refit(self, model: Model, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
             start = model.start_parameters(self.x, self.model)
-        rows = self._rows_for_model(model)
-        return fit_model(model, rows, start, self.contact_spans, **options)
+        return fit_model(model, self._rows_for_model(model), start, self.contact_spans, **options)
 
     def _rows_for_model(self, model: Model) -> UsedRows:
         rows = self.rows

@@ -86,13 +86,11 @@ _ALLOWED_UNITS = {
     "time": ("s", "ms", "us", "ns"),
 }
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
-_POSE_VECTOR_WIDTHS = (7, 8)
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN_TEXT = "FILL IN"
-_STAMP_FIELDS = ("column", "nanoseconds")
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -187,7 +185,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
-    times = {x.get("time", {}).get(name) for x in draft.values() for name in _STAMP_FIELDS}
+    times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
     used |= times - {None}
     arrays = _names_of_array_columns(table)
     used |= {name.partition("[")[0] for name in used}
@@ -287,7 +285,7 @@ def _reinterpret_lone_torque_as_position(found: _Columns, plain: _NamesAndUnits)
 
 def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
     groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
-    for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
+    for columns in (group for group in groups.values() if len(group) in (7, 8)):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
             if _are_unit_quaternions(table, quaternion):

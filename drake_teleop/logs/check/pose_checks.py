@@ -32,8 +32,8 @@ _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2
 _CONFUSED_TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _WRONG_TORQUE_UNIT_RATIOS = (
     *(
-        SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[other]
-        for unit, other in permutations(_CONFUSED_TORQUE_UNITS, 2)
+        SI_VALUE_OF_UNIT[a] / SI_VALUE_OF_UNIT[b]
+        for a, b in permutations(_CONFUSED_TORQUE_UNITS, 2)
     ),
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )

@@ -137,9 +137,8 @@ def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[
 
 def vectors_of_skew_parts(A: Array) -> Array:
     """Return the vectors (N, 3) whose cross matrices are the skew parts of A (N, 3, 3)."""
-    return 0.5 * np.stack(
-        [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
-    )
+    S = A - np.swapaxes(A, 1, 2)
+    return 0.5 * np.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], axis=1)
 
 
 def white_noise_deviations(x: Array) -> Array:

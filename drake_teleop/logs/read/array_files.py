@@ -45,8 +45,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
     zarr = import_optional_module("zarr", path)
-    group = zarr.open_group(path, mode="r")
-    members = group.members(max_depth=None)
+    members = zarr.open_group(path, mode="r").members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
     return {
         name.replace("/", "."): np.asarray(item[rows])
@@ -76,8 +75,7 @@ def import_optional_module(name: str, path: Path) -> Any:
 
 
 _MAT_HEADER_BYTES = 128
-_MAT_MATRIX_TYPE = 14
-_MAT_COMPRESSED_TYPE = 15
+_MAT_MATRIX_TYPE, _MAT_COMPRESSED_TYPE = 14, 15
 _MAT_STRUCTURE_CLASS = 2
 _MAT_COMPLEX_FLAG = 1 << 11
 _MAX_MAT_STRUCTURE_DEPTH = 20

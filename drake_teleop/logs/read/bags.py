@@ -12,10 +12,9 @@ import os
 import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +51,7 @@ _MESSAGE_TYPES_OF_STREAM = {
 """Message types for each stream, the most likely first."""
 
 
-@dataclass(frozen=True)
-class Topic:
+class Topic(NamedTuple):
     """Topic of a bag: name, message type, number and mean rate [Hz] of messages."""
 
     name: str

@@ -195,8 +195,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     Return None for a poor fit (contact), or few samples outside of gaps.
     """
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
-    delay = estimate_delay(log, None) or 0.0
-    smooth = low_pass_log(remove_delay(log, delay), cutoff)
+    smooth = low_pass_log(remove_delay(log, estimate_delay(log, None) or 0.0), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
     if len(t) < NUM_COMPARED_SAMPLES // 10:

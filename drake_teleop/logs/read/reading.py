@@ -315,8 +315,7 @@ class _LogReader:
             assert stream.orientation is not None
             where, form = f"{self._source}:static.orientation", stream.orientation
             orientations = OrientationColumns(self._description, form, table, table.rows, where)
-            R_WS = orientations.rotations(np.arange(table.rows))
-            R_SW = np.swapaxes(R_WS, 1, 2)
+            R_SW = np.swapaxes(orientations.rotations(np.arange(table.rows)), 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
             if R_SW is None:

@@ -70,8 +70,7 @@ def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
 
 def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
-    both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
-    return both.reshape(-1, 6)
+    return np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
 def specific_force_at_So(

@@ -147,7 +147,8 @@ class Table:
             similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if similar else "its columns are"
             what = f"{self.path.name} has no column {name!r}"
-            remedy = f"{hint} {_join_names(similar or list(self.columns))}"
+            names = similar or list(self.columns)
+            remedy = f"{hint} {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = self.numbers_with_nan(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
@@ -202,8 +203,3 @@ def _column_to_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleop
         if isinstance(cell, str) and "_" in cell:  # which Python ignores
             raise bad(row, cell)
     return numbers
-
-
-def _join_names(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:12])
-    return f"{shown}, ..." if len(names) > 12 else shown
