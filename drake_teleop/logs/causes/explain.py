@@ -42,7 +42,7 @@ from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, Model
 from drake_teleop.logs.causes.state import FittedModel
 
 MAX_SEARCH_ROUNDS = 4
-BlockMeansAtDelay = Callable[[float], BlockMeans]
+MeansAtDelay = Callable[[float], BlockMeans]
 _MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S = 0.004
 _MAX_DELAY_ITERATIONS = 4
@@ -80,9 +80,7 @@ SearchResult = tuple[FittedModel, float, list[Candidate]]
 
 
 def search_causes(
-    data: BlockMeans,
-    with_delay: BlockMeansAtDelay | None = None,
-    always_fitted: tuple[str, ...] = (),
+    data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
     """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
@@ -128,7 +126,7 @@ def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
 
 
 def _search_causes_from(
-    state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
+    state: FittedModel, delay_s: float, with_delay: MeansAtDelay | None
 ) -> SearchResult:
     state, delay_s = _apply_fitted_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
@@ -173,7 +171,7 @@ def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Can
 
 
 def _apply_fitted_delay(
-    state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
+    state: FittedModel, delay_s: float, with_delay: MeansAtDelay | None
 ) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
         more = float(state.x[DELAY_INDEX])
@@ -273,9 +271,7 @@ class MisfitExplanation:
 
 
 def explain_misfit(
-    data: BlockMeans,
-    with_delay: BlockMeansAtDelay | None = None,
-    always_fitted: tuple[str, ...] = (),
+    data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> MisfitExplanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
@@ -291,9 +287,7 @@ def explain_misfit(
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _no_load_cause(state, covariance)
-        removed = None
-        if "weight" in state.model.extensions:
-            removed = state.x[state.model.parameter_slices["weight"]]
+        weight = state.model.parameter_slices.get("weight")
         return MisfitExplanation(
             causes=tuple(causes),
             explained=only_noise,
@@ -302,7 +296,7 @@ def explain_misfit(
             misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(loads_between_changes(state, covariance)),
-            removed_weight=removed,
+            removed_weight=None if weight is None else state.x[weight],
             state=state,
             always_fitted=always_fitted,
         )

@@ -55,7 +55,7 @@ class LoadFitQuality:
     """Least squares fit of a load to a log, Eq. (5).
 
     Attributes:
-        unexplained: share of the wrench's variance that is in the residual.
+        unexplained: share of the residual in the wrench's variance.
         noise_share: share of white noise in this variance.
         mass: fitted mass [kg].
         independent_samples: number of samples with independent noise.

@@ -205,21 +205,18 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
 
 
 def _merge_clock_findings(
-    description: Description,
-    findings: list[Finding],
-    mounting: Mounting | None,
-    delay: float | None,
+    description: Description, found: list[Finding], mounting: Mounting | None, delay: float | None
 ) -> list[Finding]:
-    num_clocks = sum(finding.name == "clock" for finding in findings)
+    num_clocks = sum(finding.name == "clock" for finding in found)
     if num_clocks < 2 or mounting is None or mounting.clock_drift or delay is None:
-        return findings
+        return found
     if abs(mounting.lag_s + delay) > MIN_LAG_OF_WRONG_CLOCK_S:
-        return findings
+        return found
     assert description.pose is not None
     text = f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench"
     offset = description.pose.time.offset - delay
     finding = Finding("clock", f"{text}; set pose.time.offset: {offset:.3f}")
-    return [finding, *(other for other in findings if other.name != "clock")]
+    return [finding, *(other for other in found if other.name != "clock")]
 
 
 def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:

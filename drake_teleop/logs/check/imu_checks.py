@@ -41,26 +41,21 @@ def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding]
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
-    unit = _angle_unit_finding(imu, log)
-    if unit is not None:
-        return [unit[0]], edit_field(description, *unit[1:])
+    edit = _angle_unit_edit(description, imu, log)
+    if edit is not None:
+        return [edit[0]], edit[1]
     if imu.specific_force is None or imu.frame == "base":
         return [], description
     gravity = float(np.linalg.norm(description.gravity_W))
-    axes = _gyro_axes_finding(imu, log, gravity)
-    if axes is not None:
-        finding, columns = axes
-        if columns is not None:
-            description = edit_field(description, "imu.angular_velocity.columns", columns)
-        return [finding], description
-    alpha = _angular_acceleration_axes_finding(imu, log)
-    if alpha is not None:
-        return [alpha], description
-    scale = _gravity_magnitude_finding(imu, log, gravity)
-    return ([] if scale is None else [scale]), description
+    edit = _gyro_axes_edit(description, imu, log, gravity)
+    if edit is not None:
+        return [edit[0]], edit[1]
+    axes = _angular_acceleration_axes_finding(imu, log)
+    finding = axes or _gravity_magnitude_finding(imu, log, gravity)
+    return ([] if finding is None else [finding]), description
 
 
-def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
+def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | None:
     assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
@@ -78,7 +73,8 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
         if least < wrong < most and getattr(imu, quantity).unit == unit:
             text = f"the angular acceleration is {ratio:.3g} times the derivative of the angular"
             line = f"imu.{quantity}.unit"
-            return Finding("degrees", f"{text} velocity; set {line}: {other}"), line, other
+            finding = Finding("degrees", f"{text} velocity; set {line}: {other}")
+            return finding, edit_field(description, line, other)
     return None
 
 
@@ -88,7 +84,7 @@ def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
     return given, low_pass(rate, log.dt, _ALPHA_COMPARISON_CUTOFF_HZ)
 
 
-def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
+def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float) -> Edit | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
@@ -105,10 +101,10 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
             "swapped axes",
             f"{text}: its x, y, z should be its {', '.join(axis_names_of_rows(P))}; correct"
             " imu.angular_velocity.columns, and signs by imu.angular_velocity.scale",
-        ), None
+        ), description
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
-    text = f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
-    return Finding("swapped axes", text), ordered
+    finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
+    return finding, edit_field(description, "imu.angular_velocity.columns", ordered)
 
 
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:

@@ -94,18 +94,13 @@ class OrientationColumns:
     """Columns of a table with orientations of S, or of the posed frame P, in any form."""
 
     def __init__(
-        self,
-        description: Description,
-        orientation: Orientation,
-        table: Table,
-        rows: int,
-        where: str,
+        self, description: Description, described: Orientation, table: Table, rows: int, where: str
     ) -> None:
-        self._orientation, self._table, self._where = orientation, table, where
-        width = NUM_COLUMNS_OF_ROTATION_FORM[orientation.form]
-        self._columns = table.finite_numbers(orientation.columns, width, f"{where}.columns", rows)
-        if orientation.form in ("rotation_vector", "euler"):
-            self._columns *= description.unit_in_si(orientation.unit)
+        self._orientation, self._table, self._where = described, table, where
+        width = NUM_COLUMNS_OF_ROTATION_FORM[described.form]
+        self._columns = table.finite_numbers(described.columns, width, f"{where}.columns", rows)
+        if described.form in ("rotation_vector", "euler"):
+            self._columns *= description.unit_in_si(described.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
         """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
