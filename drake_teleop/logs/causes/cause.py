@@ -94,11 +94,10 @@ def loads_between_changes(state: FittedModel, covariance: Array) -> list[RecordP
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []
-    first, last = float(state.data.t[0]), float(state.data.t[-1])
     ratio = np.sqrt(np.diag(covariance) / np.diag(state.covariance)[:16])
     selection = np.eye(16, state.model.size)
-    out, start = [], first
-    for time, i in [*sorted(loads), (last, -1)]:
+    out, start = [], float(state.data.t[0])
+    for time, i in [*sorted(loads), (float(state.data.t[-1]), -1)]:
         spread = selection @ state.covariance @ selection.T * np.outer(ratio, ratio)
         out.append(RecordPartWithLoad(start, time, (selection @ state.x)[6:], spread))
         if i >= 0:

@@ -308,9 +308,8 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     if abs(delay) > MIN_LAG_OF_WRONG_CLOCK_S:
         offset = description.wrench.time.offset + delay
         text = (
-            f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
-            f" set wrench.time.offset: {offset:.3f} (or shift the other streams in the opposite"
-            " direction)"
+            f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong; set"
+            f" wrench.time.offset: {offset:.3f} (or shift the other streams by the opposite)"
         )
         return [Finding("clock", text)]
     text = (

@@ -146,20 +146,17 @@ def dead_or_repeated_channel_findings(
         if quantity is None:
             continue
         where = f"{stream}.{field}"
-        numbers = _values_by_channel(tables[described.source], quantity.columns, where)
+        numbers: dict[str, Array] = {}
+        for column in quantity.columns:
+            x = tables[described.source].numbers_with_nan(column, where).T
+            named_parts = (
+                [str(column)] if len(x) == 1 else [f"{column}[{i}]" for i in range(len(x))]
+            )
+            numbers |= zip(named_parts, x, strict=True)
         twice = _repeated_column_findings(where, quantity.columns, named)
         found += twice or _dead_channel_findings(where, numbers)
         found += [] if twice else _equal_channel_findings(where, numbers)
     return found
-
-
-def _values_by_channel(table: Table, columns: Any, where: str) -> dict[str, Array]:
-    numbers: dict[str, Array] = {}
-    for column in columns:
-        x = table.numbers_with_nan(column, where)
-        for i, values in enumerate(x.T):
-            numbers[str(column) if len(x.T) == 1 else f"{column}[{i}]"] = values
-    return numbers
 
 
 def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:

@@ -95,14 +95,13 @@ class Log:
             value, shape = getattr(self, name), (len(self.t), *row_shape)
             if value is None:
                 continue
+            where = f"{self.source}:{name}"
             if np.shape(value) != shape:
                 what = f"has shape {np.shape(value)} instead of {shape}"
-                remedy = "give one row per time"
-                raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
+                raise DrakeTeleopError(what, where=where, remedy="give one row per time")
             if not np.isfinite(value).all():
                 what = "holds NaN or infinity (numbers must be finite)"
-                remedy = "cut or repair these samples"
-                raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
+                raise DrakeTeleopError(what, where=where, remedy="cut or repair these samples")
         if np.any(np.diff(self.t) <= 0):
             remedy = "sort the rows, and remove repeated times"
             raise DrakeTeleopError("does not increase", where=f"{self.source}:t", remedy=remedy)

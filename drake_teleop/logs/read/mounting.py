@@ -34,10 +34,8 @@ def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool)
 
     Specific force, and with `gyroscope` also angular velocity.
     """
-    pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
-    if gyroscope:
-        pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
-    return pairs
+    signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
+    return [(resample(t, pose.t, x), y) for x, y in signals]
 
 
 def lag_of_imu_clock(
