@@ -76,15 +76,10 @@ def import_optional_module(name: str, path: Path) -> Any:
 
 _MAT_HEADER_BYTES = 128
 _MAT_MATRIX_TYPE, _MAT_COMPRESSED_TYPE = 14, 15
-_MAT_STRUCTURE_CLASS = 2
-_MAT_COMPLEX_FLAG = 1 << 11
-_MAX_MAT_STRUCTURE_DEPTH = 20
-_MAT_NUMERIC_CLASSES = range(6, 16)
-_DTYPE_OF_MAT_TYPE = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+_MAT_STRUCTURE_CLASS, _MAX_MAT_STRUCTURE_DEPTH = 2, 20
+_MAT_NUMERIC_CLASSES, _MAT_COMPLEX_FLAG = range(6, 16), 1 << 11
+_DTYPE_OF_MAT_TYPE = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4"}
+_DTYPE_OF_MAT_TYPE |= {9: "f8", 12: "i8", 13: "u8"}
 _MAT_FLAGS_AND_SIZE_TYPES = [6, 5]
 _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
