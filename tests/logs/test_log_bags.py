@@ -363,8 +363,8 @@ def test_invalid_bag_raises_error(
 
 def test_error_names_the_missing_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bag(tmp_path / "run1", {"/wrench": islice(wrenches(), 20)})
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(DrakeTeleopError, match=r"; install .*: pip install '\.\[ros\]' "):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(DrakeTeleopError, match=r"rosbags.*; install .*: pip install '\.\[ros\]' "):
         list_topics(tmp_path / "run1")
 
 

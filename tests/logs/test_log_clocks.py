@@ -42,6 +42,18 @@ def clock_of(stamps: object, values: object = None, **time: object) -> Clock:
     return read_clock(Time.model_validate({"column": "t"} | time), table, ["x"], "here")
 
 
+@pytest.mark.parametrize("stride", [1, 8])
+def test_rows_without_numbers_are_gaps_at_a_constant_rate(stride: int) -> None:
+    """The stream starts late, has a gap, and uses one of `stride` rows of its table."""
+    rows = np.delete(np.arange(10, 200), slice(40, 90)) * stride
+    x = np.full(200 * stride, NAN)
+    x[rows] = rows
+    table = Table(Path("log.csv"), {"x": x}).rows_with_any_number(["x"])
+    clock = read_clock(Time(rate=100.0), table, ["x"], "here")
+    np.testing.assert_allclose(clock.t, rows / stride / 100.0)
+    np.testing.assert_allclose(find_gaps_in_times(clock.t, 30.0), [[0.49, 1.0]])
+
+
 def test_valid_stamps_are_unchanged() -> None:
     t = 1.7e9 + np.arange(50) * 0.01
     clock = clock_of(t, offset=0.5)

@@ -331,6 +331,14 @@ def drafted(names: str) -> dict[str, Any]:
     return draft_description(Table(Path("x.csv"), columns), Path()).streams
 
 
+def test_an_empty_cell_does_not_change_the_unit_of_time() -> None:
+    """The last row has no time stamp."""
+    columns = dict.fromkeys(["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], np.arange(60.0))
+    columns["t"] = np.r_[np.arange(59.0) * 0.01, np.nan]
+    draft = draft_description(Table(Path("x.csv"), columns), Path()).streams
+    assert draft["wrench"]["time"] == {"column": "t", "unit": "s"}
+
+
 @pytest.mark.parametrize(
     ("force", "torque", "position"), [("Kraft ", "Moment ", "Ort "), ("力", "力矩", "位置")]
 )

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.corrections import edit_field
 from drake_teleop.logs.check.imu_checks import (
     _correct_imu_clock,
     check_imu_against_pose,
@@ -219,6 +220,19 @@ def test_position_of_another_point_or_unit_is_named(scale: float, name: str, lin
     if name == "pose frame":
         found = yaml.safe_load(re.findall(r"position_in_sensor: (\[.*?\])", finding.message)[0])
         np.testing.assert_allclose(found, place, atol=1e-3)
+
+
+def test_wrong_position_of_the_accelerometer_is_corrected_from_the_described_one() -> None:
+    """The accelerometer is in So; the described position of the pose is right."""
+    at = motion_at(np.arange(0.0, 12.0, 0.01))
+    tool, wrong = np.array([0.03, -0.02, 0.15]), (0.05, 0.02, -0.04)
+    position = at.p_WS + at.R_WS @ tool
+    description, data = imu_and_pose(np.eye(3), position=position)
+    description = edit_field(description, "imu.position", wrong)
+    description = edit_field(description, "pose.position_in_sensor", tuple(tool))
+    (finding,) = position_unit_or_origin_findings(description, data, 0.0)
+    found = yaml.safe_load(finding.message.rpartition("imu.position: ")[2])
+    np.testing.assert_allclose(found, 0.0, atol=1e-3)
 
 
 def test_lag_of_a_drifting_clock_is_given_at_the_first_row() -> None:

@@ -230,6 +230,7 @@ def test_undetermined_auto_raises_error(folder, tmp_path):
         ({"position": None, "position_in_sensor": "auto"}, {}, "require positions"),
         ({"rotation_in_sensor": "auto"}, {"frame": "base"}, "axes of the sensor, not in base"),
         ({"rotation_in_sensor": "base"}, {}, "must be a 3x3 rotation matrix"),
+        ({"rotation_in_sensor": "tool"}, {}, "from the stream to S, or the word auto"),
         ({}, {"gain_std": -0.1}, "greater than or equal to 0"),
     ],
 )

@@ -18,7 +18,7 @@ from drake_teleop.logs.causes.instants import (
     SPECIFIC_FORCE_SIGNALS,
     WRENCH_SIGNALS,
 )
-from drake_teleop.logs.causes.model import Model
+from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, Model
 from drake_teleop.logs.causes.state import FittedModel
 
 EXTENSIONS_BY_PLAUSIBILITY = (
@@ -33,18 +33,15 @@ TORQUE_UNIT_FACTORS = tuple(
     for ratio in (1.0, *_UNIT_RATIOS, *(1.0 / x for x in _UNIT_RATIOS))
     if sign * ratio != 1.0
 )
-"""Ratios of known units and signs between torque and force."""
+"""Factors on the torque that a wrong unit or sign of force or torque causes."""
 _MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.0
 _MIN_GRAVITY_TILT_DEG, _MAX_GRAVITY_ERROR_TILTED, _MAX_GRAVITY_ERROR_UPRIGHT = 0.25, 0.05, 0.02
 _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
-_MIN_CHANNEL_GAIN_ERROR = 0.003
-_MAX_CHANNEL_GAIN_ERROR = 0.25
-_MIN_POSE_SHIFT_M = 0.010
+_MIN_CHANNEL_GAIN_ERROR, _MAX_CHANNEL_GAIN_ERROR = 0.003, 0.25
+_MIN_POSE_SHIFT_M, _MAX_POSE_SHIFT_M = 0.010, 1.5
 _MIN_SENSOR_ROTATION_DEG = 1.0
 _MIN_LOAD_MASS_OVER_DEVIATION = 10.0
-_MAX_POSE_SHIFT_M = 1.5
-_MAX_CABLE_STIFFNESS_N_M = 1000.0
-_MIN_DRIFT_OVER_NOISE = 3.0
+_MAX_CABLE_STIFFNESS_N_M, _MIN_DRIFT_OVER_NOISE = 1000.0, 3.0
 _NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
 _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERROR = 0.02, 0.06, 0.2
 _MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
@@ -68,7 +65,7 @@ class Candidate:
 def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candidate]:
     """Fit a model with each further extension, and yield those with sufficient effect.
 
-    `is_first_round` is True in the first round of the search.
+    Axis permutations and a rotated sensor are tried in the first round of the search only.
     """
     model, data = state.model, state.data
     if is_first_round:
@@ -132,8 +129,7 @@ def _fit_extension(
     is_significant: Callable[[FittedModel], bool],
 ) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
-    fits = [state.refit(model, start) for start in starts]
-    best = max(fits, key=lambda x: x.likelihood)
+    best = max((state.refit(model, start) for start in starts), key=lambda x: x.likelihood)
     if is_significant(best):
         yield _scored_candidate(name, state, best)
 
@@ -143,6 +139,7 @@ def has_negative_mass(state: FittedModel) -> bool:
 
 
 def has_negative_inertia(state: FittedModel) -> bool:
+    """Return whether the inertia about So, or the mass if it is uncertain, is clearly negative."""
     if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
@@ -159,24 +156,21 @@ def has_negative_inertia(state: FittedModel) -> bool:
 def is_plausible(state: FittedModel) -> bool:
     if has_negative_inertia(state):
         return False
-    parts, deviation = state.model.extensions, float(np.sqrt(state.covariance[6, 6]))
-    if "weight" in parts:
-        removed = state.parameters_of_extension("weight")[0][0]
-        # A robot adds no weight, and a removed weight requires an inertia to compare with.
-        if removed < -0.01 * state.x[6] or state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
-            return False
+    parts, mass = set(state.model.extensions), state.x[6]
+    # A removed weight or a cable requires an inertia to compare with.
+    required = _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6])
+    if {"weight", "cable"} & parts and mass < required:
+        return False
+    if "weight" in parts and state.parameters_of_extension("weight")[0][0] < -0.01 * mass:
+        return False  # a robot adds no weight
     if "frame" in parts and _extension_magnitude(state, "frame") > _MAX_POSE_SHIFT_M:
         return False
-    if "cable" in parts:
-        if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
-            return False
-        return max_cable_stiffness_n_m(state) < _MAX_CABLE_STIFFNESS_N_M
-    return True
+    return "cable" not in parts or max_cable_stiffness_n_m(state) < _MAX_CABLE_STIFFNESS_N_M
 
 
 def max_cable_stiffness_n_m(state: FittedModel) -> float:
     """Return the largest stiffness of a cable in any direction [N/m]."""
-    K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    K = state.parameters_of_extension("cable")[0][3:9][SYMMETRIC_MATRIX_INDICES]
     return float(np.abs(np.linalg.eigvalsh(K)).max())
 
 
@@ -190,7 +184,7 @@ def _is_tilt_significant(state: FittedModel) -> bool:
 
 
 def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array, float, float]:
-    """Return the estimated gravity (3,), and its angle [deg] and ratio to the described one."""
+    """Return the estimated gravity_W (3,), its angle [deg] and ratio to the described one."""
     given = state.data.gravity_W
     assert given is not None
     true = given - state.parameters_of_extension("gravity")[0]
@@ -212,17 +206,15 @@ def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
     force = np.eye(width)[WRENCH_SIGNALS][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     right = np.einsum("pci,ij,cj->p", J, sums, state.model.axes.T @ force)
-    found = np.linalg.lstsq(gram, right, rcond=1e-12)[0]
-    u = found[4:]
-    given = state.data.gravity_W
+    u = np.linalg.lstsq(gram, right, rcond=1e-12)[0][4:]
+    given, size = state.data.gravity_W, float(np.linalg.norm(u))
     assert given is not None
-    size = float(np.linalg.norm(u))
     if size == 0.0:
         return None
     model = state.model.with_extension("gravity")
     x = model.start_parameters(state.x, state.model)
+    x[6:16] = 0.0
     x[6] = size / float(np.linalg.norm(given))
-    x[7:16] = 0.0
     x[model.parameter_slices["gravity"]] = given + u / size * np.linalg.norm(given)
     return x
 
@@ -239,7 +231,7 @@ def _is_removed_weight_large(state: FittedModel) -> bool:
 
 
 def drift_amplitudes(state: FittedModel) -> Array:
-    """Return the largest drift (6,) of the offsets from their means [N, N m]."""
+    """Return bounds (6,) of the drift of the offsets from their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
     return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
 
@@ -252,20 +244,19 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     fits = []
     for factor in (1.0, *TORQUE_UNIT_FACTORS):
         model = replace(state.model, torque_factor=factor)
-        fits.append(state.refit(model, state.x, steps=_TORQUE_FACTOR_ITERATIONS))
+        fits.append(state.refit(model, state.x, iterations=_TORQUE_FACTOR_ITERATIONS))
     most = max(x.likelihood for x in fits)
     best = next(x for x in fits if x.likelihood > most - _EQUAL_LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
-    by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * min(
-        best.residual_ratio, state.residual_ratio
-    )
+    usual = min(best.residual_ratio, state.residual_ratio)
+    by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * usual
     if by_residual:
         low = (x for x in fits if x.residual_ratio < 2.0 * least)
         best = max(low, key=lambda x: x.likelihood)
     if best is fits[0]:
         return
-    options = {"steps": _TORQUE_FACTOR_ITERATIONS} if by_residual else {}
+    options = {"iterations": _TORQUE_FACTOR_ITERATIONS} if by_residual else {}
     best = state.refit(best.model, best.x, **options)
     if 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
@@ -276,13 +267,9 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     most = _MAX_EXTREME_TORQUE_FACTOR_ERROR if far else _MAX_TORQUE_FACTOR_ERROR
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, num_extra=1)
-    # A factor beside the known ratios is not a cause, but widens the intervals.
-    score = (
-        found.score
-        if abs(value[0]) < limit
-        else min(found.score, _SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR)
-    )
-    yield replace(found, score=score)
+    if not abs(value[0]) < limit:  # a factor beside the known ratios is not a cause
+        found = replace(found, score=min(found.score, _SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR))
+    yield found
 
 
 def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
@@ -314,18 +301,16 @@ def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
     cross = np.einsum("pci,ij,dj->cdp", J, sums, force)  # axis c of S, channel d
     total = float(np.trace(sums[WRENCH_SIGNALS, WRENCH_SIGNALS][:3, :3]))
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
-    best: tuple[float, Array] = (np.inf, np.eye(3))
-    plain = total
-    for Q in signed_permutations():
+
+    def square_with_axes(Q: Array) -> float:
         right = np.einsum("dc,cdp->p", Q, cross)
         found = inverse @ right
-        left = total - float(right @ found) if found[0] > 0.0 else total
-        if (np.eye(3) == Q).all():
-            plain = left
-        elif left < best[0]:
-            best = (left, Q)
-    if best[0] < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * plain:
-        larger = state.refit(replace(state.model, axes=best[1]), np.zeros(state.model.size))
+        return total - float(right @ found) if found[0] > 0.0 else total
+
+    identity, *others = signed_permutations()
+    best = min(others, key=square_with_axes)
+    if square_with_axes(best) < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * square_with_axes(identity):
+        larger = state.refit(replace(state.model, axes=best), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
             found = _scored_candidate("axes", state, larger, num_extra=3)
             # The given axes imply a negative mass, which is impossible.

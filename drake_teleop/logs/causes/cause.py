@@ -22,8 +22,7 @@ from drake_teleop.logs.causes.candidates import (
 from drake_teleop.logs.causes.state import FittedModel
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
-CHANGE_CAUSES = ("zero change", "load change")
-"""Causes that divide a record into parts with different offsets or loads."""
+CHANGE_CAUSES = ("zero change", "load change")  # they divide a record into parts
 CAUSES_WITHOUT_CORRECTION = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
 """Causes that no line of a description corrects."""
 
@@ -35,8 +34,8 @@ class Cause:
     Attributes:
         name: such as "axes", "gravity direction", "load change" or "cable".
         message: cause, value with its interval, and remedy.
-        start_s, stop_s: time span since the start of the record [s]; None: unlimited.
-        values: figures by name, in SI.
+        start_s, stop_s: time span on the clock of the log [s]; None: unlimited.
+        values: figures by name, in SI; `angle_deg` in [deg].
         fields: corrected values of fields of the log description, as in YAML.
     """
 
@@ -95,17 +94,14 @@ def loads_between_changes(state: FittedModel, covariance: Array) -> list[RecordP
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []
-    first, last = float(state.data.t[0]), float(state.data.t[-1])
     ratio = np.sqrt(np.diag(covariance) / np.diag(state.covariance)[:16])
-    map_ = np.zeros((16, state.model.size))
-    map_[:, :16] = np.eye(16)
-    out, start = [], first
-    for time, i in [*sorted(loads), (last, -1)]:
-        spread = map_ @ state.covariance @ map_.T * np.outer(ratio, ratio)
-        out.append(RecordPartWithLoad(start, time, (map_ @ state.x)[6:], spread))
+    selection = np.eye(16, state.model.size)
+    out, start = [], float(state.data.t[0])
+    for time, i in [*sorted(loads), (float(state.data.t[-1]), -1)]:
+        spread = selection @ state.covariance @ selection.T * np.outer(ratio, ratio)
+        out.append(RecordPartWithLoad(start, time, (selection @ state.x)[6:], spread))
         if i >= 0:
-            map_ = map_.copy()
-            map_[6:, state.model.parameter_slices[f"step {i}"]] = np.eye(10)
+            selection[6:, state.model.parameter_slices[f"step {i}"]] = np.eye(10)
         start = time
     return out
 

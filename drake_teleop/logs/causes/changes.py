@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
-from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
+from drake_teleop.logs.causes.model import Model, StepChange
 from drake_teleop.logs.causes.state import (
     FittedModel,
     TimeSpans,
@@ -23,12 +23,10 @@ from drake_teleop.logs.causes.state import (
 _MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
 _STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
-MIN_OMITTED_RAMP_SPAN_S = 0.5
-"""Shortest omitted time around a gradual step [s]."""
+MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
 _NUM_TRIED_STEP_TIMES = 2
 _MIN_STEP_OVER_DEVIATION = 5.0
-_MIN_OFFSET_STEP_OVER_NOISE = 2.0
-_MIN_MASS_STEP_OVER_MASS = 0.01
+_MIN_OFFSET_STEP_OVER_NOISE, _MIN_MASS_STEP_OVER_MASS = 2.0, 0.01
 _MIN_MOMENT_STEP_OVER_MASS_M = 0.002
 
 
@@ -71,8 +69,6 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Likelihood gain by a change of offsets or load at any instant, for white noise."""
-
     def __init__(self, state: FittedModel, kind: str) -> None:
         power = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
         J = state.model.wrench_derivative(state.x) / power[:, None]
@@ -81,9 +77,8 @@ class _StepScan:
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
         self._rows = rows = state.data.rows_per_search_block
         starts = range(0, len(state.data.t), rows)
-        gram, right = map(
-            np.stack, zip(*(self._equations_of_rows(n, n + rows) for n in starts), strict=True)
-        )
+        equations = [self._equations_of_rows(n, n + rows) for n in starts]
+        gram, right = map(np.stack, zip(*equations, strict=True))
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
@@ -112,25 +107,29 @@ def fit_steps_at_middle_of_ramps(
     spans: TimeSpans,
     widths: Sequence[float] | None = None,
 ) -> FittedModel:
-    """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
+    """Add changes of "offsets" or "load" (`kinds`) at the estimated middles of ramps.
+
+    The ramps are near `times` [s] and `widths` [s] long; their rows are not used.
+    """
     least = MIN_OMITTED_RAMP_SPAN_S
     widths = [max(least, w + least) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
     model = replace(state.model, steps=(*state.model.steps, *steps))
-    found = FittedModel.fit_record(
-        state.data, model, model.start_parameters(state.x, state.model), (*spans, *around)
-    )
-    owners = [k for k, both in enumerate(kinds) for _ in both]
-    middles = [_estimate_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
-    steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
+    start = model.start_parameters(state.x, state.model)
+    found = FittedModel.fit_record(state.data, model, start, (*spans, *around))
+    steps = []
+    for both, span in zip(kinds, around, strict=True):
+        own = range(first + len(steps), first + len(steps) + len(both))
+        middle = _estimate_ramp_middle(found, own, span)
+        steps += [StepChange(kind, middle) for kind in both]
     model = replace(model, steps=(*state.model.steps, *steps))
     return FittedModel.fit_record(state.data, model, found.x, found.contact_spans)
 
 
 def remove_small_steps(state: FittedModel) -> FittedModel:
-    """Remove insignificant changes of offsets or load one by one, and refit the model."""
+    """Refit without insignificant changes of offsets or load."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
@@ -138,25 +137,17 @@ def remove_small_steps(state: FittedModel) -> FittedModel:
         least = min(small, key=lambda i: _squared_step_over_variance(state, i))
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
-        x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
+        x = model.start_parameters(state.x, Model())
         state = FittedModel.fit_record(state.data, model, x, state.contact_spans)
 
 
 def _squared_step_over_variance(state: FittedModel, i: int) -> float:
-    where = state.model.parameter_slices[f"step {i}"]
-    x, covariance = state.x[where], state.covariance[where, where]
+    x, covariance = state.parameters_of_extension(f"step {i}")
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _estimate_ramp_middle(
-    state: FittedModel,
-    kinds: Sequence[Sequence[str]],
-    first_added_step: int,
-    k: int,
-    span: tuple[float, float],
-) -> float:
-    data, at = state.data, first_added_step + sum(len(both) for both in kinds[:k])
-    own = range(at, at + len(kinds[k]))
+def _estimate_ramp_middle(state: FittedModel, own: range, span: tuple[float, float]) -> float:
+    data = state.data
     rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
@@ -193,25 +184,21 @@ def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> F
 
 
 def _is_step_significant(state: FittedModel, i: int) -> bool:
-    where = state.model.parameter_slices[f"step {i}"]
-    values = state.x[where]
-    deviations = np.sqrt(np.diag(state.covariance[where, where]))
+    values, covariance = state.parameters_of_extension(f"step {i}")
+    deviations = np.sqrt(np.diag(covariance))
     if state.model.steps[i].kind == "offsets":
         clear = np.abs(values) > _MIN_STEP_OVER_DEVIATION * deviations
         large = np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise
         return bool((clear & large).any())
-    mass = max(abs(state.x[6]), 1e-3)
-    heavier = abs(values[0]) > max(
-        _MIN_STEP_OVER_DEVIATION * deviations[0], _MIN_MASS_STEP_OVER_MASS * mass
-    )
+    mass, limit = max(abs(state.x[6]), 1e-3), _MIN_STEP_OVER_DEVIATION * deviations[0]
+    heavier = abs(values[0]) > max(limit, _MIN_MASS_STEP_OVER_MASS * mass)
     size, moment = np.linalg.norm(values[1:4]), np.linalg.norm(deviations[1:4])
     moved = size > max(2.0 * _MIN_STEP_OVER_DEVIATION * moment, _MIN_MOMENT_STEP_OVER_MASS_M * mass)
     return bool(heavier or moved)
 
 
 _TRIMMED_FIT_BLOCK_SHARES = (0.12, 0.3, 0.55)
-_MAX_TRIMMED_FIT_ITERATIONS = 15
-_MIN_TRIMMED_FIT_BLOCKS = 8
+_MAX_TRIMMED_FIT_ITERATIONS, _MIN_TRIMMED_FIT_BLOCKS = 15, 8
 _BLOCK_COUNT_GROWTH = 1.3
 _TRIED_START_RUN_LENGTHS_BLOCKS, _TRIED_END_RUN_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
 _CONTACT_RMS_OVER_NOISE, _CONTACT_RMS_OVER_CALM, _CALM_RMS_MARGIN = 8.0, 5.0, 1.3
@@ -230,15 +217,13 @@ def find_contact_spans(state: FittedModel) -> TimeSpans:
     wide[1:] |= contact_blocks[:-1]
     t, rows = state.data.t, state.data.rows_per_search_block
     half, last = 0.5 * float(t[1] - t[0]), len(t) - 1
-    return tuple(
-        (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
-        for a, b in find_runs_of_true(wide)
-    )
+    ends = rows * find_runs_of_true(wide)
+    return tuple((float(t[a]) - half, float(t[min(b - 1, last)]) + half) for a, b in ends)
 
 
-def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
+def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
     """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
-    blocks = _NormalEquationsOfBlocks(larger)
+    blocks = _NormalEquationsOfBlocks(state)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_NUM_LOADS):
         contact_blocks = blocks.find_contact_blocks(left)
@@ -252,15 +237,13 @@ def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
     if not 0 < len(borders) <= _MAX_LOAD_STEPS:
         return None
-    dt, rows = larger.data.dt, larger.data.rows_per_search_block
-    t = larger.data.t[0] + dt * rows * np.arange(len(number))
+    dt, rows = state.data.dt, state.data.rows_per_search_block
+    t = state.data.t[0] + dt * rows * np.arange(len(number))
     times = [float(0.5 * (t[a] + dt * rows + t[b])) for a, b in borders]
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
-    found = fit_steps_at_middle_of_ramps(
-        larger, [("offsets", "load")] * len(times), times, (), widths
-    )
-    found = remove_small_steps(found)
-    limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
+    both = [("offsets", "load")] * len(times)
+    found = remove_small_steps(fit_steps_at_middle_of_ramps(state, both, times, (), widths))
+    limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * state.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
     return found if found.residual_ratio < limit else None
 
 
@@ -296,20 +279,17 @@ class _NormalEquationsOfBlocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks `among` with a residual far above the calmest; None for few."""
+        """Return flags of blocks `among` with a residual far above the usual; None for few."""
         found = self._residual_levels_by_calm_fit(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_CALM_RMS_MARGIN * calm) ** 2, 0.0))
         quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_RMS_OVER_CALM * calm)))
-        by_motion = _residuals_by_motion_errors(
-            self._state, self._state.x + move, excess, among, quantile
-        )
-        usual = np.hypot(calm, by_motion)
-        return np.asarray(
-            (level > _CONTACT_RMS_OVER_NOISE) & (level > _CONTACT_RMS_OVER_CALM * usual) & among
-        )
+        x = self._state.x + move
+        by_motion = _residuals_by_motion_errors(self._state, x, excess, among, quantile)
+        usual = _CONTACT_RMS_OVER_CALM * np.hypot(calm, by_motion)
+        return np.asarray((level > np.maximum(_CONTACT_RMS_OVER_NOISE, usual)) & among)
 
     def _residual_levels_by_calm_fit(
         self, blocks: NDArray[np.intp]
@@ -375,10 +355,10 @@ def _residuals_by_motion_errors(
     bend[1:-1] = np.where(both, (second * second).sum(axis=1), 0.0)
     blocks = np.add.reduceat(bend, np.arange(0, len(y), rows)) / rows
     fast = np.sqrt(blocks[: len(level)])
-    accelerates_enough = usable & (fast > np.median(fast[usable]))
-    if accelerates_enough.sum() < 8:
+    fastest = usable & (fast > np.median(fast[usable]))
+    if fastest.sum() < 8:
         return np.zeros(len(level))
-    ratio = level[accelerates_enough] / np.maximum(fast[accelerates_enough], 1e-12)
+    ratio = level[fastest] / np.maximum(fast[fastest], 1e-12)
     return np.asarray(2.0 * np.quantile(ratio, quantile) * fast)
 
 
@@ -393,7 +373,7 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
             continue
         kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
         model = replace(state.model, steps=kept)
-        x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
+        x = model.start_parameters(state.x, Model())
         dt = state.data.dt
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
@@ -409,10 +389,9 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
 def shrink_contacts(state: FittedModel) -> FittedModel:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
-    spans = [_shrunk_contact_span(state, span) for span in state.contact_spans]
-    return FittedModel.fit_record(
-        state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans)
-    )
+    shrunk = (_shrunk_contact_span(state, span) for span in state.contact_spans)
+    spans = tuple((a - dt, b + dt) for a, b in shrunk)
+    return FittedModel.fit_record(state.data, state.model, state.x, spans)
 
 
 def _shrunk_contact_span(state: FittedModel, span: tuple[float, float]) -> tuple[float, float]:

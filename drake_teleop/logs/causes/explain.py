@@ -42,9 +42,8 @@ from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, Model
 from drake_teleop.logs.causes.state import FittedModel
 
 MAX_SEARCH_ROUNDS = 4
-BlockMeansAtDelay = Callable[[float], BlockMeans]
-_MIN_CORRECTED_DELAY_S = 5e-4
-_MAX_CORRECTED_DELAY_S = 0.3
+MeansAtDelay = Callable[[float], BlockMeans]
+_MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S = 0.004
 _MAX_DELAY_ITERATIONS = 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
@@ -58,18 +57,14 @@ _CERTAIN_CAUSE_SCORE = 1000.0
 _MIN_WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
 _STEP_CAUSES, _MAX_CANDIDATE_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
 _CAUSES_LIKE_COLOURED_NOISE = ("axes", "gravity", "weight", "torque factor", "contact")
-"""Causes whose misfit may be as smooth as coloured noise."""
-_FLEXIBLE_CAUSES = ("cable", "drift")
-"""Causes with many columns, which resemble others and require margins of their scores."""
+_FLEXIBLE_CAUSES = ("cable", "drift")  # with many columns, which resemble other causes
 _FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE = 80.0, 0.1
 
 
 def residual_is_noise(state: FittedModel) -> bool:
-    if (
-        has_negative_inertia(state)
-        or state.residual_ratio > MAX_NOISE_RESIDUAL_RATIO
-        or state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
-    ):
+    if state.residual_ratio > MAX_NOISE_RESIDUAL_RATIO or has_negative_inertia(state):
+        return False
+    if state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT:
         return False
     model = state.model
     parts = ["frame", "linear drift", "rotation"]
@@ -85,9 +80,7 @@ SearchResult = tuple[FittedModel, float, list[Candidate]]
 
 
 def search_causes(
-    data: BlockMeans,
-    with_delay: BlockMeansAtDelay | None = None,
-    always_fitted: tuple[str, ...] = (),
+    data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
     """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
@@ -97,9 +90,8 @@ def search_causes(
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
-        opposite = _search_causes_from(
-            _initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay
-        )
+        mirrored = _initial_state(data, replace(plain, axes=-np.eye(3)))
+        opposite = _search_causes_from(mirrored, 0.0, with_delay)
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
         is_wrench = opposite[0].model.torque_factor > 0.0
         # An equal residual is sufficient for a positive mass, because a negative one is impossible.
@@ -112,12 +104,9 @@ def search_causes(
     if abs(delay_s - found[1]) < _EQUAL_DELAY_TOLERANCE_S:
         return found
     repeated = _search_causes_from(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
-    better = (
-        residual_is_noise(repeated[0])
-        or repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
-        or _is_residual_much_smaller(repeated[0], found[0])
-    )
-    return repeated if better else found
+    likelier = repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
+    better = likelier or _is_residual_much_smaller(repeated[0], found[0])
+    return repeated if better or residual_is_noise(repeated[0]) else found
 
 
 def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
@@ -126,18 +115,8 @@ def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
 
 def may_be_coloured_noise(state: FittedModel) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
-    return (
-        state.smooth_misfit < GOOD_SMOOTH_MISFIT
-        and state.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
-    )
-
-
-def is_clear_misfit(state: FittedModel) -> bool:
-    """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
-    return (
-        state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
-        or state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
-    )
+    small = state.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
+    return small and state.smooth_misfit < GOOD_SMOOTH_MISFIT
 
 
 def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
@@ -147,16 +126,15 @@ def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
 
 
 def _search_causes_from(
-    state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
+    state: FittedModel, delay_s: float, with_delay: MeansAtDelay | None
 ) -> SearchResult:
     state, delay_s = _apply_fitted_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
             return state, delay_s, []
-        found = _remove_cable_if_weight_explains_as_much(
-            list(fit_candidates(state, is_first_round=number == 0))
-        )
+        found = list(fit_candidates(state, is_first_round=number == 0))
+        found = _remove_cable_if_weight_explains_as_much(found)
         rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]
         winner = _most_plausible_of_best_candidates(effective)
@@ -187,23 +165,20 @@ def _search_causes_from(
 
 
 def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Candidate]:
-    best = max(
-        (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
-    )
+    weights = (x for x in found if x.name == "weight" and not is_plausible(x.state))
+    best = max((x.score for x in weights), default=0)
     return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
 def _apply_fitted_delay(
-    state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
+    state: FittedModel, delay_s: float, with_delay: MeansAtDelay | None
 ) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
-        if (
-            with_delay is None
-            or abs(state.x[DELAY_INDEX]) < _MIN_CORRECTED_DELAY_S
-            or abs(delay_s) > _MAX_CORRECTED_DELAY_S
-        ):
+        more = float(state.x[DELAY_INDEX])
+        large = abs(delay_s) > _MAX_CORRECTED_DELAY_S
+        if with_delay is None or abs(more) < _MIN_CORRECTED_DELAY_S or large:
             break
-        delay_s += float(state.x[DELAY_INDEX])
+        delay_s += more
         x = state.x.copy()
         x[DELAY_INDEX] = 0.0
         state = FittedModel.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
@@ -232,11 +207,9 @@ def _is_misfit_reduced(candidate: Candidate, state: FittedModel) -> bool:
     smaller = fitted.residual_ratio < _MAX_EFFECTIVE_MISFIT_SHARE * state.residual_ratio
     if candidate.name == "cable":
         return smaller  # the force of a cable far exceeds the noise
-    if (
-        candidate.name not in _STEP_CAUSES
-        and fitted.residual_ratio > _MAX_CANDIDATE_RESIDUAL_INCREASE * state.residual_ratio
-    ):
-        return False  # the candidate increases the residual, and coloured noise predicts it
+    increased = fitted.residual_ratio > _MAX_CANDIDATE_RESIDUAL_INCREASE * state.residual_ratio
+    if increased and candidate.name not in _STEP_CAUSES:
+        return False  # coloured noise predicts the increased residual
     better = smaller or fitted.smooth_misfit < _MAX_EFFECTIVE_MISFIT_SHARE * state.smooth_misfit
     return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_CAUSE_SCORE)
 
@@ -285,7 +258,9 @@ class MisfitExplanation:
 
     @property
     def is_misfit(self) -> bool:
-        return not self.explained and is_clear_misfit(self.state)
+        """Whether the residual is clearly not noise: large, or explained by smooth signals."""
+        large = self.state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
+        return not self.explained and (large or self.state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT)
 
     @property
     def has_several_gains(self) -> bool:
@@ -296,9 +271,7 @@ class MisfitExplanation:
 
 
 def explain_misfit(
-    data: BlockMeans,
-    with_delay: BlockMeansAtDelay | None = None,
-    always_fitted: tuple[str, ...] = (),
+    data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> MisfitExplanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
@@ -312,12 +285,9 @@ def explain_misfit(
         covariance = load_covariance(state, rejected, blocks, gains)
         causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
-        noisy = only_noise or may_be_coloured_noise(state)
-        if not causes and noisy and _is_load_absent(state, covariance):
-            causes = [_no_load_cause(state, covariance)]
-        removed = None
-        if "weight" in state.model.extensions:
-            removed = state.x[state.model.parameter_slices["weight"]]
+        if not causes and (only_noise or may_be_coloured_noise(state)):
+            causes = _no_load_cause(state, covariance)
+        weight = state.model.parameter_slices.get("weight")
         return MisfitExplanation(
             causes=tuple(causes),
             explained=only_noise,
@@ -326,19 +296,17 @@ def explain_misfit(
             misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(loads_between_changes(state, covariance)),
-            removed_weight=removed,
+            removed_weight=None if weight is None else state.x[weight],
             state=state,
             always_fitted=always_fitted,
         )
 
 
-def _is_load_absent(state: FittedModel, covariance: Array) -> bool:
+def _no_load_cause(state: FittedModel, covariance: Array) -> list[Cause]:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     largest = min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation)
-    return bool(mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1)
-
-
-def _no_load_cause(state: FittedModel, covariance: Array) -> Cause:
-    most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
+    if not (mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1):
+        return []
+    most = mass + 1.96 * deviation
     text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
-    return Cause("no load", text, values={"mass_limit": most})
+    return [Cause("no load", text, values={"mass_limit": most})]

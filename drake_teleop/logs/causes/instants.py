@@ -19,8 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from drake_teleop.common.numeric import Array, position_of_parabola_minimum
 
-MAX_NOISE_LAG = 4
-"""Order of the autoregressive noise."""
+MAX_NOISE_LAG = 4  # order of the autoregressive noise
 CONSTANT_COLUMN = 0
 SPECIFIC_FORCE_SIGNALS = slice(1, 4)
 GRAVITY_SIGNALS = slice(4, 7)
@@ -59,7 +58,7 @@ class BlockMeans:
         used: (M,) True for rows without gaps and edges.
         wrench_noise: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        acceleration_noise: standard deviation in a block mean [m/s^2].
+        acceleration_noise: standard deviation of its noise in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 
@@ -78,9 +77,8 @@ class BlockMeans:
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_ALPHA_NOISE_SHARE
         a = (self.y[:, SPECIFIC_FORCE_SIGNALS] + self.y[:, GRAVITY_SIGNALS])[self.used]
-        return bool(
-            np.sqrt(a.var(axis=0).max()) > _MIN_ACCELERATION_OVER_NOISE * self.acceleration_noise
-        )
+        largest = np.sqrt(a.var(axis=0).max())
+        return bool(largest > _MIN_ACCELERATION_OVER_NOISE * self.acceleration_noise)
 
     @property
     def dt(self) -> float:
@@ -155,9 +153,8 @@ def block_means_of_record(
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _MIN_WRENCH_NOISE_OVER_SPREAD * spread)
     share = _smooth_noisy_alpha_and_get_noise_share(y, used) if gravity_W is None else 0.0
-    out = BlockMeans(
-        middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
-    )
+    noise = white / np.sqrt(size)
+    out = BlockMeans(middle, y, used, noise, gravity_W, positions, acceleration_noise, share)
     return out.with_other_rows_zeroed(used)
 
 
@@ -243,6 +240,5 @@ def delay_of_free_fit(data: BlockMeans) -> float:
     best = int(np.argmin(costs))
     if best in (0, len(shifts) - 1):
         return 0.0
-    return float(
-        shifts[best] + _DELAY_STEP_S * position_of_parabola_minimum(*costs[best - 1 : best + 2])
-    )
+    share = position_of_parabola_minimum(*costs[best - 1 : best + 2])
+    return float(shifts[best] + _DELAY_STEP_S * share)

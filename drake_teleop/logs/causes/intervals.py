@@ -13,22 +13,19 @@ from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
 from drake_teleop.logs.causes.instants import ALPHA_SIGNALS, WRENCH_SIGNALS, white_noise_deviations
 from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
-from drake_teleop.logs.causes.state import FittedModel, UsedRows, regularized_inverse
+from drake_teleop.logs.causes.state import FittedModel, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
 _MAX_JACKKNIFE_OVER_FIT, _USUAL_JACKKNIFE_OVER_FIT = 1.5, 1.15
 GOOD_SMOOTH_MISFIT, _WIDENING_BY_MISFIT = 1.35, 3.0
 """Largest smooth misfit of good records; growth of the deviations above it."""
 _MIN_WIDENING_SCORE, _FULLY_WIDENING_SCORE, _FULLY_WIDENING_RESIDUAL_SHARE = 6.0, 15.0, 0.5
-_CABLE_WIDENING_FACTOR = 1.5
-_LARGE_RESIDUAL_RATIO = 20.0
+_CABLE_WIDENING_FACTOR, _LARGE_RESIDUAL_RATIO = 1.5, 20.0
 _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL = 2.2
 _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL = 6.0
 _CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
-"""Causes whose effects are included in the jackknife."""
 _TRIED_SENSOR_GAIN_STDS = np.geomspace(1e-4, 0.1, 31)
-_MIN_LIKELIHOOD_RISE_BY_GAINS = 20.0
-_MIN_SHARE_EXPLAINED_BY_GAINS = 0.5
+_MIN_LIKELIHOOD_RISE_BY_GAINS, _MIN_SHARE_EXPLAINED_BY_GAINS = 20.0, 0.5
 _MAX_PLAUSIBLE_GAIN_STD = 0.025
 
 
@@ -56,9 +53,8 @@ def load_deviations_if_unexplained(
     if state.residual_ratio > _LARGE_RESIDUAL_RATIO:
         least = _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
     if state.smooth_misfit > least:
-        jackknife_std = jackknife_std * (
-            1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
-        )
+        growth = 1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
+        jackknife_std = jackknife_std * growth
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
     variance = jackknife_std**2 + _load_variances_by_rejected_causes(state, lasting)
     return np.asarray(np.sqrt(variance + np.diag(gain_covariance)))
@@ -68,9 +64,8 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
-        share = min(1.0, candidate.score / _FULLY_WIDENING_SCORE)
-        if candidate.score <= _MIN_WIDENING_SCORE:
-            share = 0.0
+        score = candidate.score
+        share = min(1.0, score / _FULLY_WIDENING_SCORE) if score > _MIN_WIDENING_SCORE else 0.0
         if other.residual_ratio < _FULLY_WIDENING_RESIDUAL_SHARE * state.residual_ratio:
             share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts
         own = np.diag(other.covariance)[OFFSETS_AND_LOAD]
@@ -79,7 +74,10 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
 
 
 def load_covariance_by_gain_errors(state: FittedModel) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
+    """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains.
+
+    It is 0 unless gain errors of a plausible size explain most of the misfit.
+    """
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
     unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
@@ -150,16 +148,14 @@ def widening_factor_by_misfit(state: FittedModel, jackknife_std: Array) -> float
 def jackknife_load_deviations(state: FittedModel) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
-    at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)
     whole, right = state.normal_equations(state.model, state.x)
     moves = []
-    for part in at:
+    for part in np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS):
         used = np.zeros(len(rows.used), bool)
         used[part] = True
-        few = UsedRows(rows.data, used, rows.times, rows.columns)
+        few = replace(rows, used=used)
         gram, pull = replace(state, rows=few).normal_equations(state.model, state.x)
         moves.append((regularized_inverse(whole - gram) @ (right - pull))[OFFSETS_AND_LOAD])
     spread = np.array(moves) - np.mean(moves, axis=0)
-    return np.asarray(
-        np.sqrt((_NUM_JACKKNIFE_PARTS - 1.0) / _NUM_JACKKNIFE_PARTS * np.sum(spread**2, axis=0))
-    )
+    share = (_NUM_JACKKNIFE_PARTS - 1.0) / _NUM_JACKKNIFE_PARTS
+    return np.asarray(np.sqrt(share * np.sum(spread**2, axis=0)))

@@ -27,8 +27,7 @@ from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
 )
 
-OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16
-"""Positions of the 16 parameters [offsets; phi] and of the delay."""
+OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter vector
 _NUM_EXTENSION_PARAMETERS = {
     "gravity": 3,
     "weight": 4,
@@ -42,11 +41,12 @@ _NUM_EXTENSION_PARAMETERS = {
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _ROTATION_COLUMNS_OF_STEP = slice(16, 25)
-_MAX_DELAY_CHANGE_PER_ITERATION_S = 0.03  # s, in an iteration
-_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # rad, step of the numerical derivative
+_MAX_DELAY_CHANGE_PER_ITERATION_S = 0.03
+_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
-_SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Index (3, 3) in [xx, xy, xz, yy, yz, zz] of each entry of a symmetric matrix."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Model:
         extensions: names of extensions, such as "gravity" or "drift".
         gain_channels: numbers of the wrench channels whose gain is estimated.
         steps: changes of offsets or load.
-        axes: (3, 3) signed permutation of the wrench's axes.
+        axes: (3, 3) signed permutation, from the motion's axes to the wrench's.
         torque_factor: given factor on the torque; the extension "torque factor" corrects it.
     """
 
@@ -80,13 +80,12 @@ class Model:
     torque_factor: float = 1.0
 
     def with_extension(self, name: str) -> Model:
-        return (
-            self if name in self.extensions else replace(self, extensions=(*self.extensions, name))
-        )
+        known = name in self.extensions
+        return self if known else replace(self, extensions=(*self.extensions, name))
 
     @cached_property
     def parameter_slices(self) -> dict[str, slice]:
-        """Position of each extension's parameters in the parameter vector."""
+        """Positions of the parameters of extensions, "gain c" (channel c) and "step i"."""
         out, at = {}, DELAY_INDEX + 1
         sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
         sizes += [(f"gain {c}", 1) for c in self.gain_channels]
@@ -97,15 +96,18 @@ class Model:
         return out
 
     @property
+    def _num_signals(self) -> int:
+        return _columns_of_step(len(self.steps)).start
+
+    @property
     def size(self) -> int:
         return max([DELAY_INDEX + 1, *(x.stop for x in self.parameter_slices.values())])
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
-        wide = bool({"gravity", "cable"} & set(self.extensions))
-        kept = np.ones(NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * len(self.steps), bool)
-        if not wide:
+        kept = np.ones(self._num_signals, bool)
+        if not {"gravity", "cable"} & set(self.extensions):
             kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
             for i in range(len(self.steps)):
                 kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
@@ -117,9 +119,8 @@ class Model:
         out = np.full(self.size, np.inf)
         out[DELAY_INDEX] = _MAX_DELAY_CHANGE_PER_ITERATION_S
         for name, where in self.parameter_slices.items():
-            out[where] = _MAX_CHANGE_PER_ITERATION.get(
-                name.split(" ")[0] if "gain" in name else name, np.inf
-            )
+            kind = "gain" if name.startswith("gain") else name
+            out[where] = _MAX_CHANGE_PER_ITERATION.get(kind, np.inf)
         return out
 
     @property
@@ -137,22 +138,16 @@ class Model:
 
     def wrench_coefficients(self, x: Array) -> Array:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
-        width, parts = (
-            NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * len(self.steps),
-            self.parameter_slices,
-        )
-        motion = self._motion_from_signals_matrix(x)
-        out = np.zeros((len(x), 6, width))
+        parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
+        out = np.zeros((len(x), 6, self._num_signals))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
-                out[..., _columns_of_step(i)] = (
-                    _load_coefficients(x[:, parts[f"step {i}"]])
-                    @ motion[..., COLUMNS_REPEATED_BY_STEP]
-                )
+                load = _load_coefficients(x[:, parts[f"step {i}"]])
+                out[..., _columns_of_step(i)] = load @ motion[..., COLUMNS_REPEATED_BY_STEP]
         if "weight" in parts:
-            static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
-            out[..., GRAVITY_SIGNALS] += static  # - V(-g) w
+            removed = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
+            out[..., GRAVITY_SIGNALS] += removed  # - V(-g) w
         if "cable" in parts:
             out[..., :NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
         turned = self._sensor_rotations(x)
@@ -182,12 +177,8 @@ class Model:
         parts = self.parameter_slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
-        for rows, where in (
-            (slice(0, 3), SPECIFIC_FORCE_SIGNALS),
-            (slice(3, 6), ALPHA_SIGNALS),
-            (slice(6, 12), OMEGA_PRODUCTS),
-        ):
-            M[:, rows, where] = np.eye(rows.stop - rows.start)
+        M[:, 0:3, SPECIFIC_FORCE_SIGNALS] = M[:, 3:6, ALPHA_SIGNALS] = np.eye(3)
+        M[:, 6:12, OMEGA_PRODUCTS] = np.eye(6)
         if "gravity" in parts:
             d = x[:, parts["gravity"]]
             for i in range(3):
@@ -221,10 +212,8 @@ class Model:
 
 
 def _columns_of_step(i: int) -> slice:
-    return slice(
-        NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i,
-        NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * (i + 1),
-    )
+    start = NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i
+    return slice(start, start + len(COLUMNS_REPEATED_BY_STEP))
 
 
 def _load_coefficients(phi: Array) -> Array:
@@ -233,13 +222,9 @@ def _load_coefficients(phi: Array) -> Array:
 
 def _cable_coefficients(x: Array) -> Array:
     out = np.zeros((len(x), 6, NUM_SIGNALS))
-    K = x[:, 3:9][:, _SYMMETRIC_MATRIX_INDICES]
+    K = x[:, 3:9][:, SYMMETRIC_MATRIX_INDICES].reshape(-1, 9)
     for i in range(3):
-        out[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] = x[:, :3]
-        out[
-            :,
-            i,
-            ROTATION_POSITION_PRODUCTS.start + 9 * i : ROTATION_POSITION_PRODUCTS.start + 9 * i + 9,
-        ] = K.reshape(-1, 9)
+        row, products = ROTATION_SIGNALS.start + 3 * i, ROTATION_POSITION_PRODUCTS.start + 9 * i
+        out[:, i, row : row + 3], out[:, i, products : products + 9] = x[:, :3], K
     out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out

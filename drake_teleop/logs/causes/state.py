@@ -14,16 +14,13 @@ from drake_teleop.logs.causes.instants import (
     OMEGA_PRODUCTS,
     ROTATION_POSITION_PRODUCTS,
     ROTATION_SIGNALS,
-    SYMMETRIC_MATRIX_ENTRIES,
     WRENCH_SIGNALS,
     BlockMeans,
 )
-from drake_teleop.logs.causes.model import Model
+from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, Model
 
 _MIN_ROWS_FOR_AUTOREGRESSION = 50
-"""Fewest rows for an autoregression."""
-TimeSpans = tuple[tuple[float, float], ...]
-"""(start, stop) of contacts [s]."""
+TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +29,13 @@ class UsedRows:
 
     data: BlockMeans
     used: NDArray[np.bool_]
-    times: tuple[float, ...]
+    step_times: tuple[float, ...]
     columns: NDArray[np.intp]
 
     @cached_property
     def y(self) -> Array:
-        return self.data.with_other_rows_zeroed(self.used).append_step_signals(self.times)[
-            :, self.columns
-        ]
+        zeroed = self.data.with_other_rows_zeroed(self.used)
+        return zeroed.append_step_signals(self.step_times)[:, self.columns]
 
     @cached_property
     def lagged_product_sums(self) -> Array:
@@ -69,27 +65,24 @@ class UsedRows:
     def whitened_products(self, filters: Array) -> Array:
         """Return sums of products (6, n, n) of n signals, whitened by 5-tap filters (6, 5)."""
         width = self.y.shape[1]
-        taps = [
-            (filters[:, : MAX_NOISE_LAG + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)
-        ]
-        full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(MAX_NOISE_LAG + 1, -1)
+        taps = [(filters[:, : 5 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
+        full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(5, -1)
         out = full.reshape(6, width, width)
         edge = np.tensordot(filters, self._lagged_signals_of_edge_rows, axes=(1, 1))
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
     def noise_filters_and_power(
-        self, residual_coefficients: Array, floor: Array, order: int = MAX_NOISE_LAG
+        self, residual_coefficients: Array, floor: Array, is_white: bool = False
     ) -> tuple[Array, Array]:
-        """Return whitening filters (6, 5) and noise power (6,) for coefficients of the residual."""
+        """Return whitening filters (6, 5) and noise power (6,) >= `floor` (6,) of the residual."""
         e = self.y @ residual_coefficients.T
         filters = np.zeros((6, MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
-        history = np.stack(
-            [e[self.rows_with_predecessors - d] for d in range(MAX_NOISE_LAG + 1)], axis=2
-        )
+        now = self.rows_with_predecessors
+        history = np.stack([e[now - d] for d in range(MAX_NOISE_LAG + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
-        products /= max(len(self.rows_with_predecessors), 1)
-        if order == 0 or len(self.rows_with_predecessors) < _MIN_ROWS_FOR_AUTOREGRESSION:
+        products /= max(len(now), 1)
+        if is_white or len(now) < _MIN_ROWS_FOR_AUTOREGRESSION:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(MAX_NOISE_LAG)
         inner += 1e-300 * np.eye(MAX_NOISE_LAG)
@@ -103,15 +96,16 @@ class UsedRows:
 
 
 def is_in_time_spans(data: BlockMeans, spans: TimeSpans) -> NDArray[np.bool_]:
-    inside = np.zeros(len(data.t), bool)
-    for start, stop in spans:
-        inside |= (data.t >= start) & (data.t <= stop)
-    return inside
+    inside = [(data.t >= start) & (data.t <= stop) for start, stop in spans]
+    return np.any([np.zeros(len(data.t), bool), *inside], axis=0)
 
 
 _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 _NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
+# (18, 27) from rotation-position products to the signals of a symmetric stiffness.
+_STIFFNESS_ENTRIES = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
+_STIFFNESS_SIGNALS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRIES])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +139,11 @@ class FittedModel:
     def refit(self, model: Model, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
             start = model.start_parameters(self.x, self.model)
-        rows = self._rows_for_model(model)
-        return fit_model(model, rows, start, self.contact_spans, **options)
+        return fit_model(model, self._rows_for_model(model), start, self.contact_spans, **options)
 
     def _rows_for_model(self, model: Model) -> UsedRows:
         rows = self.rows
-        if rows.times == model.step_times and np.array_equal(rows.columns, model.columns):
+        if rows.step_times == model.step_times and np.array_equal(rows.columns, model.columns):
             return rows
         return UsedRows(self.data, rows.used, model.step_times, model.columns)
 
@@ -179,11 +172,10 @@ class FittedModel:
         own = -0.5 * count * float(np.log(self.noise_power).sum())
         if not self.contact_spans:
             return own
-        used = self.data.used & ~self.rows.used
-        inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
+        inside = replace(self.rows, used=self.data.used & ~self.rows.used)
         power = inside.noise_filters_and_power(self.residual, 1e-6 * self.noise_power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
-        every = UsedRows(self.data, self.data.used, (), self.model.columns)
+        every = replace(self.rows, used=self.data.used)
         others = len(every.rows_with_predecessors) - count
         return own - 0.5 * others * float(np.log(power).sum())
 
@@ -195,7 +187,7 @@ class FittedModel:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Gain by smooth signals per degree of freedom; at most about 1 for noise."""
+        """`gain_by_smooth_signals` per degree of freedom; about 1 or less for noise."""
         gain, freedom = self.gain_by_smooth_signals
         return gain / max(1, freedom - self.model.size)
 
@@ -203,17 +195,14 @@ class FittedModel:
     def gain_by_smooth_signals(self) -> tuple[float, int]:
         """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
         y = self.data.y
-        part = np.linspace(0.0, _NUM_TIME_SEGMENTS_OF_MISFIT_TEST, len(y), endpoint=False).astype(
-            int
-        )
+        segments = _NUM_TIME_SEGMENTS_OF_MISFIT_TEST
+        part = np.linspace(0.0, segments, len(y), endpoint=False).astype(int)
         parts = [y[:, : OMEGA_PRODUCTS.stop]]
         if self.data.gravity_W is not None:
             parts.append(y[:, ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, ROTATION_POSITION_PRODUCTS] @ _symmetric_stiffness_signals_matrix().T)
-        columns = np.hstack(
-            [*parts, part[:, None] == np.arange(1.0, _NUM_TIME_SEGMENTS_OF_MISFIT_TEST)]
-        )
+            parts.append(y[:, ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
+        columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_predecessors, self.noise_filters
         gain, freedom = 0.0, 0
@@ -240,7 +229,7 @@ def fit_model(
     start: Array | None = None,
     spans: TimeSpans = (),
     *,
-    steps: int = _MAX_FIT_ITERATIONS,
+    iterations: int = _MAX_FIT_ITERATIONS,
 ) -> FittedModel:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
@@ -250,18 +239,18 @@ def fit_model(
     white = np.eye(1, MAX_NOISE_LAG + 1).repeat(6, axis=0)
     residual, power = model.residual_coefficients(x), np.maximum(both, floor)
     found = FittedModel(model, rows, x, np.zeros(0), residual, white, power, spans)
-    for step in range(steps):
+    for iteration in range(iterations):
         gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
         move = inverse @ right
         move /= max(1.0, float(np.max(np.abs(move) / model.max_parameter_changes)))
         x = x + move
         residual = model.residual_coefficients(x)
-        order = 0 if step + 1 < _UNWEIGHTED_FIT_ITERATIONS else MAX_NOISE_LAG
-        filters, power = rows.noise_filters_and_power(residual, floor, order)
+        is_white = iteration + 1 < _UNWEIGHTED_FIT_ITERATIONS
+        filters, power = rows.noise_filters_and_power(residual, floor, is_white)
         found = FittedModel(model, rows, x, inverse, residual, filters, power, spans)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED_MOVE_OVER_DEVIATION
-        if still and step > _UNWEIGHTED_FIT_ITERATIONS:
+        if still and iteration > _UNWEIGHTED_FIT_ITERATIONS:
             break
     return found
 
@@ -288,13 +277,3 @@ def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     kept = values > 1e-7 * values[-1]
     part = vectors[:, kept].T @ (scale * right[used])
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
-
-
-def _symmetric_stiffness_signals_matrix() -> Array:
-    """Return the matrix (18, 27) from rotation-position products to signals of a stiffness."""
-    out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
-        for i in range(3):
-            for a, b in {(j, k), (k, j)}:
-                out[row, i, 9 * i + 3 * a + b] = 1.0
-    return out.reshape(18, 27)

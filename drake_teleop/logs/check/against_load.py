@@ -41,14 +41,12 @@ GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
 VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
-MIN_REDUCTION_BY_EDIT = 4.0
-"""Smallest factor by which an edit must reduce the unexplained share."""
+MIN_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _LOAD_FIT_CUTOFF_HZ = 15.0
 _FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
 """Findings with the sign; mirrored axes are a cause that `identify` names."""
-_CONTACT_FREE_SHARE = 0.75
-"""Share of a record that is without contact, if any is."""
+_CONTACT_FREE_SHARE = 0.75  # of a record with contact
 _MAX_FITTED_SAMPLES = 1500
 
 
@@ -57,7 +55,8 @@ class LoadFitQuality:
     """Least squares fit of a load to a log, Eq. (5).
 
     Attributes:
-        unexplained, noise_share: shares of the wrench's variance: unexplained, white noise.
+        unexplained: share of the residual in the wrench's variance.
+        noise_share: share of white noise in this variance.
         mass: fitted mass [kg].
         independent_samples: number of samples with independent noise.
     """
@@ -70,9 +69,8 @@ class LoadFitQuality:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < self.max_unexplained_including_noise(
-            GOOD_UNEXPLAINED
-        )
+        limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
+        return self.mass > 0 and self.unexplained < limit
 
     def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
         """Return the largest accepted `unexplained`: that of the noise plus the given share."""
@@ -101,9 +99,7 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     total = float(w.var(axis=0).sum()) + 1e-30
     unexplained = float((w - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
-        return LoadFitQuality(
-            unexplained, float(theta[0]), independent_samples=max(1.0, len(w) - 8.0)
-        )
+        return LoadFitQuality(unexplained, float(theta[0]), 0.0, max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
     noise_share = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
@@ -120,7 +116,7 @@ def _fit_load_parameters(V: Array, w: Array) -> Array:
 
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
-    """Return the variance of a residual (N, 6) over that of the wrench (N, 6)."""
+    """Return the variance of a residual (N, 6) over the wrench's; force and torque count alike."""
     scale = _wrench_channel_scales(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
@@ -138,10 +134,8 @@ def min_unexplained_reduction_by_edit(fit: LoadFitQuality) -> float:
     return max(MIN_REDUCTION_BY_EDIT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
 
 
-UNDETERMINED_UNEXPLAINED_SHARE = 0.9
-"""Unexplained share of the wrench's variance above which a load is undetermined."""
+UNDETERMINED_UNEXPLAINED_SHARE = 0.9  # of the variance; above it a load is undetermined
 MIN_REPORTED_LAG_S = 0.002
-"""Smallest reported delay [s]."""
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
@@ -276,7 +270,7 @@ def undetermined_payload_finding(load: Identification, unexplained: float) -> Fi
     if load.verdicts[6] != "not" and unexplained < UNDETERMINED_UNEXPLAINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
-    fitted = "nothing here depends on its mass"
+    fitted = "no signal of the record depends on its mass"
     if np.isfinite(deviation):
         share = max(0.0, 100 * (1 - unexplained))
         fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit, which explains {share:.0f} % of"
@@ -314,9 +308,8 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     if abs(delay) > MIN_LAG_OF_WRONG_CLOCK_S:
         offset = description.wrench.time.offset + delay
         text = (
-            f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
-            f" set wrench.time.offset: {offset:.3f} (or shift the other streams in the opposite"
-            " direction)"
+            f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong; set"
+            f" wrench.time.offset: {offset:.3f} (or shift the other streams by the opposite)"
         )
         return [Finding("clock", text)]
     text = (
@@ -343,12 +336,8 @@ def clock_drift_finding_and_correction(
     limit = _MAX_UNEXPLAINED_AFTER_OVER_BEFORE * _unexplained_after_delay_removal(log)
     if _unexplained_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
-    finding = Finding(
-        "clock",
-        f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against that of the"
-        f" wrench; set {lines}",
-    )
-    return [finding], edited
+    text = f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against the wrench's"
+    return [Finding("clock", f"{text}; set {lines}")], edited
 
 
 def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
@@ -366,11 +355,8 @@ def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     slope, late = np.polyfit(t, delays, 1)
     change = abs(slope) * span
     deviation = float(np.std(delays - late - slope * t))
-    if (
-        change < _MIN_DELAY_DRIFT_S
-        or deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
-        or abs(slope) > 0.2
-    ):
+    uneven = deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
+    if change < _MIN_DELAY_DRIFT_S or uneven or abs(slope) > 0.2:
         return None
     return float(late + slope * log.t[0]), float(slope)
 

@@ -43,12 +43,8 @@ from drake_teleop.logs.read.tables import Table
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
-"""Fewest poses that allow a check of the fit."""
-_MIN_GRAVITY_DIRECTION_SPREAD = 0.15
-"""Smallest deviation of gravity's direction that separates offsets from a load."""
-_MIN_WRENCH_CHANGE_OVER_LARGEST = (
-    1e-6  # smallest change of a live wrench, as a share of the largest reading
-)
+_MIN_GRAVITY_DIRECTION_SPREAD = 0.15  # that separates offsets from a load
+_MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest reading
 
 
 @dataclass(frozen=True)
@@ -87,11 +83,9 @@ def findings_if_load_is_suspicious(
     its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
     """
     if _is_wrench_constant(log):
-        raise DrakeTeleopError(
-            "the wrench is the same in all samples: no load can be identified",
-            where=log.source,
-            remedy="check the sensor's cable; a driver may repeat its last value",
-        )
+        what = "the wrench is the same in all samples: no load can be identified"
+        remedy = "check the sensor's cable; a driver may repeat its last value"
+        raise DrakeTeleopError(what, where=log.source, remedy=remedy)
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < MIN_LAG_OF_WRONG_CLOCK_S)
@@ -116,11 +110,9 @@ def findings_if_load_is_suspicious(
         raise DrakeTeleopError(f"{what}: {found[0].message}", where=log.source)
     if negative:
         sensor = "static" if log.static else "wrench"
-        raise DrakeTeleopError(
-            f"the fitted mass is {load.mass:.4g} kg: the sign of the wrench is probably inverted",
-            where=f"{log.source}:{sensor}.sign",
-            remedy="set `sign: -1` in the log description (or remove it if it is there)",
-        )
+        what = f"the fitted mass is {load.mass:.4g} kg: the sign of the wrench is probably inverted"
+        remedy = "set `sign: -1` in the log description (or remove it if it is there)"
+        raise DrakeTeleopError(what, where=f"{log.source}:{sensor}.sign", remedy=remedy)
     return tuple(found)
 
 
@@ -169,27 +161,21 @@ def check_conventions(
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    return bool(
-        (
-            np.ptp(log.wrench, axis=0) <= _MIN_WRENCH_CHANGE_OVER_LARGEST * np.abs(log.wrench).max()
-        ).all()
-    )
+    limit = _MIN_WRENCH_CHANGE_OVER_LARGEST * np.abs(log.wrench).max()
+    return bool((np.ptp(log.wrench, axis=0) <= limit).all())
 
 
 def _check_description(data: LogData, description: Description) -> ConventionCheckResult:
     log = data.read_whole_log(description)
     if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
-        return ConventionCheckResult(
-            (Finding("dead channel", message),), LoadFitQuality(1.0, 0.0), None, None
-        )
+        dead_wrench = Finding("dead channel", message)
+        return ConventionCheckResult((dead_wrench,), LoadFitQuality(1.0, 0.0), None, None)
     # Determine gravity once, not for each edit.
     if "gravity" in log.estimated and log.described is not None:
         description = description.model_copy(update={"gravity": log.described.gravity})
-    dead, broken = (
-        dead_or_repeated_channel_findings(name, description, data.tables)
-        for name in ("imu", "wrench")
-    )
+    dead = dead_or_repeated_channel_findings("imu", description, data.tables)
+    broken = dead_or_repeated_channel_findings("wrench", description, data.tables)
     if dead:  # A dead channel would cause wrong findings about motion and load.
         fit = fit_load(data.read_thinned_log(description))
         return ConventionCheckResult((*dead, *broken), fit, None, None)
@@ -219,23 +205,18 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
 
 
 def _merge_clock_findings(
-    description: Description,
-    findings: list[Finding],
-    mounting: Mounting | None,
-    delay: float | None,
+    description: Description, found: list[Finding], mounting: Mounting | None, delay: float | None
 ) -> list[Finding]:
-    clocks = [finding for finding in findings if finding.name == "clock"]
-    if len(clocks) < 2 or mounting is None or mounting.clock_drift or delay is None:
-        return findings
+    num_clocks = sum(finding.name == "clock" for finding in found)
+    if num_clocks < 2 or mounting is None or mounting.clock_drift or delay is None:
+        return found
     if abs(mounting.lag_s + delay) > MIN_LAG_OF_WRONG_CLOCK_S:
-        return findings
+        return found
     assert description.pose is not None
-    finding = Finding(
-        "clock",
-        f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench;"
-        f" set pose.time.offset: {description.pose.time.offset - delay:.3f}",
-    )
-    return [finding, *(other for other in findings if other.name != "clock")]
+    text = f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench"
+    offset = description.pose.time.offset - delay
+    finding = Finding("clock", f"{text}; set pose.time.offset: {offset:.3f}")
+    return [finding, *(other for other in found if other.name != "clock")]
 
 
 def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:

@@ -14,15 +14,13 @@ from drake_teleop.common.rotations import EULER_AXES, right_angled_rotations
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-FINDINGS_CAUSED_BY_MISFIT = ("lag", "units", "payload")
-"""Findings that may be the effect of a cause, such as drift."""
+FINDINGS_CAUSED_BY_MISFIT = ("lag", "units", "payload")  # or by its cause, such as drift
 MOTION_FINDINGS = (
     *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
     "base axes",
 )
 """Errors of the described motion, which resemble causes."""
-MIN_LAG_OF_WRONG_CLOCK_S = 0.05
-"""Delay above which a clock error, not the lag of a filter, is the reason [s]."""
+MIN_LAG_OF_WRONG_CLOCK_S = 0.05  # filters lag less
 
 
 @dataclass(frozen=True)
@@ -40,8 +38,7 @@ class Finding:
     fields: dict[str, Any] = field(default_factory=dict)
 
 
-Edit = tuple[Finding, Description]
-"""Finding, and the corrected description."""
+Edit = tuple[Finding, Description]  # a finding, and the corrected description
 
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
@@ -77,7 +74,9 @@ def correct_accelerometer_unit(
     }
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     ratio = median / float(np.linalg.norm(description.gravity_W))
-    for path, sensor in ((path, x) for path, x in sensors.items() if x is not None):
+    for path, sensor in sensors.items():
+        if sensor is None:
+            continue
         read = ratio / description.unit_in_si(sensor.unit)
         text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in {sensor.unit}"
         for unit in ("m/s^2", "g", "mm/s^2"):
@@ -131,7 +130,6 @@ def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -
 
 
 def call_or_none_if_unreadable(function: Callable[[Description], Any], edited: Description) -> Any:
-    """Return `function(edited)`, or None if the edited description cannot be read."""
     try:
         return function(edited)
     except DrakeTeleopError:

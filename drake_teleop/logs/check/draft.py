@@ -86,13 +86,11 @@ _ALLOWED_UNITS = {
     "time": ("s", "ms", "us", "ns"),
 }
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
-_POSE_VECTOR_WIDTHS = (7, 8)
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN_TEXT = "FILL IN"
-_STAMP_FIELDS = ("column", "nanoseconds")
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -131,10 +129,9 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
         streams = whole | streams
     streams = streams or drafts[0].streams
-    lines = dict.fromkeys(line for draft in drafts for line in draft.comment_lines)
-    return Draft(
-        {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}, list(lines)
-    )
+    order = ["wrench", "imu", "pose", "static"]
+    ordered = {name: streams[name] for name in order if name in streams}
+    return Draft(ordered, [*dict.fromkeys(x for draft in drafts for x in draft.comment_lines)])
 
 
 def _is_template(stream: dict[str, Any]) -> bool:
@@ -143,10 +140,8 @@ def _is_template(stream: dict[str, Any]) -> bool:
     return bool(columns) and set(columns) == {_FILL_IN_TEXT}
 
 
-_NamesAndUnits = dict[str, tuple[str, str]]
-"""Normalized name and unit of each column, from the column's name."""
-_Columns = dict[str, list[str]]
-"""Names of the columns of each recognized vector."""
+_NamesAndUnits = dict[str, tuple[str, str]]  # normalized, of each column, from its name
+_Columns = dict[str, list[str]]  # names of the columns of each recognized vector
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
@@ -187,20 +182,14 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     if not draft:
         draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
-    used = {
-        name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
-    }
+    used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
-    times = {
-        stream.get("time", {}).get(name) for stream in draft.values() for name in _STAMP_FIELDS
-    }
+    times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
     used |= times - {None}
     arrays = _names_of_array_columns(table)
     used |= {name.partition("[")[0] for name in used}
-    parts = {
-        name for name in table.columns if name not in arrays and name.partition("[")[0] in arrays
-    }
+    parts = {x for x in table.columns if x not in arrays and x.partition("[")[0] in arrays}
     unused = [name for name in table.columns if name not in used | parts]
     head = [
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
@@ -244,9 +233,7 @@ def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, li
 
 
 def _find_vectors(plain: _NamesAndUnits) -> _Columns:
-    groups = {
-        kind: _group_axes(plain, kind, names) for kind, names in _VECTOR_NAME_PATTERNS.items()
-    }
+    groups = {kind: _group_axes(plain, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
     found: _Columns = {}
     for pair in _VECTORS_OF_ONE_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
@@ -271,10 +258,7 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
         if match and _known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
     whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
-    return {
-        name: [group[axis] for axis in axes if axis in group]
-        for name, group in (whole or groups).items()
-    }
+    return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
 
 
 def _known_unit(text: str) -> str:
@@ -301,7 +285,7 @@ def _reinterpret_lone_torque_as_position(found: _Columns, plain: _NamesAndUnits)
 
 def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
     groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
-    for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
+    for columns in (group for group in groups.values() if len(group) in (7, 8)):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
             if _are_unit_quaternions(table, quaternion):
@@ -368,10 +352,10 @@ def _draft_quantity(
     table: Table, plain: _NamesAndUnits, kind: str, columns: list[str]
 ) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(columns)}
-    if kind in ("force", "torque") and _are_raw_counts(table, columns):
-        group["scale"] = _FILL_IN_TEXT
     if _FILL_IN_TEXT in columns:
         return group
+    if kind in ("force", "torque") and _are_raw_counts(table, columns[0]):
+        group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
         unit = _known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
@@ -388,13 +372,10 @@ def _draft_quantity(
     return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 
-def _are_raw_counts(table: Table, columns: list[str]) -> bool:
-    if _FILL_IN_TEXT in columns:
-        return False
-    first = table.numbers_with_nan(columns[0], columns[0])
-    if not np.nanmedian(np.abs(first)) > _MIN_MEDIAN_RAW_COUNT:
-        return False
-    return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
+def _are_raw_counts(table: Table, column: str) -> bool:
+    x = table.numbers_with_nan(column, column)
+    large = np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT
+    return bool(large and (np.nan_to_num(x) % 1.0 == 0.0).all())
 
 
 def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
@@ -424,21 +405,17 @@ def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, A
         return {"column": _FILL_IN_TEXT}
     if beside in table.columns:
         structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
-
-        def distance(name: str) -> tuple[bool, bool]:
-            return name.rpartition(".")[0] != structure, len(table.columns[name]) != rows
-
-        named.sort(key=distance)
+        named.sort(key=lambda name: len(table.columns[name]) != rows)
+        named.sort(key=lambda name: name.rpartition(".")[0] != structure)
     unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
     for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
-    return {
-        "column": named[0],
-        "unit": unit if unit in _ALLOWED_UNITS["time"] else _guess_time_unit(table, named[0]),
-    }
+    if unit not in _ALLOWED_UNITS["time"]:
+        unit = _guess_time_unit(table, named[0])
+    return {"column": named[0], "unit": unit}
 
 
 def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
@@ -455,7 +432,7 @@ def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
 
 
 def _guess_time_unit(table: Table, column: str) -> str:
-    step = float(np.median(np.abs(np.diff(table.single_column(column, column)))))
+    step = float(np.nanmedian(np.abs(np.diff(table.single_column(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:
             return unit

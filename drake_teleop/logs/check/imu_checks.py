@@ -27,8 +27,7 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
 RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
-MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02
-"""Smallest reported error of gravity; calibrated sensors are within 1 %."""
+MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION = 5.0
 _MIN_ALPHA_CORRELATION = 0.8
 _ALPHA_COMPARISON_CUTOFF_HZ = 5.0
@@ -38,30 +37,25 @@ _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0
 
 
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Return contradictions among the signals of an IMU, and the corrected description."""
+    """Return a contradiction among an IMU's signals, if any, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
-    unit = _angle_unit_finding(imu, log)
-    if unit is not None:
-        return [unit[0]], edit_field(description, *unit[1:])
+    edit = _angle_unit_edit(description, imu, log)
+    if edit is not None:
+        return [edit[0]], edit[1]
     if imu.specific_force is None or imu.frame == "base":
         return [], description
     gravity = float(np.linalg.norm(description.gravity_W))
-    axes = _gyro_axes_finding(imu, log, gravity)
-    if axes is not None:
-        finding, columns = axes
-        if columns is not None:
-            description = edit_field(description, "imu.angular_velocity.columns", columns)
-        return [finding], description
-    alpha = _angular_acceleration_axes_finding(imu, log)
-    if alpha is not None:
-        return [alpha], description
-    scale = _gravity_magnitude_finding(imu, log, gravity)
-    return ([] if scale is None else [scale]), description
+    edit = _gyro_axes_edit(description, imu, log, gravity)
+    if edit is not None:
+        return [edit[0]], edit[1]
+    axes = _angular_acceleration_axes_finding(imu, log)
+    finding = axes or _gravity_magnitude_finding(imu, log, gravity)
+    return ([] if finding is None else [finding]), description
 
 
-def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
+def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | None:
     assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
@@ -79,7 +73,8 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
         if least < wrong < most and getattr(imu, quantity).unit == unit:
             text = f"the angular acceleration is {ratio:.3g} times the derivative of the angular"
             line = f"imu.{quantity}.unit"
-            return Finding("degrees", f"{text} velocity; set {line}: {other}"), line, other
+            finding = Finding("degrees", f"{text} velocity; set {line}: {other}")
+            return finding, edit_field(description, line, other)
     return None
 
 
@@ -89,7 +84,7 @@ def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
     return given, low_pass(rate, log.dt, _ALPHA_COMPARISON_CUTOFF_HZ)
 
 
-def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
+def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float) -> Edit | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
@@ -105,11 +100,11 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
         return Finding(
             "swapped axes",
             f"{text}: its x, y, z should be its {', '.join(axis_names_of_rows(P))}; correct"
-            " imu.angular_velocity.columns, in the file where a sign is wrong",
-        ), None
+            " imu.angular_velocity.columns, and signs by imu.angular_velocity.scale",
+        ), description
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
-    text = f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
-    return Finding("swapped axes", text), ordered
+    finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
+    return finding, edit_field(description, "imu.angular_velocity.columns", ordered)
 
 
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
@@ -120,10 +115,8 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     alike = given_alpha.T @ derived_alpha / size
     best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     largest = np.sum(alike * best)
-    if (
-        largest < _MIN_ALPHA_CORRELATION
-        or np.trace(alike) > _MAX_UNSWAPPED_OVER_BEST_CORRELATION * largest
-    ):
+    limit = _MAX_UNSWAPPED_OVER_BEST_CORRELATION * largest
+    if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > limit:
         return None
     return Finding(
         "swapped axes",
@@ -185,8 +178,8 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
         "gravity",
         f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
         f" {100 * off:.2g} % (+- {100 * deviation:.1g})"
-        f" {'more' if ratio > 1 else 'less'} than the description says:"
-        f" the mass would be wrong by as much; {remedy}",
+        f" {'more' if ratio > 1 else 'less'} than described: the mass would be wrong by as much;"
+        f" {remedy}",
     )
 
 
@@ -226,23 +219,22 @@ def check_imu_against_pose(
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
-    if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
+    least, most = RANGE_OF_DEGREES_PER_RADIAN
+    if given.speed_ratio is not None and least < given.speed_ratio < most:
         text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
         findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
         description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
     if given.is_mirrored:
         text = (
             "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"
-            " has the wrong sign; correct imu.specific_force.columns"
+            " has the wrong sign; correct imu.specific_force.columns or imu.specific_force.scale"
         )
         findings.append(Finding("swapped axes", text))
     elif given.rotation_angle_deg > 10:
         assert description.imu is not None
-        old = np.eye(3)
-        if isinstance(description.imu.frame, tuple):
-            old = np.array(description.imu.frame)
+        old = description.imu.frame
         R = given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI
-        frame = R @ old
+        frame = R @ (np.array(old) if isinstance(old, tuple) else np.eye(3))
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
         text = f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S;"
@@ -254,22 +246,18 @@ def check_imu_against_pose(
 
 def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
     assert description.imu is not None
-    if not found.clock_drift:
+    drift = found.clock_drift
+    if not drift:
         offset = description.imu.time.offset - found.lag_s
-        finding = Finding(
-            "clock",
-            f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
-            f" set imu.time.offset: {offset:.3f}",
-        )
+        text = f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s"
+        finding = Finding("clock", f"{text}; set imu.time.offset: {offset:.3f}")
         return finding, edit_field(description, "imu.time.offset", offset)
-    late = found.mid_record_lag_s - found.clock_drift * found.mid_record_time_s
-    lag, lines, edited = data.start_lag_and_clock_drift_correction(
-        "imu", description, late, found.clock_drift
-    )
+    late = found.mid_record_lag_s - drift * found.mid_record_time_s
+    lag, lines, edited = data.start_lag_and_clock_drift_correction("imu", description, late, drift)
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
-        f" {1e3 * found.clock_drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
+        f" {1e3 * drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
         f" constant); set {lines}",
     )
     return finding, edited

@@ -18,7 +18,7 @@ from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_num_episodes
-from drake_teleop.logs.read.description import Description, Time
+from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_described_log
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
@@ -78,13 +78,10 @@ class LogData:
         return lag, lines, edit_field(edited, f"{name}.time.scale", factor)
 
     def _start_time_of_stream(self, stream: Any) -> float:
-        if stream.time.column is None:
-            return float(stream.time.offset)
         return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
 
     def _thinning_stride(self, stream: Any) -> int:
-        time: Time | None = getattr(stream, "time", None)
-        if time is None:
+        if getattr(stream, "time", None) is None:
             return 1
         t, _ = self._times_and_rows(stream)
         if len(t) < 2:  # read_log raises the error
@@ -98,9 +95,6 @@ class LogData:
         return self.tables[stream.source].rows_with_any_number(stream.columns)
 
     def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
-        if stream.time.column is None:
-            rows = np.arange(self._table_of_stream(stream).rows)
-            return rows / stream.time.rate, rows
         t, _ = time_stamps_and_num_episodes(stream.time, self._table_of_stream(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
@@ -152,20 +146,17 @@ def dead_or_repeated_channel_findings(
         if quantity is None:
             continue
         where = f"{stream}.{field}"
-        numbers = _values_by_channel(tables[described.source], quantity.columns, where)
+        numbers: dict[str, Array] = {}
+        for column in quantity.columns:
+            x = tables[described.source].numbers_with_nan(column, where).T
+            named_parts = (
+                [str(column)] if len(x) == 1 else [f"{column}[{i}]" for i in range(len(x))]
+            )
+            numbers |= zip(named_parts, x, strict=True)
         twice = _repeated_column_findings(where, quantity.columns, named)
         found += twice or _dead_channel_findings(where, numbers)
         found += [] if twice else _equal_channel_findings(where, numbers)
     return found
-
-
-def _values_by_channel(table: Table, columns: Any, where: str) -> dict[str, Array]:
-    numbers: dict[str, Array] = {}
-    for column in columns:
-        x = table.numbers_with_nan(column, where)
-        for i, values in enumerate(x.T):
-            numbers[str(column) if len(x.T) == 1 else f"{column}[{i}]"] = values
-    return numbers
 
 
 def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:

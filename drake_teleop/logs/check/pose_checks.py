@@ -16,7 +16,7 @@ from drake_teleop.logs.read.auto_frames import round_for_yaml
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.mounting import lever_matrix
+from drake_teleop.logs.read.mounting import lever_matrix, rotation_angle_deg
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -27,14 +27,13 @@ _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
-MIN_POSES_DURATION_S = 4.0
-"""Shorter records have too few frequencies for an estimate by poses alone [s]."""
+MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
 _CONFUSED_TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _WRONG_TORQUE_UNIT_RATIOS = (
     *(
-        SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[other]
-        for unit, other in permutations(_CONFUSED_TORQUE_UNITS, 2)
+        SI_VALUE_OF_UNIT[a] / SI_VALUE_OF_UNIT[b]
+        for a, b in permutations(_CONFUSED_TORQUE_UNITS, 2)
     ),
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
@@ -82,11 +81,12 @@ def position_unit_or_origin_findings(
         return []
     if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_ERROR_OVER_DEVIATION * deviation):
         return []
-    place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
+    place, other = shift + np.array(pose.position_in_sensor), np.array(imu.position) - shift
     text = (
-        f"the pose's origin is {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}) from the"
-        f" accelerometer; if imu.position is right, set pose.position_in_sensor:"
-        f" {place.tolist()}, otherwise set imu.position: {(0.0 - place).tolist()}"
+        f"the described positions of the pose's origin and the accelerometer disagree by"
+        f" {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}); if imu.position is right, set"
+        f" pose.position_in_sensor: {round_for_yaml(place)}, otherwise set imu.position:"
+        f" {round_for_yaml(other)}"
     )
     return [Finding("pose frame", text)]
 
@@ -101,11 +101,8 @@ def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding 
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(kappa) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
-    return Finding(
-        "units",
-        f"{text} their unit is not known; multiply pose.position.scale (1 by default) by"
-        f" {kappa:.4g}",
-    )
+    remedy = f"multiply pose.position.scale (1 by default) by {kappa:.4g}"
+    return Finding("units", f"{text} their unit is not known; {remedy}")
 
 
 def _fit_centred_signals(
@@ -128,7 +125,7 @@ def _fit_centred_signals(
 
 
 def has_usable_poses(log: Log) -> bool:
-    """Return whether a log has poses over at least 4 s, as splines require."""
+    """Return whether a log of motion has poses over at least 4 s, as splines require."""
     duration_s = float(log.t[-1] - log.t[0])
     return log.posed is not None and not log.static and duration_s >= MIN_POSES_DURATION_S
 
@@ -139,9 +136,8 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
     pose = None if log.described is None else log.described.pose
     seen = found.units_and_axes
     if pose is not None and pose.position is not None and seen.is_usable and not seen.is_mirrored:
-        unit = _position_unit_finding(
-            pose.position.unit, seen.position_unit_ratio, seen.position_unit_ratio_std
-        )
+        ratio, std = seen.position_unit_ratio, seen.position_unit_ratio_std
+        unit = _position_unit_finding(pose.position.unit, ratio, std)
         if unit is not None:
             return unit
     return pose_frame_finding(found, log.posed)
@@ -167,8 +163,7 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
         )
         lines.append(f"pose.position_in_sensor: {round_for_yaml(place)}")
     if frame.is_rotated:
-        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
-        deviation = float(frame.rotation_stds_deg.max())
+        angle, deviation = rotation_angle_deg(frame.R_SP), float(frame.rotation_stds_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
         lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
     text = f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}"

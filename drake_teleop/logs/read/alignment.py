@@ -20,8 +20,7 @@ _MIN_SAMPLES_AFTER_DELAY = 8
 _INTERPOLATED_CHUNK_ROWS = 2**18
 _MIN_SMOOTHER_WINDOW_SAMPLES = 9
 _SMOOTHER_DEGREE = 5
-SMOOTHER_WINDOW_OVER_PERIOD = 1.8
-"""Window length [s] of the smoother times its bandwidth [Hz]."""
+SMOOTHER_WINDOW_OVER_PERIOD = 1.8  # window [s] of the smoother times its bandwidth [Hz]
 
 
 def mean_time_step(t: Array) -> float:
@@ -74,9 +73,8 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
         padded[pad : pad + n] = column
         padded[:pad] = 2 * column[0] - column[pad:0:-1]
         padded[pad + n : 2 * pad + n] = 2 * column[-1] - column[-2 : -2 - pad : -1]
-        padded[2 * pad + n :] = np.linspace(
-            padded[2 * pad + n - 1], padded[0], length - 2 * pad - n
-        )
+        end = 2 * pad + n
+        padded[end:] = np.linspace(padded[end - 1], padded[0], length - end)
         filtered[:] = np.fft.irfft(np.fft.rfft(padded) * gain, length)[pad : pad + n]
     return out.reshape(x.shape)
 
@@ -107,7 +105,7 @@ def smooth_derivatives(
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return noise (3,) of `smooth_derivatives` over white noise of x: [1], [1/s], [1/s^2]."""
+    """Return noise (3,) of `smooth_derivatives` over white noise of x [1, 1/s, 1/s^2]."""
     weights = polynomial_fit_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
@@ -139,9 +137,8 @@ def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[
 
 def vectors_of_skew_parts(A: Array) -> Array:
     """Return the vectors (N, 3) whose cross matrices are the skew parts of A (N, 3, 3)."""
-    return 0.5 * np.stack(
-        [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
-    )
+    S = A - np.swapaxes(A, 1, 2)
+    return 0.5 * np.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], axis=1)
 
 
 def white_noise_deviations(x: Array) -> Array:
@@ -190,9 +187,8 @@ def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
-    return ~widen_flags(
-        log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
-    )
+    reach = 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
+    return ~widen_flags(log.bridged, reach)
 
 
 def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
@@ -243,7 +239,12 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
-    return _refine_delay_shift(cost, float(shifts[best]), step)
+    delay = float(shifts[best])
+    while step > 1e-5:
+        step /= 4
+        candidates = delay + step * np.arange(-4, 5)
+        delay = float(candidates[int(np.argmin([cost(shift) for shift in candidates]))])
+    return delay
 
 
 def choose_delay(
@@ -258,19 +259,10 @@ def choose_delay(
     if not isinstance(delay, str):
         return float(finite_array("delay", to_float("delay", delay))), "given"
     if delay != "auto":
-        raise DrakeTeleopError(
-            f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"
-        )
+        what = f"{delay!r} is neither seconds nor auto"
+        raise DrakeTeleopError(what, where="delay", remedy="give a number or auto")
     found = estimate_delay(log, cutoff_hz, phi)
     return (0.0, "undetermined") if found is None else (found, "estimated")
-
-
-def _refine_delay_shift(cost: Callable[[float], float], best: float, step: float) -> float:
-    while step > 1e-5:
-        step /= 4
-        candidates = best + step * np.arange(-4, 5)
-        best = float(candidates[int(np.argmin([cost(shift) for shift in candidates]))])
-    return best
 
 
 def _cost_of_shift(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:

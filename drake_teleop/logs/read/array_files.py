@@ -45,8 +45,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
     zarr = import_optional_module("zarr", path)
-    group = zarr.open_group(path, mode="r")
-    members = group.members(max_depth=None)
+    members = zarr.open_group(path, mode="r").members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
     return {
         name.replace("/", "."): np.asarray(item[rows])
@@ -57,16 +56,12 @@ def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
 
 def _is_numeric_table(item: Any, transpose: bool) -> bool:
     shape = item.shape[::-1] if transpose else item.shape
-    if (
-        item.dtype.kind not in "fiu"
-        or not 1 <= len(shape) <= 3
-        or math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW
-    ):
+    if item.dtype.kind not in "fiu" or not 1 <= len(shape) <= 3:
         return False
-    if math.prod(shape) > _MAX_NUMBERS_PER_ARRAY:
-        raise ValueError(
-            f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_NUMBERS_PER_ARRAY:.2g})"
-        )
+    if math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW:
+        return False
+    if (count := math.prod(shape)) > _MAX_NUMBERS_PER_ARRAY:
+        raise ValueError(f"an array has {count:.2g} numbers (at most {_MAX_NUMBERS_PER_ARRAY:.2g})")
     return True
 
 
@@ -80,17 +75,11 @@ def import_optional_module(name: str, path: Path) -> Any:
 
 
 _MAT_HEADER_BYTES = 128
-_MAT_MATRIX_TYPE = 14
-_MAT_COMPRESSED_TYPE = 15
-_MAT_STRUCTURE_CLASS = 2
-_MAT_COMPLEX_FLAG = 1 << 11
-_MAX_MAT_STRUCTURE_DEPTH = 20
-_MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
-_DTYPE_OF_MAT_TYPE = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+_MAT_MATRIX_TYPE, _MAT_COMPRESSED_TYPE = 14, 15
+_MAT_STRUCTURE_CLASS, _MAX_MAT_STRUCTURE_DEPTH = 2, 20
+_MAT_NUMERIC_CLASSES, _MAT_COMPLEX_FLAG = range(6, 16), 1 << 11
+_DTYPE_OF_MAT_TYPE = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4"}
+_DTYPE_OF_MAT_TYPE |= {9: "f8", 12: "i8", 13: "u8"}
 _MAT_FLAGS_AND_SIZE_TYPES = [6, 5]
 _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
@@ -151,9 +140,8 @@ def _add_mat_variable(
     if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _MAT_COMPLEX_FLAG:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        _add_mat_array_unless_scalar(
-            name, _parse_mat_numbers(parts[3], order).reshape(size, order="F"), found
-        )
+        array = _parse_mat_numbers(parts[3], order).reshape(size, order="F")
+        _add_mat_array_unless_scalar(name, array, found)
     elif flags & 0xFF == _MAT_STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
         (length, *_), names = _parse_mat_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
@@ -166,9 +154,8 @@ def _parse_mat_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     kind, content = part
     if kind not in _DTYPE_OF_MAT_TYPE:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
-    return np.frombuffer(content, f"{order}{_DTYPE_OF_MAT_TYPE[kind]}").astype(
-        _DTYPE_OF_MAT_TYPE[kind]
-    )
+    dtype = _DTYPE_OF_MAT_TYPE[kind]
+    return np.frombuffer(content, f"{order}{dtype}").astype(dtype)
 
 
 def _add_mat_array_unless_scalar(name: str, array: NDArray, found: dict[str, NDArray]) -> None:

@@ -20,12 +20,11 @@ from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
 MIN_WARNED_IMU_LAG_S = 0.05
-"""Lag between the clocks of IMU and pose that causes a warning [s]."""
+ReadLog = Callable[[Description], Log]
+Estimate = tuple[Description, tuple[str, ...]]  # description with estimates, and notes
 
 
-def estimate_auto_imu_mounting(
-    description: Description, source: str, read: Callable[[Description], Log]
-) -> tuple[Description, tuple[str, ...]]:
+def estimate_auto_imu_mounting(description: Description, source: str, read: ReadLog) -> Estimate:
     """Return the description with estimates for `auto` in the IMU's mounting, and notes."""
     imu = description.imu
     assert imu is not None
@@ -135,9 +134,7 @@ def _format_arm_mm(lever: LeverArm) -> str:
     )
 
 
-def estimate_auto_pose_frame(
-    description: Description, source: str, read: Callable[[Description], Log]
-) -> tuple[Description, tuple[str, ...]]:
+def estimate_auto_pose_frame(description: Description, source: str, read: ReadLog) -> Estimate:
     """Return the description with estimates for `auto` in the pose frame, and notes."""
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 
@@ -148,43 +145,31 @@ def estimate_auto_pose_frame(
     log = read(description.model_copy(update=alone))
     assert log.posed is not None
     arrays = log.t, log.wrench, log.posed.poses, log.posed.gravity_W
-    found = estimate_from_poses(*arrays, p_SoPo_S=None, R_SP=None, lost=log.bridged)
-    frame = found.frame
+    frame = estimate_from_poses(*arrays, p_SoPo_S=None, R_SP=None, lost=log.bridged).frame
     changes: dict[str, Any] = {}
     notes: list[str] = []
-    if pose.position_in_sensor == "auto":
-        _require_determined_axes(
-            frame.is_position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
+    mm, deg = 1e3 * frame.position_stds_m.max(), frame.rotation_stds_deg.max()
+    for name, value, known, quantity, deviation in (
+        ("position", frame.p_SoPo_S, frame.is_position_known, "origin along", f"{mm:.2g} mm"),
+        ("rotation", frame.R_SP, frame.is_rotation_known, "turn about", f"{deg:.2g} deg"),
+    ):
+        field = f"{name}_in_sensor"
+        if getattr(pose, field) != "auto":
+            continue
+        if not known.all():
+            what = f"the data do not determine the pose's {quantity} {_unknown_axes(known)}"
+            remedy = "turn the sensor faster, about more axes, without contact; or give the values"
+            raise DrakeTeleopError(what, where=f"{source}:pose.{field}", remedy=remedy)
+        changes[field] = tuple(map(tuple, value.tolist()) if value.ndim == 2 else value.tolist())
+        notes.append(
+            f"pose.{field} found, standard deviation {deviation}; write it into the description as"
+            f" pose.{field}: {round_for_yaml(value)}"
         )
-        changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
-        deviation = 1e3 * float(frame.position_stds_m.max())
-        notes.append(_pose_frame_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
-    if pose.rotation_in_sensor == "auto":
-        _require_determined_axes(
-            frame.is_rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
-        )
-        changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
-        deviation = float(frame.rotation_stds_deg.max())
-        notes.append(_pose_frame_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
-
-
-def _require_determined_axes(known: Any, where: str, quantity: str) -> None:
-    if not known.all():
-        what = f"the data do not determine {quantity} {_unknown_axes(known)}"
-        remedy = "turn the sensor faster, about more axes, without contact; or give the values"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _unknown_axes(known: Any) -> str:
     return ", ".join(axis for axis, is_known in zip("xyz", known, strict=True) if not is_known)
-
-
-def _pose_frame_note(name: str, value: Any, deviation: str) -> str:
-    return (
-        f"pose.{name} found, standard deviation {deviation}; write it into the description as"
-        f" pose.{name}: {round_for_yaml(value)}"
-    )
 
 
 def block_means_of_log(log: Log) -> BlockMeans:
@@ -214,9 +199,7 @@ def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
 _MAX_GRAVITY_DIRECTION_STD_DEG = 2.0
 
 
-def estimate_auto_gravity(
-    description: Description, source: str, read: Callable[[Description], Log]
-) -> tuple[Description, tuple[str, ...]]:
+def estimate_auto_gravity(description: Description, source: str, read: ReadLog) -> Estimate:
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf

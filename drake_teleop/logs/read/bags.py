@@ -12,15 +12,14 @@ import os
 import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -52,8 +51,7 @@ _MESSAGE_TYPES_OF_STREAM = {
 """Message types for each stream, the most likely first."""
 
 
-@dataclass(frozen=True)
-class Topic:
+class Topic(NamedTuple):
     """Topic of a bag: name, message type, number and mean rate [Hz] of messages."""
 
     name: str
@@ -152,13 +150,10 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     if not is_bag(path):
         remedy = "give a folder with metadata.yaml, or a .mcap, .db3 or .bag file"
         raise DrakeTeleopError("the path is not a bag", where=str(path), remedy=remedy)
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        what = "reading bags requires the Python package rosbags, which is not installed"
-        remedy = remedy_to_install_extra("ros")
-        raise DrakeTeleopError(what, where=str(path), remedy=remedy) from error
+    require_library("rosbags", "rosbags", "ros", str(path))
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     try:
         for file in path.iterdir() if path.is_dir() else [path]:
             if file.suffix.lower() == ".mcap":
@@ -244,9 +239,8 @@ def _columns_of_messages(messages: list[Any]) -> dict[str, NDArray]:
         get = attrgetter(path)
         values = [get(message) for message in messages]
         if hasattr(sample, "nanosec"):
-            columns[path] = np.array([v.sec for v in values]) + 1e-9 * np.array(
-                [v.nanosec for v in values]
-            )
+            seconds, rest = np.array([(v.sec, v.nanosec) for v in values]).T
+            columns[path] = seconds + 1e-9 * rest
         elif not isinstance(sample, np.ndarray):
             columns[path] = np.array(values)
         elif all(len(v) == len(sample) for v in values):

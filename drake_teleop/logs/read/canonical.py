@@ -95,14 +95,13 @@ class Log:
             value, shape = getattr(self, name), (len(self.t), *row_shape)
             if value is None:
                 continue
+            where = f"{self.source}:{name}"
             if np.shape(value) != shape:
                 what = f"has shape {np.shape(value)} instead of {shape}"
-                remedy = "give one row per time"
-                raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
+                raise DrakeTeleopError(what, where=where, remedy="give one row per time")
             if not np.isfinite(value).all():
                 what = "holds NaN or infinity (numbers must be finite)"
-                remedy = "cut or repair these samples"
-                raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
+                raise DrakeTeleopError(what, where=where, remedy="cut or repair these samples")
         if np.any(np.diff(self.t) <= 0):
             remedy = "sort the rows, and remove repeated times"
             raise DrakeTeleopError("does not increase", where=f"{self.source}:t", remedy=remedy)
@@ -123,7 +122,6 @@ class Log:
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
     def with_times_relative_to(self, start: float) -> Log:
-        """Return the log with times relative to `start` [s]."""
         posed = None if self.posed is None else self.posed.with_times_relative_to(start)
         return replace(self, t=self.t - start, posed=posed)
 
@@ -208,8 +206,8 @@ def describe_canonical(path: Path, table: Table) -> Description:
 
 
 def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
-    where, q = str(table.path), "orientation" in fields
-    if not q and "specific_force" not in fields:
+    where, oriented = str(table.path), "orientation" in fields
+    if not oriented and "specific_force" not in fields:
         return False
     if "angular_velocity" in fields:
         speed = table.finite_numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
@@ -223,10 +221,9 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
     steps = np.diff(t)
     if not len(steps) or not np.median(steps) > 1 / MIN_RATE_HZ:
         return False
-    if q:
-        vertical = rotation_matrices(
-            table.finite_numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
-        )[:, 2]
+    if oriented:
+        quaternions = table.finite_numbers(QUATERNION_COLUMNS, 4, where)
+        vertical = rotation_matrices(quaternions, "quaternion_wxyz")[:, 2]
     else:
         vertical = table.finite_numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)

@@ -15,12 +15,9 @@ from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
-EPISODE_SPACING_S = 1.0
-"""Least time between two episodes of a file [s]."""
-MIN_GAP_STEPS = 4.0
-"""Least length of a gap in median steps."""
-MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
-"""Range of plausible rates [Hz]; other rates indicate a wrong unit."""
+EPISODE_SPACING_S = 1.0  # least time between two episodes of a file
+MIN_GAP_STEPS = 4.0  # median steps
+MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5  # other rates indicate a wrong unit
 _MAX_MEAN_OVER_MEDIAN_STEP = 4.0
 # Limits of an episode, in median steps: distance of its start from that of the first episode, and
 # each of its first steps. Least number of its rows.
@@ -46,7 +43,6 @@ class Clock:
     num_episodes: int = 1
 
     def select_timed_rows(self, x: Array) -> Array:
-        """Return the rows of x (num_rows, ...) that have a time."""
         return x if len(self.kept_rows) == self.num_rows else x[self.kept_rows]
 
 
@@ -55,12 +51,10 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 
     A row that repeats the time stamp and the values in `columns` of the previous row is removed.
     """
-    if time.column is None:
-        assert time.rate is not None
-        rows = np.arange(table.rows)
-        return Clock(_apply_clock_scale_and_offset(rows / time.rate, time), rows, table.rows)
     t, episodes = time_stamps_and_num_episodes(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
+    if time.column is None:
+        return Clock(_apply_clock_scale_and_offset(t, time), rows, total)
     notes = []
     if len(rows) < len(t):
         notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
@@ -77,7 +71,11 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     shared = int((np.diff(t) == 0).sum())
     if shared:
         even = spread_shared_stamps(t)
-        _check_stamps_increase(even, rows, table, where)
+        if (np.diff(even) <= 0).any():
+            row = table.line_in_file(rows[int(np.argmax(np.diff(even) <= 0))])
+            what = f"the time stamps do not increase around row {row} of {table.path.name}"
+            remedy = "cut the log there, or give time.rate instead of the stamps"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         notes.append(
             f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
             f" over {_SMOOTHING_WINDOW_STAMPS} stamps, which changes times by up to"
@@ -90,11 +88,16 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 
 
 def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
-    """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
+    """Return the times (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
-    Episodes are joined in the whole table, so that all its streams keep one clock.
+    Episodes are joined in the whole table, so that all its streams keep one clock. `time.rate` is
+    that of the stream's usual rows; missing rows are gaps.
     """
-    assert time.column is not None
+    if time.column is None:
+        assert time.rate is not None
+        rows = np.arange(table.rows) if table.kept_rows is None else table.kept_rows
+        spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
+        return rows / spacing / time.rate, 1
     whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:
@@ -115,11 +118,11 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
 def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
     """Return a note about the episodes of a wrench's clock; raise an error for several files."""
     if num_files > 1:
-        raise DrakeTeleopError(
-            f"the clock starts {clock.num_episodes} times, which requires all streams in one file",
-            where=where,
-            remedy="write all streams into one table, or each episode into files of its own",
+        what = (
+            f"the clock starts {clock.num_episodes} times, which requires all streams in one file"
         )
+        remedy = "write all streams into one table, or each episode into files of its own"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     if not where.endswith("wrench.time"):
         return []
     return [
@@ -191,10 +194,7 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     sums = np.concatenate([[0.0], np.cumsum(deviation)])
     smooth = np.empty(n)
     smooth[half : n - half] = (sums[width:] - sums[:-width]) / width
-    for ends, window in (
-        (slice(0, half), slice(0, width)),
-        (slice(n - half, n), slice(n - width, n)),
-    ):
+    for ends, window in (slice(half), slice(width)), (slice(n - half, n), slice(n - width, n)):
         index = np.arange(n)[window]
         slope = np.polyfit(index - index.mean(), deviation[window], 1)[0] if half else 0.0
         smooth[ends] = deviation[window].mean() + slope * (np.arange(n)[ends] - index.mean())
@@ -228,15 +228,6 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
         raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
 
 
-def _check_stamps_increase(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
-    steps = np.diff(t)
-    if (steps <= 0).any():
-        row = table.line_in_file(rows[int(np.argmax(steps <= 0))])
-        what = f"the time stamps do not increase around row {row} of {table.path.name}"
-        remedy = "cut the log there, or give time.rate instead of the stamps"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
-
-
 def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
     if len(t) < 2:
         return
@@ -245,9 +236,7 @@ def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
         return
     counts = step / SI_VALUE_OF_UNIT[time.unit]
     # Typical sensor rates are 20 Hz to 10 kHz.
-    likely = [
-        unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * SI_VALUE_OF_UNIT[unit] <= 0.05
-    ]
+    likely = [x for x in ("s", "ms", "us", "ns") if 1e-4 <= counts * SI_VALUE_OF_UNIT[x] <= 0.05]
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
     if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"

@@ -51,17 +51,13 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         rest = [" ".join(line.split()) for line in rest]
     names = _names_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
+    cells = (cell for line in rest for cell in line.split(separator))
     parse = partial(
         pl.read_csv,
         source,
         has_header=header,
         separator=separator,
-        decimal_comma=separator in ";\t"
-        and any(
-            _DECIMAL_COMMA_CELL_PATTERN.fullmatch(cell)
-            for line in rest
-            for cell in line.split(separator)
-        ),
+        decimal_comma=separator in ";\t" and any(map(_DECIMAL_COMMA_CELL_PATTERN.fullmatch, cells)),
         skip_lines=before,
         try_parse_dates=True,
     )

@@ -323,9 +323,9 @@ class Description(StrictModel):
 
     @property
     def streams(self) -> dict[str, Any]:
-        """The described ones of wrench, imu, pose and static, by name."""
-        fields = ((name, getattr(self, name)) for name in ("wrench", "imu", "pose", "static"))
-        return {name: stream for name, stream in fields if stream is not None}
+        """Described streams by name: some of wrench, imu, pose and static."""
+        names = ("wrench", "imu", "pose", "static")
+        return {name: x for name in names if (x := getattr(self, name)) is not None}
 
     @property
     def gravity_W(self) -> Array:
@@ -350,19 +350,14 @@ def load_description(path: str | Path) -> Description:
         raise DrakeTeleopError("no such log description", where=str(path), remedy="check the path")
     data = read_yaml(path)
     if not isinstance(data, dict):
-        raise DrakeTeleopError(
-            "holds no fields", where=str(path), remedy="see docs/log-description.md"
-        )
+        remedy = "see docs/log-description.md"
+        raise DrakeTeleopError("holds no fields", where=str(path), remedy=remedy)
     try:
         description = Description.model_validate(data)
     except ValidationError as error:
         raise _validation_error(error, path) from error
-    return _resolve_paths(description, path.parent)
-
-
-def _resolve_paths(description: Description, folder: Path) -> Description:
     streams = {
-        name: stream.model_copy(update={"file": folder / stream.file})
+        name: stream.model_copy(update={"file": path.parent / stream.file})
         for name, stream in description.streams.items()
     }
     return description.model_copy(update=streams)
@@ -399,8 +394,7 @@ def _is_field_or_index(part: str | int) -> bool:
 def _allowed_fields_at(location: Sequence[str | int]) -> Iterator[str]:
     model: Any = Description
     for part in location:
-        options = typing.get_args(model.model_fields[part].annotation) or (
-            model.model_fields[part].annotation,
-        )
+        annotation = model.model_fields[part].annotation
+        options = typing.get_args(annotation) or (annotation,)
         model = next(option for option in options if option is not types.NoneType)
     yield from model.model_fields

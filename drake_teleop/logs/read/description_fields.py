@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -9,8 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 
 from drake_teleop.common.rotations import nearest_rotation, orthogonality_error
 
-ROTATION_TOLERANCE = 0.01
-"""Largest deviation of entries of R^T R from the identity."""
+ROTATION_TOLERANCE = 0.01  # of the entries of R^T R
 _MIN_SCALE_FACTOR = 1e-12
 STANDARD_GRAVITY = 9.80665
 SI_VALUE_OF_UNIT = {
@@ -54,28 +54,23 @@ SI_VALUE_OF_UNIT = {
 """SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
-def _parse_frame(value: Any) -> Any:
-    if value in ("sensor", "base"):
+def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:
+    if value in words:
         return value
     try:
         matrix = np.asarray(value)
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
-        raise ValueError("must be sensor, base, or a 3x3 rotation matrix from the stream to S")
+        allowed = f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(words)}"
+        raise ValueError(f"must be {allowed}")
     if not (np.abs(matrix) < 2.0).all() or orthogonality_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
     return tuple(map(tuple, nearest_rotation(matrix).tolist()))
 
 
-def _parse_imu_frame(value: Any) -> Any:
-    return value if value == "auto" else _parse_frame(value)
-
-
 def _parse_rotation(value: Any) -> Any:
-    if value in ("sensor", "base"):
-        raise ValueError("must be a 3x3 rotation matrix from posed frame to S, or the word auto")
-    return value if value is None else _parse_imu_frame(value)
+    return value if value is None else _parse_frame(value, words=("auto",))
 
 
 def _parse_position(value: Any) -> Any:
@@ -149,7 +144,8 @@ Weight = Annotated[
 ]
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_parse_frame)]
 ImuFrame = Annotated[
-    Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_parse_imu_frame)
+    Literal["sensor", "base", "auto"] | Rotation,
+    BeforeValidator(partial(_parse_frame, words=("sensor", "base", "auto"))),
 ]
 RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_parse_rotation)]
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]

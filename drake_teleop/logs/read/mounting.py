@@ -34,10 +34,8 @@ def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool)
 
     Specific force, and with `gyroscope` also angular velocity.
     """
-    pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
-    if gyroscope:
-        pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
-    return pairs
+    signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
+    return [(resample(t, pose.t, x), y) for x, y in signals]
 
 
 def lag_of_imu_clock(
@@ -57,9 +55,8 @@ def lag_of_imu_clock(
 
     def unexplained_at_shift(shift: float) -> float:
         moved = remove_arm_effects(resample(t + shift, t_imu, sensed))
-        return sum(
-            _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
-        )
+        parts = np.split(moved, len(expected), axis=1)
+        return sum(_unexplained_share(y, x) for y, x in zip(expected, parts, strict=True))
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
@@ -162,14 +159,10 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     return np.where(unknown, np.inf, deviations)
 
 
-MAX_LEVER_ARM_DEVIATION_M = 0.005
-"""Largest standard deviation of a determined coordinate [m]."""
-MAX_UNEXPLAINED_SHARE = 0.05
-"""Largest unexplained share of the variance of a valid fit."""
+MAX_LEVER_ARM_DEVIATION_M = 0.005  # of a determined coordinate
+MAX_UNEXPLAINED_SHARE = 0.05  # of the variance, for a valid fit
 IMU_COMPARISON_CUTOFF_HZ = 8.0
-"""Cut-off of the low-pass on all signals [Hz]."""
 NUM_COMPARED_SAMPLES = 1500
-"""Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _MIN_MOTION_OVER_NOISE_POWER = 20.0
 
@@ -200,8 +193,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     Return None for a poor fit (contact), or few samples outside of gaps.
     """
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
-    delay = estimate_delay(log, None) or 0.0
-    smooth = low_pass_log(remove_delay(log, delay), cutoff)
+    smooth = low_pass_log(remove_delay(log, estimate_delay(log, None) or 0.0), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
     if len(t) < NUM_COMPARED_SAMPLES // 10:
@@ -220,9 +212,8 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     target = (wrench - wrench.mean(axis=0)).ravel()
     phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_VALUE_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = least_squares_with_deviations(
-        residual_at, np.concatenate([np.zeros(4), offsets, phi])
-    )
+    start = np.concatenate([np.zeros(4), offsets, phi])
+    x, deviations = least_squares_with_deviations(residual_at, start)
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
     if (left > MAX_UNEXPLAINED_SHARE * whole).any():
         return None
@@ -232,9 +223,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 def times_outside_gaps(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, NUM_COMPARED_SAMPLES)
-    known = [
-        np.interp(t, log.t, is_far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs
-    ]
+    known = [np.interp(t, x.t, is_far_from_gaps(x, cutoff).astype(float)) > 0.99 for x in logs]
     return t[np.all(known, axis=0)]
 
 
@@ -255,10 +244,8 @@ def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[
     return alone > _MIN_MOTION_OVER_NOISE_POWER * (noise.sum() - noise)
 
 
-MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
-"""Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
-MAX_ROTATION_DEVIATION_DEG = 1.0
-"""Largest standard deviation of a determined rotation [deg]."""
+MAX_RIGHT_ANGLE_ERROR_DEG = 5.0  # of a right-angled mounting
+MAX_ROTATION_DEVIATION_DEG = 1.0  # of a determined rotation
 MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS = 0.005
 """Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
 _MAX_IMU_LAG_S = 1.0
@@ -296,7 +283,7 @@ class Mounting:
 
     @property
     def rotation_angle_deg(self) -> float:
-        return _rotation_angle_deg(self.R_SI)
+        return rotation_angle_deg(self.R_SI)
 
     @property
     def nearest_right_angled_rotation(self) -> Array:
@@ -305,7 +292,7 @@ class Mounting:
 
     @property
     def angle_to_right_angled_deg(self) -> float:
-        return _rotation_angle_deg(self.nearest_right_angled_rotation.T @ self.R_SI)
+        return rotation_angle_deg(self.nearest_right_angled_rotation.T @ self.R_SI)
 
     @property
     def is_right_angled(self) -> bool:
@@ -356,12 +343,10 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
     lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
-    middle, drift = mid_record_lag_and_clock_drift(
-        t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0])
-    )
-    R, mirrored = _kabsch_rotation_and_is_mirrored(
-        resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected
-    )
+    independent = 2 * cutoff * float(t[-1] - t[0])
+    middle, drift = mid_record_lag_and_clock_drift(t, pairs, imu.t, lag, independent)
+    shifted = resample(t + middle + drift * (t - centre), imu.t, pairs[0][1])
+    R, mirrored = _kabsch_rotation_and_is_mirrored(shifted, expected)
 
     # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
@@ -370,16 +355,11 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     pose_omega = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(pose_omega, resample(t, pose.t, smooth.angular_acceleration))
 
-    x, deviations, left = _refine_rotation_lag_and_lever_arm(
-        t, drift * (t - centre), imu.t, pairs, K, R, middle
-    )
+    x, deviations, left = _refine_mounting(t, drift * (t - centre), imu.t, pairs, K, R, middle)
     lever = None
     if position:
-        lever = LeverArm(
-            x[4:7],
-            np.where(are_lever_arm_axes_observable(K, pose, cutoff), deviations[4:7], np.inf),
-            "pose",
-        )
+        observable = are_lever_arm_axes_observable(K, pose, cutoff)
+        lever = LeverArm(x[4:7], np.where(observable, deviations[4:7], np.inf), "pose")
     powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
@@ -398,7 +378,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     )
 
 
-def _refine_rotation_lag_and_lever_arm(
+def _refine_mounting(
     t: Array, drift_lag: Array, t_imu: Array, pairs: SignalPairs, K: Array, R: Array, lag: float
 ) -> tuple[Array, Array, Array]:
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
@@ -431,5 +411,5 @@ def _rotated_about_fixed_axes(R: Array, vector: Array) -> Array:
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 
-def _rotation_angle_deg(R: Array) -> float:
+def rotation_angle_deg(R: Array) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))

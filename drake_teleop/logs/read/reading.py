@@ -28,6 +28,7 @@ from drake_teleop.logs.read.alignment import (
     uniform_times,
 )
 from drake_teleop.logs.read.auto_frames import (
+    Estimate,
     estimate_auto_gravity,
     estimate_auto_imu_mounting,
     estimate_auto_pose_frame,
@@ -68,7 +69,7 @@ MIN_STATIC_POSES = 3
 MIN_BANDWIDTH_HZ = 1e-3
 _CONVERTED_CHUNK_ROWS = 2**16
 _MIN_IMU_GAP_OVER_STEP = 4.0
-_EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
+_EstimateAuto = Callable[..., Estimate]
 
 
 def read_log(
@@ -161,12 +162,12 @@ class _LogReader:
         t = uniform_times_of_streams(clock.t, streams, self._source)
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
-        gain_std = self._description.wrench.gain_std
-        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
+        posed, gain_std = None, self._description.wrench.gain_std
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
             posed = self._description.poses_with_frame(pose.recorded_poses, inertial)
-            log = replace(log, posed=posed)
+        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
+        log = replace(log, posed=posed)
         log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
@@ -273,7 +274,7 @@ class _LogReader:
                 return None
             values = self._read_vectors("imu", field, quantity, table, clock.num_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
-            return self._rotate_to_S("imu", stream.frame, values, t, pose)
+            return self._imu_to_S(stream.frame, values, t, pose)
 
         s = imu_vectors("specific_force", stream.sign)
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
@@ -284,24 +285,20 @@ class _LogReader:
         if s is not None and any(stream.position):
             s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt  # outside of gaps
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
         return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
 
-    def _rotate_to_S(
-        self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
-    ) -> Array:
+    def _imu_to_S(self, frame: Any, vectors: Array, t: Array, pose: Stream | None) -> Array:
         if isinstance(frame, tuple):
             return vectors @ np.array(frame).T
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._no_orientation_error(name)
+            raise self._no_R_WS_error("imu")
         return rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
-    def _no_orientation_error(
-        self, name: str, remedy: str = "add a pose stream"
-    ) -> DrakeTeleopError:
+    def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
         return DrakeTeleopError(what, where=f"{self._source}:{name}.frame", remedy=remedy)
 
@@ -318,23 +315,20 @@ class _LogReader:
             assert stream.orientation is not None
             where, form = f"{self._source}:static.orientation", stream.orientation
             orientations = OrientationColumns(self._description, form, table, table.rows, where)
-            R_WS = orientations.rotations(np.arange(table.rows))
-            R_SW = np.swapaxes(R_WS, 1, 2)
+            R_SW = np.swapaxes(orientations.rotations(np.arange(table.rows)), 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
-                raise self._no_orientation_error("static", remedy)
+                raise self._no_R_WS_error("static", remedy)
             wrench = rotate_wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
         if n < MIN_STATIC_POSES:
-            raise DrakeTeleopError(
-                f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)",
-                where=f"{self._source}:static",
-                remedy="record 12 or more, with different orientations",
-            )
+            what = f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)"
+            remedy = "record 12 or more, with different orientations"
+            raise DrakeTeleopError(what, where=f"{self._source}:static", remedy=remedy)
         rest = np.zeros((n, 3))
         return Log(
             *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),
@@ -390,8 +384,7 @@ class _LogReader:
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
-                values = None if stream is None else getattr(stream, field)
-                if stream is not None and values is not None:
+                if stream is not None and (values := getattr(stream, field)) is not None:
                     return resample_to_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
@@ -404,7 +397,7 @@ class _LogReader:
             if in_base:
                 wrench = rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
-            raise self._no_orientation_error("wrench")
+            raise self._no_R_WS_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
             self._notes.append(

@@ -70,8 +70,7 @@ def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
 
 def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
-    both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
-    return both.reshape(-1, 6)
+    return np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
 def specific_force_at_So(
@@ -92,35 +91,30 @@ def specific_force_at_So(
 
 
 class OrientationColumns:
-    """Columns of a table that contain orientations of S in any form."""
+    """Columns of a table with orientations of S, or of the posed frame P, in any form."""
 
     def __init__(
-        self,
-        description: Description,
-        orientation: Orientation,
-        table: Table,
-        rows: int,
-        where: str,
+        self, description: Description, described: Orientation, table: Table, rows: int, where: str
     ) -> None:
-        self._orientation, self._table, self._where = orientation, table, where
-        width = NUM_COLUMNS_OF_ROTATION_FORM[orientation.form]
-        self._columns = table.finite_numbers(orientation.columns, width, f"{where}.columns", rows)
-        if orientation.form in ("rotation_vector", "euler"):
-            self._columns *= description.unit_in_si(orientation.unit)
+        self._orientation, self._table, self._where = described, table, where
+        width = NUM_COLUMNS_OF_ROTATION_FORM[described.form]
+        self._columns = table.finite_numbers(described.columns, width, f"{where}.columns", rows)
+        if described.form in ("rotation_vector", "euler"):
+            self._columns *= description.unit_in_si(described.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
         """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:
-        """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
+        """Return R_WS or R_WP (n, 3, 3) of n rows; raise an error if these are no rotations."""
         orientation = self._orientation
         R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
         self._check_rotation_errors(orthogonality_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
-        """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z]."""
+        """Return R_WS or R_WP of n rows as quaternions (n, 4) [w, x, y, z]."""
         if not self._orientation.form.startswith("quaternion"):
             return quaternions_from_matrices(self.rotations(rows))
         q = self._columns[rows]

@@ -35,8 +35,7 @@ _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
 _WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
-_MAX_CELLS_IN_MEMORY = 2**24
-"""Number of cells above which columns of a Parquet file are read on access."""
+_MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
 
 
 def note_that_table_needs_description(source: str) -> str:
@@ -106,7 +105,7 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
     columns = _column_expressions(frame)
     rows = frame.select(pl.len()).collect().item()
     if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
-        return _LazyColumns(frame, columns)
+        return _LazyColumns(frame, columns)  # each is read on access, to limit memory
     return _collect_columns(frame, columns)
 
 
@@ -173,8 +172,6 @@ def _expand_nested_column(
 
 
 class _LazyColumns(UserDict[str, Any]):
-    """Columns of a Polars frame, each read on access to limit memory."""
-
     def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
         super().__init__(columns)
         self._frame = frame

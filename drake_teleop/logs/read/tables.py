@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
-MAX_PLAUSIBLE_NUMBER = 1e25
-"""Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
+MAX_PLAUSIBLE_NUMBER = 1e25  # in any unit; nanoseconds since 1970 are 2e18
 _MAX_RESOLUTION_DECIMALS = 12
 
 
@@ -51,15 +50,14 @@ class Table:
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.numbers_with_nan(names[0], "")).all():
             return self
-        columns = [self.numbers_with_nan(name, "") for name in names]
-        if len({len(column) for column in columns}) > 1:
+        numbers = [self.numbers_with_nan(name, "") for name in names]
+        if len({len(column) for column in numbers}) > 1:
             return self
-        rows = np.flatnonzero(np.isfinite(np.hstack(columns)).any(axis=1))
+        rows = np.flatnonzero(np.isfinite(np.hstack(numbers)).any(axis=1))
         if not 0 < len(rows) < self.rows:
             return self
-        return replace(
-            self, columns=_SelectedRows(self.columns, rows), whole_table=self, kept_rows=rows
-        )
+        columns = _SelectedRows(self.columns, rows)
+        return replace(self, columns=columns, whole_table=self, kept_rows=rows)
 
     @property
     def rows(self) -> int:
@@ -112,11 +110,10 @@ class Table:
         """Return the numbers (N,) of a column, with NaN and infinity."""
         numbers = self.numbers_with_nan(name, where)
         if numbers.shape[1] != 1:
-            raise DrakeTeleopError(
-                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1",
-                where=where,
-                remedy="name a column that has one",
+            what = (
+                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1"
             )
+            raise DrakeTeleopError(what, where=where, remedy="name a column that has one")
         return numbers[:, 0]
 
     def check_magnitude(
@@ -150,18 +147,16 @@ class Table:
             similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if similar else "its columns are"
             what = f"{self.path.name} has no column {name!r}"
-            remedy = f"{hint} {_join_names(similar or list(self.columns))}"
+            names = similar or list(self.columns)
+            remedy = f"{hint} {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = self.numbers_with_nan(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
         if bad.any():
-            first = int(np.argmax(bad))
-            raise DrakeTeleopError(
-                f"no finite number in {int(bad.sum())} rows, the first is row"
-                f" {self.line_in_file(first)}",
-                where=f"{self.path}:{name}",
-                remedy="cut the log before it or repair the rows",
-            )
+            row = self.line_in_file(int(np.argmax(bad)))
+            what = f"no finite number in {int(bad.sum())} rows, the first is row {row}"
+            remedy = "cut the log before it or repair the rows"
+            raise DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
         return numbers
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
@@ -182,8 +177,6 @@ def decimal_resolution(values: Array) -> float:
 
 
 class _SelectedRows(UserDict[str, Any]):
-    """Columns of another table, reduced to some of its rows on access."""
-
     def __init__(self, columns: MutableMapping[str, NDArray], rows: NDArray[np.intp]) -> None:
         super().__init__(dict.fromkeys(columns))
         self._columns, self._rows = columns, rows
@@ -210,8 +203,3 @@ def _column_to_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleop
         if isinstance(cell, str) and "_" in cell:  # which Python ignores
             raise bad(row, cell)
     return numbers
-
-
-def _join_names(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:12])
-    return f"{shown}, ..." if len(names) > 12 else shown
