@@ -118,13 +118,13 @@ class EliminatedLog:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
         offsets: (6,) sensor offsets of this record [N, N m].
-        tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
+        tare_fraction: share of samples that agree on `offsets`; 1 for given offsets or span.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
         measured: wrench without offsets.
         non_contact: load's wrench V phi.
         contact: contact wrench F_c, Eq. (13).
         scaled: scaled wrench gamma F_c + sigma V phi.
-        gravity_only: wrench without offsets and weight; None without orientation.
+        gravity_only: wrench without weight and its own offsets; None without orientation.
         noise_floor: (6,) noise of `contact` [N, N m].
         causal: wrenches as in a control loop, if requested.
         edge: (N,) True for samples near ends and gaps, excluded from all figures.
@@ -185,14 +185,13 @@ def identify_log(
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     raw = log
+    motion = None if posed is None else posed.motion
     if posed is not None:
-        log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.delay_source
+        log, fit, delay_s, source = posed.log, posed.fit, posed.motion.delay_s, posed.delay_source
     else:
         log, fit, delay_s, source = _fit_load_to_motion(raw, method, cutoff_hz, delay)
-    motion = None if posed is None else posed.motion
-    why = None
-    if _is_explanation_possible(raw, posed is not None):
-        why = explain_log(raw, delay_s, motion)
+    possible = _is_explanation_possible(raw, posed is not None)
+    why = explain_log(raw, delay_s, motion) if possible else None
     names = {x.name for x in why.causes} if why is not None else set()
     if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
@@ -381,20 +380,12 @@ def eliminate_log(
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
         load_of_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = phi_with_inertia_replaced(alone)[0]
-    eliminated = partial(
-        _read_and_eliminate_log,
-        identification=identification,
-        phi_gripper=phi_gripper,
-        scales=scales,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-        tare=tare,
-    )
+    common = identification, phi_gripper, scales, cutoff_hz, delay, tare
     if untouched_s is not None and not tare:
         what = "a span without contact determines the offsets, but those of the load are requested"
         raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
-    found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
-    free_motion = None if free is None else eliminated(free)
+    found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
+    free_motion = None if free is None else _read_and_eliminate_log(free, *common)
     if free_motion is not None and (found.log.static or free_motion.log.static):
         raise _no_contact_in_static_log_error(
             (free_motion if free_motion.log.static else found).log
@@ -407,9 +398,12 @@ def eliminate_log(
         free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
     covariance = limit_covariance_to_scales(found.phi, identification.covariance, tared=tare)
-    options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
-    usual = identification.residual_rms
-    detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
+    detection = detect_contact(
+        *(samples, found.log.dt, cutoff_hz, covariance, identification.residual_rms),
+        edge=found.edge,
+        free=reference,
+        statistic=statistic,
+    )
     if free_motion is not None and tare and detection is not None:
         notes = note_on_drift_or_much_contact(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
@@ -426,7 +420,6 @@ def _read_and_eliminate_log(
     identification: Identification,
     phi_gripper: Array,
     scales: dict[str, Any],
-    *,
     cutoff_hz: float | None,
     delay: str | float,
     tare: bool,
@@ -439,10 +432,8 @@ def _read_and_eliminate_log(
         remedy = "give causal as well, or remove it"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     phi = phi_with_inertia_replaced(identification)[0]
-    phi_object = phi - phi_gripper
-    known_load = phi, identification.delay_s
-    removed = identification.weight_removed
-    aligned = read_aligned_log(path, *known_load, cutoff_hz, delay, causal is not None, removed)
+    removed, late_s = identification.weight_removed, identification.delay_s
+    aligned = read_aligned_log(path, phi, late_s, cutoff_hz, delay, causal is not None, removed)
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
     if log.static and causal is not None:
         raise DrakeTeleopError(
@@ -466,15 +457,21 @@ def _read_and_eliminate_log(
     motion = log.motion
     gravity_only = None
     removed = removed or "weight" in log.estimated
-    _require_gravity_for_unequal_scales(log, removed, scales)
+    sigmas = {name: value for name, value in scales.items() if name != "gamma"}
+    weights, inertias = weight_scales_and_inertia_scales(**sigmas)
+    if weights != inertias and removed:
+        raise weight_scale_without_effect_error(log.source)
+    if weights != inertias and log.gravity is None:
+        raise unknown_gravity_error(
+            f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
+        )
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
         weightless = low_pass_wrench(weightless)
         gravity_only = weightless - choose_offsets(weightless)[0]
-    contact = contact_wrench(log.wrench, offsets, *motion, phi)
-    parts = phi_gripper, phi_object
+    parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
     scaled = scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
     causal_wrench = None
@@ -497,7 +494,7 @@ def _read_and_eliminate_log(
             contact=causal_wrench.contact[known],
             scaled=causal_wrench.scaled[known],
         )
-    contact = low_pass_wrench(contact)
+    contact = low_pass_wrench(contact_wrench(log.wrench, offsets, *log.motion, phi))
     findings = _findings_if_contact_is_large(
         Path(path), log.wrench - offsets, contact, identification
     )
@@ -589,19 +586,6 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
         where=where,
         remedy="use sigma alone; it scales the inertia",
     )
-
-
-def _require_gravity_for_unequal_scales(log: Log, removed: bool, scales: dict[str, Any]) -> None:
-    sigmas = {name: value for name, value in scales.items() if name != "gamma"}
-    weights, inertias = weight_scales_and_inertia_scales(**sigmas)
-    if weights == inertias:
-        return
-    if removed:
-        raise weight_scale_without_effect_error(log.source)
-    if log.gravity is None:
-        raise unknown_gravity_error(
-            f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
-        )
 
 
 def _checked_scales(

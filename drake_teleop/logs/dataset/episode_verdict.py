@@ -31,7 +31,7 @@ HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
-_FORCE_CHANNELS, _TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
+_FORCE_AND_TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
 _REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
 # Required reduction of the log spread, for each deviation.
 _SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
@@ -70,12 +70,8 @@ class WrenchHypothesis:
     def reading_of_load(self, load_wrench: Array) -> Array:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
-        return np.hstack(
-            [
-                self.force_torque_gains[0] * f @ self.force_axes.T,
-                self.force_torque_gains[1] * tau @ self.torque_axes.T,
-            ]
-        )
+        f_gain, tau_gain = self.force_torque_gains
+        return np.hstack([f_gain * f @ self.force_axes.T, tau_gain * tau @ self.torque_axes.T])
 
     def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
@@ -112,7 +108,7 @@ def find_simplest_hypothesis_and_residual(
     for kind in HYPOTHESIS_KINDS:
         best_lag = search.best_lag(replace(usual, kind=kind))
         for lag in {usual_lag, best_lag, search.lag_of_linear_fit(kind)}:
-            found += search._hypotheses_at_lag(kind, lag)
+            found += search.hypotheses_at_lag(kind, lag)
             found += [search.hypothesis_of_other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
@@ -145,16 +141,12 @@ class HypothesisSearch:
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
     def _best_rows_of(self, x: WrenchHypothesis) -> NDArray[np.bool_]:
-        return _rows_of_smallest_residual(
-            (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
-        )
+        residual = (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
+        return _rows_of_smallest_residual(residual)
 
-    def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
+    def hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
-        force, torque = (
-            self.best_permutation(*both, channels)
-            for channels in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
-        )
+        force, torque = (self.best_permutation(*both, c) for c in _FORCE_AND_TORQUE_CHANNELS)
         plain = WrenchHypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
         yield self.with_spread_and_cost(
@@ -179,9 +171,8 @@ class HypothesisSearch:
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         pairs = pairs.reshape(len(w), -1)
-        spread = ln_half_width_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0].reshape(
-            3, 3, 2
-        )
+        spread = ln_half_width_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0]
+        spread = spread.reshape(3, 3, 2)
         costs = [
             sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
             for M in _SIGNED_PERMUTATIONS
@@ -198,7 +189,7 @@ class HypothesisSearch:
     def refit_to_best_rows(
         self, x: WrenchHypothesis, *, det: float, scale: bool
     ) -> WrenchHypothesis:
-        """Return the hypothesis with rotation and factors fitted to the best rows.
+        """Return the hypothesis with rotation and factors fitted to the frames that fit best.
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
         """
@@ -214,7 +205,7 @@ class HypothesisSearch:
             if scale:
                 ratio = [
                     np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
-                    for c in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
+                    for c in _FORCE_AND_TORQUE_CHANNELS
                 ]
                 x = replace(x, force_torque_gains=np.maximum(ratio, 1e-9))
             if det:
@@ -286,7 +277,7 @@ def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
     H = np.zeros((3, 3))
-    for channels, factor in zip((_FORCE_CHANNELS, _TORQUE_CHANNELS), gain, strict=True):
+    for channels, factor in zip(_FORCE_AND_TORQUE_CHANNELS, gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
         H += w[:, channels].T @ p[:, channels] * factor / size**2
     U, _, Vt = np.linalg.svd(H)
@@ -295,7 +286,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: WrenchHypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE_CHANNELS, x.force_axes), (_TORQUE_CHANNELS, x.torque_axes)):
+    for channels, M in zip(_FORCE_AND_TORQUE_CHANNELS, (x.force_axes, x.torque_axes), strict=True):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)

@@ -27,15 +27,7 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_JOINT_POSITION,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    SATURATION_FLAG_INDEX,
-)
+from drake_teleop.load import regressor
 from drake_teleop.station.sensor.sensor_chain import (
     READ_ANGLES,
     READ_SATURATED,
@@ -262,7 +254,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     n = arm.shape[0] - 1
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
-    angles = sample[SAMPLE_JOINT_POSITION]
+    angles = sample[regressor.SAMPLE_JOINT_POSITION]
     _align_signal_paths(constants, memory, n, reading, sample)
     if memory[0] == 0.0:
         for i in range(3 * n):
@@ -270,7 +262,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     _differentiate_joint_angles(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
     if constants.encoders_only != 0.0:
-        copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
+        copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:
         _convert_and_fuse_accelerometer(
             constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample
@@ -284,17 +276,17 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
 
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
-    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
+    n = sample.shape[0] - regressor.SAMPLE_JOINT_POSITION.start
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     _align_signal_paths(constants, memory, n, reading, sample)
-    copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
+    copy_into(motion, 3, sample, regressor.SAMPLE_JOINT_POSITION.start, 3)
     _convert_and_fuse_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
 def _align_signal_paths(constants, memory, n, reading, sample):
-    sections, angles = constants.angle_low_passes, sample[SAMPLE_JOINT_POSITION]
+    sections, angles = constants.angle_low_passes, sample[regressor.SAMPLE_JOINT_POSITION]
     filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
@@ -313,7 +305,7 @@ def _align_signal_paths(constants, memory, n, reading, sample):
             copy_into(line, k * width, line, 0, width)
     wrench = int(constants.wait_samples[0]) * width
     acceleration = int(constants.wait_samples[1]) * width
-    waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
+    waited, read = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
@@ -327,7 +319,7 @@ def _align_signal_paths(constants, memory, n, reading, sample):
         float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
     )
     memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
-    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAGGED_SAMPLES_LEFT_INDEX] > 0.0 else 0.0
+    sample[regressor.SATURATION_FLAG_INDEX] = 1.0 if flagged > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -344,8 +336,8 @@ def _differentiate_joint_angles(constants, joints, angles):
 @njit(cache=True)
 def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
     period, fused, starts = constants.period, constants.fused != 0.0, memory[0] == 0.0
-    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
+    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
     R_SA, R = matrix_as_tuple(constants.R_SA), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
