@@ -203,8 +203,7 @@ _BLOCK_MEAN_BANDWIDTH_HZ = 25.0
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
     """Search for causes why a rigid load does not explain the wrench; None for a short log.
 
-    `delay_s` is that of the motion behind the wrench [s]. The motion is from the splines of `found`
-    or, for None, that of the log.
+    `delay_s` is that of the motion [s], which is from splines of `found` or, for None, from the log.
     """
 
     def instants_at_delay(more: float) -> BlockMeans:
@@ -254,7 +253,7 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 
 
 def explained_load(load: Identification, why: MisfitExplanation) -> Identification:
-    """Return the load fitted with the causes; without causes, `load` with wider intervals."""
+    """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
     load = _load_with_causes_or_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load
@@ -311,7 +310,6 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Caus
 
 
 def unexplained_finding(why: MisfitExplanation) -> Finding:
-    """Return the finding that a misfit has no known cause."""
     ratio = why.state.residual_ratio
     return Finding(
         "misfit",

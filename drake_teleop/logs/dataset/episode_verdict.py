@@ -218,11 +218,9 @@ class HypothesisSearch:
         return x
 
     def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
-        """Return the hypothesis of another load, fitted to the best rows."""
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        found = [
-            self._fit_other_load(wrench, V, lag, rows) for rows in self.row_flags_for_first_fits()
-        ]
+        first_fits = self.row_flags_for_first_fits()
+        found = (self._fit_other_load(wrench, V, lag, rows) for rows in first_fits)
         return min(found, key=lambda x: x.cost)
 
     def _fit_other_load(

@@ -82,12 +82,12 @@ class PoseFrame:
 
     @property
     def is_position_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): whether the position along each axis of S is known to 2 cm."""
+        """Booleans (3,): whether it is known to 2 cm along the axes of S."""
         return np.asarray(self.position_stds_m < MAX_KNOWN_FRAME_SHIFT_STD_M)
 
     @property
     def is_rotation_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): whether the rotation about each axis of S is known to 1 degree."""
+        """Booleans (3,): whether it is known to 1 degree about the axes of S."""
         return np.asarray(self.rotation_stds_deg < MAX_KNOWN_FRAME_ROTATION_STD_DEG)
 
 
@@ -217,7 +217,7 @@ def fit_motion_to_load(
 ) -> PoseMotion:
     """Return the motion from poses of S with which a load fits a wrench best.
 
-    `coefficients` (6, 16) are the load's, Eq. (T73); other arguments as in `estimate_from_poses`.
+    `coefficients` (6, 16) are the load's, Eq. (T73).
     """
     with one_blas_thread():
         motion, last, _ = _find_splines_and_delay(

@@ -73,8 +73,7 @@ def _fit_sensor_model(
 ) -> _ImuSensorModel | None:
     """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y.
 
-    `which` is 0 for an accelerometer, 1 for a gyroscope. `pose_noise` is the power density of the
-    poses' noise, and the exponent of 2 pi f that converts it to y.
+    `which` is 0 for an accelerometer, 1 for a gyroscope.
     """
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)

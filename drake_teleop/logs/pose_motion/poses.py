@@ -91,6 +91,5 @@ class PosesOfLog:
     imu: ImuData | None = None
 
     def with_times_relative_to(self, start: float) -> PosesOfLog:
-        """Return poses and IMU data with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

@@ -62,7 +62,6 @@ class WrenchGrid:
 
     @cached_property
     def transform_length(self) -> int:
-        """Number of samples of the Fourier transforms."""
         return int(next_fast_len(len(self.t), real=True))
 
     @cached_property
@@ -210,7 +209,6 @@ class NoiseLevels:
 
     @classmethod
     def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
-        """Return levels of noise that is white within each group of bands."""
         return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:

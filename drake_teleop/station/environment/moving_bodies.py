@@ -37,7 +37,6 @@ from drake_teleop.common.vectors import (
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 _PARENT_ROW_COLUMN, _JOINT_TYPE_COLUMN, _POSITION_INDEX_COLUMN, _VELOCITY_INDEX_COLUMN = range(4)
 _AXIS_COLUMN, _X_PF_COLUMN, _X_MB_COLUMN = 4, 7, 14
-#: Number of columns of the table of joints.
 NUM_JOINT_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
 BODY_STATE_SIZE = 13
@@ -82,18 +81,16 @@ def _joint_table_row(
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if parent_row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-    kind, axis = _joint_type_and_axis(joint)
+    kind, axis = _FIXED_JOINT, np.zeros(3)
+    if isinstance(joint, RevoluteJoint):
+        kind, axis = _REVOLUTE_JOINT, joint.revolute_axis()
+    elif isinstance(joint, PrismaticJoint):
+        kind, axis = _PRISMATIC_JOINT, joint.translation_axis()
+    elif isinstance(joint, QuaternionFloatingJoint):
+        kind = _FREE_JOINT
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
     return np.array([parent_row, kind, *places, *axis, *poses[0], *poses[1]])
-
-
-def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
-    if isinstance(joint, RevoluteJoint):
-        return _REVOLUTE_JOINT, joint.revolute_axis()
-    if isinstance(joint, PrismaticJoint):
-        return _PRISMATIC_JOINT, joint.translation_axis()
-    return _FREE_JOINT if isinstance(joint, QuaternionFloatingJoint) else _FIXED_JOINT, np.zeros(3)
 
 
 @njit(cache=True)

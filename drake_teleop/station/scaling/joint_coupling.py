@@ -14,8 +14,8 @@ from drake_teleop.station.slave.arm import ArmModel, pose_into
 class JointCoupling(LeafSystem):
     """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open the commanded joints are constant. When it closes they jump to the
-    leader's joints and follow them.
+    While the clutch is open the command is constant. When it closes the command jumps to
+    start + (leader's joints - home), and follows it.
 
     .. pydrake_system::
 
@@ -54,7 +54,6 @@ class JointCoupling(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._update_held_joints_and_clutch)
 
     def _commanded_joint_positions(self, context: Context) -> Array:
-        """Return the leader's positions plus the offset, or the held command (n,) [rad]."""
         memory, n = context.get_discrete_state(0).value(), len(self._offset)
         joints: Array = memory[:n]
         return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints
@@ -63,11 +62,8 @@ class JointCoupling(LeafSystem):
         output.SetFromVector(self._commanded_joint_positions(context))
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        pose_into(
-            self._table,
-            np.array(self._commanded_joint_positions(context)),
-            output.get_mutable_value(),
-        )
+        joints = np.array(self._commanded_joint_positions(context))
+        pose_into(self._table, joints, output.get_mutable_value())
 
     def _update_held_joints_and_clutch(
         self, context: Context, discrete_state: DiscreteValues

@@ -33,6 +33,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     READ_SATURATED,
     WristSensorConfig,
     butterworth_sections,
+    group_delay_samples,
     low_pass_in_place,
     settle_low_pass,
     shift_delay_line,
@@ -105,7 +106,7 @@ def steady_state_kalman_gains(
 ) -> Array:
     """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
 
-    The Kalman filter has a measured position x, and an acceleration a with a drifting error.
+    The Kalman filter has a measured position, and a measured acceleration with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -134,7 +135,8 @@ def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
     wrench, acceleration, encoders = sensor.reading_delays(period)
-    encoders += _group_delay_samples(_angle_low_pass_sections(config, sensor, period)) * period
+    sections = _angle_low_pass_sections(config, sensor, period)
+    encoders += float(np.sum([group_delay_samples(section) for section in sections])) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
@@ -146,10 +148,8 @@ def fusion_gains(
 ) -> tuple[Array, Array]:
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
-    angle_std, drift = (
-        _sensor_rotation_std_by_encoders(sensor, num_joints),
-        config.angular_acceleration_drift,
-    )
+    angle_std = _sensor_rotation_std_by_encoders(sensor, num_joints)
+    drift = config.angular_acceleration_drift
     return (
         steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
         steady_state_kalman_gains(
@@ -179,7 +179,6 @@ def estimated_motion_std(
 
 
 def _sensor_rotation_std_by_encoders(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the standard deviation [rad] of the rotation of S by the encoders' rounding."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
@@ -235,11 +234,6 @@ def _angle_low_pass_sections(
             )
         filters[2:] = butterworth_sections(config.encoder_bandwidth_hz, 1 / period)
     return filters
-
-
-def _group_delay_samples(sections: Array) -> float:
-    b0, b1, b2, a1, a2 = sections.T
-    return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
 
 
 @njit(cache=True)
@@ -315,9 +309,9 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    flagged = (
-        float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
-    )
+    flagged = memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
+    if reading[READ_SATURATED] != 0.0:
+        flagged = float(rows)
     memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
     sample[regressor.SATURATION_FLAG_INDEX] = 1.0 if flagged > 0.0 else 0.0
 
