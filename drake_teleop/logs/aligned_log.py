@@ -66,14 +66,12 @@ def fit_motion_to_known_load(
         return None
     fit = partial(fit_motion_to_load, coefficients=coefficients)
     with suppress(DrakeTeleopError):  # too short
-        found, source = _fit_with_fallback_delay_if_undetermined(
-            log, delay, fit, fallback_delay_s, "load"
-        )
+        found, source = _fit_with_fallback_delay(log, delay, fit, fallback_delay_s, "load")
         return (found, source) if found.is_imu_consistent_with_poses else None
     return None
 
 
-def _fit_with_fallback_delay_if_undetermined(
+def _fit_with_fallback_delay(
     log: Log,
     delay: str | float,
     fit: Callable[..., _PoseMotionT],
@@ -236,9 +234,7 @@ def fit_load_to_posed_log(
     if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)
-    found, source = _fit_with_fallback_delay_if_undetermined(
-        log, delay, estimate, 0.0, "undetermined"
-    )
+    found, source = _fit_with_fallback_delay(log, delay, estimate, 0.0, "undetermined")
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted

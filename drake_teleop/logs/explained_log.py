@@ -83,16 +83,12 @@ def _corrected_fields_and_texts_by_cause(
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         _correct_fields_by_cause(fields, cause.name, cause.values, column)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
-    texts, corrected = [], []
+    texts, corrected, note = [], [], note_that_table_needs_description(log.source)
     for cause, names in zip(causes, touched, strict=True):
-        corrected.append(
-            {name: parse_yaml(_yaml_value(name, fields[name]), name) for name in names}
-        )
+        corrected.append({k: parse_yaml(_yaml_value(k, fields[k]), k) for k in names})
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(
-            f"set {lines}{note_that_table_needs_description(log.source)}" if lines else otherwise
-        )
+        texts.append(f"set {lines}{note}" if lines else otherwise)
     return fields, texts, corrected
 
 
@@ -183,10 +179,8 @@ def _correct_wrench_sign_and_frame(fields: DescriptionFields, Q: Array) -> None:
 def _correct_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
     force = SI_VALUE_OF_UNIT[fields["wrench.force.unit"]]
     torque = SI_VALUE_OF_UNIT[fields["wrench.torque.unit"]]
-    ratios = [
-        (torque / SI_VALUE_OF_UNIT[unit], "wrench.torque.unit", unit) for unit in _TORQUE_UNITS
-    ]
-    ratios += [(SI_VALUE_OF_UNIT[unit] / force, "wrench.force.unit", unit) for unit in _FORCE_UNITS]
+    ratios = [(torque / SI_VALUE_OF_UNIT[u], "wrench.torque.unit", u) for u in _TORQUE_UNITS]
+    ratios += [(SI_VALUE_OF_UNIT[u] / force, "wrench.force.unit", u) for u in _FORCE_UNITS]
     for ratio, name, unit in ratios:
         if unit != fields[name] and abs(torque_factor / ratio - 1.0) < _UNIT_RATIO_TOLERANCE:
             fields[name] = unit
@@ -203,7 +197,7 @@ _BLOCK_MEAN_BANDWIDTH_HZ = 25.0
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
     """Search for causes why a rigid load does not explain the wrench; None for a short log.
 
-    `delay_s` is that of the motion [s], which is from splines of `found` or, for None, from the log.
+    `delay_s` [s] is that of the motion, which is from splines of `found` or, for None, the log.
     """
 
     def instants_at_delay(more: float) -> BlockMeans:
@@ -238,9 +232,8 @@ def _block_means_of_splines(log: Log, found: PoseEstimate, late: float) -> Block
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    return block_means_of_record(
-        log.t, log.wrench, motion_at, gravity, lost, _noise_of_spline_acceleration(splines)
-    )
+    noise = _noise_of_spline_acceleration(splines)
+    return block_means_of_record(log.t, log.wrench, motion_at, gravity, lost, noise)
 
 
 def _noise_of_spline_acceleration(splines: PoseSplines) -> float:

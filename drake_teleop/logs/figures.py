@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,6 @@ def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
 
 def summarize_load(load: Identification) -> dict[str, Any]:
     deviations = load.standard_deviations
-    ends = confidence_intervals(load)
     return {
         "mass": load.mass,
         "mass_std": deviations[6],
@@ -66,10 +66,10 @@ def summarize_load(load: Identification) -> dict[str, Any]:
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
-        "phi_interval": np.stack(ends, axis=1)[6:],
+        "phi_interval": np.stack(confidence_intervals(load), axis=1)[6:],
         "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
-        "identifiable": _names_by_identifiability(load, True),
-        "not_identifiable": _names_by_identifiability(load, False),
+        "identifiable": list(compress(PARAMETER_NAMES, load.identifiable)),
+        "not_identifiable": list(compress(PARAMETER_NAMES, ~load.identifiable)),
         "physically_consistent": load.physically_consistent,
     }
 
@@ -85,10 +85,8 @@ def summarize_object_alone(alone: Identification) -> dict[str, Any]:
 def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT_STDS_BELOW_ZERO * deviation:
-        return [
-            f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
-            f" ± {deviation:.2g} kg"
-        ]
+        excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
+        return [f"no object: the total mass exceeds the gripper's by {excess}"]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
@@ -98,11 +96,6 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
             " identified in the same sensor frame, with the same gripper"
         ]
     return ["the object's parameters are physically consistent only within their uncertainty"]
-
-
-def _names_by_identifiability(result: Identification, identifiable: bool) -> list[str]:
-    pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
-    return [name for name, flag in pairs if bool(flag) == identifiable]
 
 
 def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:

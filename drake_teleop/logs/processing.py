@@ -74,7 +74,6 @@ _MIN_TARE_SAMPLES = 10
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
 _MIN_CORRECTED_DELAY_S = 1e-4
 _MAX_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
-_SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
 @dataclass(frozen=True, repr=False)
@@ -222,9 +221,8 @@ def identify_log(
     if errors:
         findings = errors
     elif not causes and not raw.estimated:
-        findings = (
-            findings_if_load_is_suspicious(log, result, predicted, known_delay, check) or other
-        )
+        findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
+        findings = findings or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
@@ -387,9 +385,7 @@ def eliminate_log(
     found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
     free_motion = None if free is None else _read_and_eliminate_log(free, *common)
     if free_motion is not None and (found.log.static or free_motion.log.static):
-        raise _no_contact_in_static_log_error(
-            (free_motion if free_motion.log.static else found).log
-        )
+        raise _no_contact_in_static_log_error(free_motion if free_motion.log.static else found)
     if found.log.static:
         return found
     samples = samples_for_detector(found.log, found.contact, cutoff_hz)
@@ -410,9 +406,9 @@ def eliminate_log(
     return replace(found, detection=detection)
 
 
-def _no_contact_in_static_log_error(log: Log) -> DrakeTeleopError:
+def _no_contact_in_static_log_error(found: EliminatedLog) -> DrakeTeleopError:
     what = "contains only poses at rest (`static`), in which no contact can be detected"
-    return DrakeTeleopError(what, where=log.source, remedy="give a log of a motion")
+    return DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
 
 
 def _read_and_eliminate_log(
@@ -462,9 +458,8 @@ def _read_and_eliminate_log(
     if weights != inertias and removed:
         raise weight_scale_without_effect_error(log.source)
     if weights != inertias and log.gravity is None:
-        raise unknown_gravity_error(
-            f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
-        )
+        where = f"{log.source}: gravity in the sensor frame"
+        raise unknown_gravity_error(where, "add an orientation, or use sigma alone")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
@@ -495,9 +490,8 @@ def _read_and_eliminate_log(
             scaled=causal_wrench.scaled[known],
         )
     contact = low_pass_wrench(contact_wrench(log.wrench, offsets, *log.motion, phi))
-    findings = _findings_if_contact_is_large(
-        Path(path), log.wrench - offsets, contact, identification
-    )
+    measured = log.wrench - offsets
+    findings = _findings_if_contact_is_large(Path(path), measured, contact, identification)
     notes = (*log.notes, *notes_on_undetermined_load(identification))
     # A wrong description would explain the clock, too.
     shown = replace(shown, notes=notes if findings else (*notes, *aligned.clock_notes))
@@ -508,7 +502,7 @@ def _read_and_eliminate_log(
         tare_fraction=fraction,
         delay_s=delay_s,
         delay_source=source,
-        measured=low_pass_wrench(log.wrench - offsets),
+        measured=low_pass_wrench(measured),
         non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
         contact=contact,
         scaled=low_pass_wrench(scaled),
@@ -605,14 +599,14 @@ def _checked_scales(
         what = "sigma_object requires a gripper"
         remedy = "give the gripper's identification.json as well, or use sigma"
         raise DrakeTeleopError(what, where="sigma_object", remedy=remedy)
-    if eta is None:
-        kept = sigma if sigma_object is None else sigma_object
-        return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
-    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
-        what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
-        raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
-    sigma_gripper, kept, gamma = scales_from_eta(eta)
-    return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
+    kept = sigma if sigma_object is None else sigma_object
+    if eta is not None:
+        others = [sigma_object, *separate.values()]
+        if sigma != 0 or gamma != 1 or any(other is not None for other in others):
+            what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
+            raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
+        sigma, kept, gamma = scales_from_eta(eta)
+    return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
 
 
 @dataclass(frozen=True)
@@ -648,7 +642,7 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise _no_contact_in_static_log_error(found.log)
+        raise _no_contact_in_static_log_error(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
         remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"

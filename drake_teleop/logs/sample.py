@@ -120,9 +120,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
             text = to_yaml_text(_description_of_record(name), head=head, comments=_FIELD_COMMENTS)
             write_text(out / f"{name}.yaml", text)
-            motion, wrench_file = _motion_of_record(row), out / f"{name}_wrench.csv"
-            _write_wrench(wrench_file, motion, touches, TRUE_OFFSETS[row], random)
-            _write_pose(out / f"{name}_pose.csv", motion, random)
+            _write_record(out, name, row, touches, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         truth = {
             "mass": TRUE_MASS_KG,
@@ -228,32 +226,28 @@ def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
     return t + _MAX_CLOCK_JITTER_S * random.uniform(0, 1, len(t))
 
 
-def _write_wrench(
-    path: Path,
-    motion_at: Callable[[Array], _Motion],
+def _write_record(
+    out: Path,
+    name: str,
+    row: int,
     touches: tuple[FingertipPush, ...],
-    offsets: Array,
     random: np.random.Generator,
 ) -> None:
-    t = _jittered_clock(WRENCH_HZ, random)
+    from scipy.spatial.transform import Rotation
+
+    t, motion_at = _jittered_clock(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
-    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + offsets
+    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_OFFSETS[row]
     for touch in touches:
         wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
-    _write_columns(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading])
-
-
-def _write_pose(
-    path: Path, motion_at: Callable[[Array], _Motion], random: np.random.Generator
-) -> None:
-    from scipy.spatial.transform import Rotation
-
+    _write_columns(out / f"{name}_wrench.csv", "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading])
     t = _jittered_clock(POSE_HZ, random)
     _, _, _, R_WS, p_WS = motion_at(t - POSE_DELAY_S)
     turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
-    _write_columns(path, "uptime x y z rx ry rz", [t + CLOCK_START_S, 1e3 * p_WS, turn])
+    columns = [t + CLOCK_START_S, 1e3 * p_WS, turn]
+    _write_columns(out / f"{name}_pose.csv", "uptime x y z rx ry rz", columns)
 
 
 def _write_columns(path: Path, names: str, columns: list[Array]) -> None:

@@ -122,10 +122,8 @@ def dataset_command(
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = to_json_data(_dataset_summary(dataset, copied, shared, rows))
-        report = render_page(
-            "drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary
-        )
-        write_text(out / "report.html", report)
+        page = render_page("drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary)
+        write_text(out / "report.html", page)
         shutil.rmtree(work)
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -293,9 +291,8 @@ def _judge_all_episodes(
     count = len(task.dataset.episodes)
     left = [k for k in range(count) if not (work / f"{k}.json").is_file()]
     progress(1.0 - len(left) / count)
-    done = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-        delayed(partial(_judge_episode, task, work))(k) for k in left
-    )
+    judge = delayed(partial(_judge_episode, task, work))
+    done = Parallel(n_jobs=jobs, return_as="generator_unordered")(map(judge, left))
     for number, _ in enumerate(done, start=count - len(left) + 1):
         progress(number / count, f"{number} of {count}")
     return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
@@ -318,15 +315,13 @@ def _judge_episode(task: SharedJudgingData, work: Path, number: int) -> None:
 def _verdict_on_episode(
     task: SharedJudgingData, episode: Episode
 ) -> tuple[dict[str, Any], ContactColumns]:
-    shared = task.shared_load
+    shared, usual = task.shared_load, task.shared_load.usual_half_widths
+    usual_lag = shared.lag_frames
     log, at = _read_log_and_row_times(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
-    found, residual = find_simplest_hypothesis_and_residual(
-        signals, shared.phi, shared.lag_frames, shared.usual_half_widths
-    )
-    faults = saturation_faults(log.wrench) + name_faults(
-        found, shared.lag_frames, shared.phi, 1.0 / log.dt
-    )
+    found, residual = find_simplest_hypothesis_and_residual(signals, shared.phi, usual_lag, usual)
+    faults = saturation_faults(log.wrench)
+    faults += name_faults(found, usual_lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = find_offset_step(residual, found.spread)
     if step is not None:
@@ -335,7 +330,6 @@ def _verdict_on_episode(
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
-    usual = shared.usual_half_widths
     spread = ln_half_width_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0]
     spread -= np.log(usual)
     spread -= np.log(found.force_torque_gains).repeat(3)

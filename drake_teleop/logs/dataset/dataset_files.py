@@ -229,9 +229,8 @@ def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
     names = [f"{CONTACT_WRENCH_COLUMN}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT_COLUMN]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
-    texts = {head: names} | {
-        k: [f"{x:.6g}" for x in row] for k, row in zip(rows, cells, strict=True)
-    }
+    numbers = [[f"{x:.6g}" for x in row] for row in cells]
+    texts = {head: names} | dict(zip(rows, numbers, strict=True))
     for k, values in texts.items():
         text = lines[k].rstrip(b"\r\n")
         added = separator + separator.join(value.encode() for value in values)

@@ -46,10 +46,9 @@ def name_faults(
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(EpisodeFault("weight removed", text, None))
-    found += _rotation_faults(
-        x.force_axes, "the wrench" if np.allclose(x.force_axes, x.torque_axes) else "the force"
-    )
-    if not np.allclose(x.force_axes, x.torque_axes):
+    same = np.allclose(x.force_axes, x.torque_axes)
+    found += _rotation_faults(x.force_axes, "the wrench" if same else "the force")
+    if not same:
         found += _rotation_faults(x.torque_axes, "the torque")
     found += _unit_faults(x.force_torque_gains)
     late = x.lag - usual_lag

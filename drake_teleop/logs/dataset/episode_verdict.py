@@ -134,9 +134,8 @@ class HypothesisSearch:
         return wrench - x.reading_of_load(load_wrench)
 
     def with_spread_and_cost(self, x: WrenchHypothesis) -> WrenchHypothesis:
-        spread, offsets = ln_half_width_and_centre_of_calm_half(
-            self.unexplained_reading(x), self.floor
-        )
+        residual = self.unexplained_reading(x)
+        spread, offsets = ln_half_width_and_centre_of_calm_half(residual, self.floor)
         cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
@@ -145,24 +144,20 @@ class HypothesisSearch:
         return _rows_of_smallest_residual(residual)
 
     def hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
-        both, one = self.predict(kind, lag), np.ones(2)
+        both, one, eye = self.predict(kind, lag), np.ones(2), np.eye(3)
         force, torque = (self.best_permutation(*both, c) for c in _FORCE_AND_TORQUE_CHANNELS)
-        plain = WrenchHypothesis(kind, lag, np.eye(3), np.eye(3), one)
+        plain = WrenchHypothesis(kind, lag, eye, eye, one)
         yield self.with_spread_and_cost(plain)
-        yield self.with_spread_and_cost(
-            replace(plain, force_axes=-np.eye(3), torque_axes=-np.eye(3))
-        )
+        yield self.with_spread_and_cost(replace(plain, force_axes=-eye, torque_axes=-eye))
         for M, T in ((force, force), (torque, torque), (force, torque)):
             yield self.with_spread_and_cost(replace(plain, force_axes=M, torque_axes=T))
         for det in (1.0, -1.0):
-            start = self.refit_to_best_rows(plain, det=det, scale=True)
+            start = self.refit_best_rows(plain, det=det, scale=True)
             yield start
-            yield self.refit_to_best_rows(
-                replace(start, force_torque_gains=one), det=det, scale=False
-            )
+            yield self.refit_best_rows(replace(start, force_torque_gains=one), det=det, scale=False)
             nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force_axes).sum()))
-            for M in (np.eye(3), -np.eye(3), nearest):
-                yield self.refit_to_best_rows(
+            for M in (eye, -eye, nearest):
+                yield self.refit_best_rows(
                     replace(start, force_axes=M, torque_axes=M), det=0.0, scale=True
                 )
 
@@ -186,9 +181,7 @@ class HypothesisSearch:
         for part in range(_NUM_START_FIT_PARTS):
             yield at == part
 
-    def refit_to_best_rows(
-        self, x: WrenchHypothesis, *, det: float, scale: bool
-    ) -> WrenchHypothesis:
+    def refit_best_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
         """Return the hypothesis with rotation and factors fitted to the frames that fit best.
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
@@ -314,9 +307,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL)
-    deviation = np.minimum(
-        np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise
-    )
+    by_spread = np.exp(spread) / HALF_WIDTH_OF_NORMAL
+    deviation = np.minimum(by_spread, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -99,9 +99,8 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         for k, (x, residual) in zip(chosen, usual, strict=True)
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
-    floor = fit_noise_floor(
-        *pooled, limit_covariance_to_scales(phi, load.covariance, tared=True), fade=0.0
-    )
+    covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
+    floor = fit_noise_floor(*pooled, covariance, fade=0.0)
     threshold = max(
         NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
         _THRESHOLD_OVER_LARGEST_FREE_LEVEL * float(floor.free_maxima[0]),

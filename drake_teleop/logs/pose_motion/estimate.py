@@ -161,9 +161,8 @@ def estimate_from_poses(
     are excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
-        found, _, window = _find_splines_and_delay(
-            *(t, wrench, poses, gravity_W, delay, lost, imu), fewest=_MIN_SHARED_INSTANTS
-        )
+        inputs = t, wrench, poses, gravity_W, delay, lost, imu
+        found, _, window = _find_splines_and_delay(*inputs, fewest=_MIN_SHARED_INSTANTS)
         splines, late, grid = found.splines, found.delay_s, window.grid
         window = replace(window, taper=_taper_without_gaps(grid, splines.poses, lost, late))
         spectra = window.spectra_at_delay(splines, late)
@@ -348,11 +347,10 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     turned = Rotation.from_matrix(start.R_PS.T @ free.parameters.R_PS).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    limits = np.radians([MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG])
-    shifted = _is_frame_wrong(
-        moved, covariance[:3, :3], MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
-    )
-    tilted = _is_frame_wrong(turned, covariance[3:, 3:], *limits)
+    limits = MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
+    shifted = _is_frame_wrong(moved, covariance[:3, :3], *limits)
+    limits = MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG
+    tilted = _is_frame_wrong(turned, covariance[3:, 3:], *np.radians(limits))
     return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,

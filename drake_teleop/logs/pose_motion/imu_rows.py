@@ -81,9 +81,8 @@ def _fit_sensor_model(
     lost, values = np.ones(len(even), bool), np.zeros((len(even), 3))
     lost[place], values[place] = False, y
     start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
-    taper = exclude_from_taper(
-        end_taper(even, start + _MAX_IMU_SHIFT_S, stop - _MAX_IMU_SHIFT_S), lost, dt
-    )
+    ends = start + _MAX_IMU_SHIFT_S, stop - _MAX_IMU_SHIFT_S
+    taper = exclude_from_taper(end_taper(even, *ends), lost, dt)
     if (taper > 0.5).sum() * dt < _MIN_COMPARED_DURATION_S:
         return None
     frequency = np.fft.rfftfreq(len(even), dt)

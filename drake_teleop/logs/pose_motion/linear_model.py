@@ -315,9 +315,8 @@ def guess_knot_spacing_and_delay(
         if known:
             found.append((spectra.fit_coefficients().cost, h, delay))
             continue
-        late, cost = find_best_delay_and_cost(
-            spectra, spectra.delay_search_half_range_s, _FINE_DELAY_STEP_S
-        )
+        reach = spectra.delay_search_half_range_s
+        late, cost = find_best_delay_and_cost(spectra, reach, _FINE_DELAY_STEP_S)
         found.append((cost, h, late))
     return min(found)[1:]
 
@@ -355,10 +354,9 @@ def choose_knot_spacing_and_delay(
 
 
 def spline_cache_of_averaged_poses(poses: Poses) -> SplineCache:
-    """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
-    return SplineCache(
-        poses.average_consecutive(max(1, int(poses.rate / _MIN_AVERAGED_POSE_RATE_HZ + 1e-6)))
-    )
+    """Return splines of poses that are averaged to 125 Hz or more."""
+    count = max(1, int(poses.rate / _MIN_AVERAGED_POSE_RATE_HZ + 1e-6))
+    return SplineCache(poses.average_consecutive(count))
 
 
 def _knot_spacings_for_pose_rate(cache: SplineCache) -> list[float]:
@@ -395,7 +393,7 @@ def estimate_clock_rate_error(
 
 
 def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
+    """Return the poses with stamps on the wrench's clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 

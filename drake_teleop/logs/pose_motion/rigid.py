@@ -257,19 +257,16 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and e (6, 38), the residual's coefficients of 38 signals."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
+    step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
         lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
-        ahead, behind = (
-            _motion_map_with_delay(
-                replace(state, R_PS=_rotate_about_own_axes(state.R_PS, x * unit))
-            )
-            for x in (_ROTATION_DIFFERENCE_STEP_RAD, -_ROTATION_DIFFERENCE_STEP_RAD)
-        )
+        turned = (_rotate_about_own_axes(state.R_PS, x * unit) for x in (step, -step))
+        ahead, behind = (_motion_map_with_delay(replace(state, R_PS=R)) for R in turned)
         B[:, 17 + i] = -L @ lever
-        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_DIFFERENCE_STEP_RAD)
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * step)
     return B, L @ M
 
 

@@ -128,9 +128,8 @@ def poses_and_twists_into(joints, state, out):
         elif kind == _FREE_JOINT:
             lever = rotate_vector(turn, vector_at(state, q + 4))
             place = plus(place, lever)
-            speed = plus(
-                plus(speed, cross(spin, lever)), rotate_vector(turn, vector_at(state, v + 3))
-            )
+            speed = plus(speed, cross(spin, lever))
+            speed = plus(speed, rotate_vector(turn, vector_at(state, v + 3)))
             spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
             turn = quaternion_product(turn, normalized_quaternion(quaternion_at(state, q)))
         # From M to B.
@@ -170,10 +169,8 @@ def interpolate_joint_state(joints, h, u, start, end, out):
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):
             out[q], out[v] = _hermite_value_and_rate(h, u, start[q], start[v], end[q], end[v])
         elif kind == _FREE_JOINT:
-            for i in range(3):
-                out[q + 4 + i], out[v + 3 + i] = _hermite_value_and_rate(
-                    h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
-                )
+            for i, j in ((q + 4, v + 3), (q + 5, v + 4), (q + 6, v + 5)):
+                out[i], out[j] = _hermite_value_and_rate(h, u, start[i], start[j], end[i], end[j])
             a, b = quaternion_at(start, q), quaternion_at(end, q)
             a_dot = _quaternion_rate(vector_at(start, v), a)
             b_dot = _quaternion_rate(vector_at(end, v), b)
@@ -182,8 +179,7 @@ def interpolate_joint_state(joints, h, u, start, end, out):
             y, y_dot = _hermite_value_and_rate(h, u, a[2], a_dot[2], b[2], b_dot[2])
             z, z_dot = _hermite_value_and_rate(h, u, a[3], a_dot[3], b[3], b_dot[3])
             out[q], out[q + 1], out[q + 2], out[q + 3] = w, x, y, z
-            spin = quaternion_product(
-                (w_dot, x_dot, y_dot, z_dot), conjugate_quaternion((w, x, y, z))
-            )
+            inverse = conjugate_quaternion((w, x, y, z))
+            spin = quaternion_product((w_dot, x_dot, y_dot, z_dot), inverse)
             scale = 2.0 / (w * w + x * x + y * y + z * z)
             out[v], out[v + 1], out[v + 2] = scale * spin[1], scale * spin[2], scale * spin[3]

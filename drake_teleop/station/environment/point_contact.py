@@ -114,9 +114,8 @@ def FindContactPairs(
 
 
 def _pair_row(first: list[Any], X_Other: RigidTransform, half: Array, last: list[Any]) -> Array:
-    return np.concatenate(
-        [*first, X_Other.rotation().matrix().ravel(), X_Other.translation(), half, *last]
-    )
+    pose = X_Other.rotation().matrix().ravel(), X_Other.translation()
+    return np.concatenate([*first, *pose, half, *last])
 
 
 def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:

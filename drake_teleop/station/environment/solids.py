@@ -134,9 +134,8 @@ class Block(Surface):
     def AddTo(self, plant: MultibodyPlant) -> None:
         if min(self.table) > 0.0:
             below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS_M / 2]
-            AddFixedBox(
-                plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS_M], self
-            )
+            size = [*self.table, _TABLE_THICKNESS_M]
+            AddFixedBox(plant, "table", RigidTransform(below), size, self)
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
         body = plant.AddRigidBody(_BLOCK_BODY_NAME, NewInstance(plant, _BLOCK_BODY_NAME), inertia)
         x, y, foot = self.position

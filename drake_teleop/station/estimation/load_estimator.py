@@ -105,9 +105,8 @@ class LoadEstimator(LeafSystem):
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
-        self.DeclareVectorOutputPort(
-            "load_state", 1, weak_callback(self._calc_load_state), {self.xd_ticket()}
-        )
+        calculate = weak_callback(self._calc_load_state)
+        self.DeclareVectorOutputPort("load_state", 1, calculate, {self.xd_ticket()})
         if config.watch:
             self.DeclareDiscreteState(
                 np.zeros(MEMORY_SIZE)

@@ -177,10 +177,8 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     )  # fmt: skip
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
-        gravity = np.empty(3)
-        acceleration_from_specific_force_into(
-            arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity
-        )
+        q, gravity = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.empty(3)
+        acceleration_from_specific_force_into(arm, q, np.zeros(3), gravity)
         add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
@@ -192,9 +190,8 @@ def find_sample_fault(sample, estimate, time, valid_range):
     """
     if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and are_finite_and_in_range(
-        sample[SAMPLE_MOTION]
-    )
+    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG
+    reading = reading and are_finite_and_in_range(sample[SAMPLE_MOTION])
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:

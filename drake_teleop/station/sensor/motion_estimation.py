@@ -290,19 +290,15 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
-    for i in range(12):
-        line[i] = reading[i]
-    for i in range(n):
-        line[12 + i] = angles[i]
+    copy_into(line, 0, reading, 0, 12)
+    copy_into(line, 12, angles, 0, n)
     if memory[0] == 0.0:
         for k in range(1, rows):
             copy_into(line, k * width, line, 0, width)
     wrench = int(constants.wait_samples[0]) * width
     acceleration = int(constants.wait_samples[1]) * width
-    waited, read = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
-    for i in range(6):
-        waited[i] = line[wrench + i]
-        read[i] = line[acceleration + 6 + i]
+    copy_into(sample, regressor.SAMPLE_WRENCH.start, line, wrench, 6)
+    copy_into(sample, regressor.SAMPLE_MOTION.start, line, acceleration + 6, 6)
     wait = int(constants.wait_samples[2])
     older = constants.wait_samples[2] - wait
     encoders = wait * width + 12
@@ -335,8 +331,7 @@ def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
     R_SA, R = matrix_as_tuple(constants.R_SA), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
-    for i in range(3):
-        omega[i] = motion[3 + i]
+    copy_into(omega, 0, motion, 3, 3)
 
     angular = memory[_ANGULAR_FUSION_FILTER_START:_LINEAR_FUSION_FILTER_START]
     linear = memory[_LINEAR_FUSION_FILTER_START:_KINEMATICS_SCRATCH_START]

@@ -68,10 +68,7 @@ from drake_teleop.station.sensor.sensor_chain import (
 )
 
 _NAME_IN_ERRORS = "AddWristSensor"
-#: Default sampling period for continuous plants [s].
-_DEFAULT_SAMPLING_PERIOD_S = 1e-3
-#: Tolerance of whole multiples of the plant's time step, in steps.
-_STEP_RATIO_TOLERANCE = 1e-6
+_DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
 _SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
@@ -107,9 +104,8 @@ def AddWristSensor(
             tool without mass, or an unsuitable period.
     """
     _check_plant(builder, plant)
-    sensor = PlantWristSensor(
-        plant, joint_or_frame, config or WristSensorConfig(ideal=True), period, model_instance
-    )
+    config = config or WristSensorConfig(ideal=True)
+    sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
     for port, source in {
@@ -121,9 +117,8 @@ def AddWristSensor(
     }.items():
         builder.Connect(source, sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
-        noise = RandomSource(
-            RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, SAMPLES_PER_NOISE_BLOCK * sensor.period
-        )
+        block_s = SAMPLES_PER_NOISE_BLOCK * sensor.period
+        noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem(f"{name}_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     return sensor
@@ -162,8 +157,8 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         plant: MultibodyPlant,
         joint_or_frame: Joint | Frame,
         config: WristSensorConfig,
-        period: float | None = None,
-        model_instance: ModelInstanceIndex | None = None,
+        period: float | None,
+        model_instance: ModelInstanceIndex | None,
     ) -> None:
         super().__init__()
         S, joint = _sensor_frame_and_weld(plant, joint_or_frame)
@@ -176,9 +171,8 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         which = [] if model_instance is None else [model_instance]
         n = self._n = plant.num_positions(*which)
         constants, chain = initialize_sensor_chain(config, 3 + n, self.period)
-        motion, estimator = initialize_motion_estimator(
-            MotionEstimationConfig(), config, 3 + n, self.period
-        )
+        sources = MotionEstimationConfig()
+        motion, estimator = initialize_motion_estimator(sources, config, 3 + n, self.period)
         sample = np.zeros(sample_size(n) + 1)
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
         held = np.full(_BODY_ROTATION_AND_RATE_SIZE + n, np.nan)

@@ -387,10 +387,9 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants.encoder_quantum
-    for i in range(_DELAY_LINE_ROW_SIZE, width):
-        angle = angles[i - _DELAY_LINE_ROW_SIZE]
-        row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
+    quantum, turned = constants.encoder_quantum, row[_DELAY_LINE_ROW_SIZE:]
+    for i in range(angles.shape[0]):
+        turned[i] = quantum * np.rint(angles[i] / quantum) if quantum > 0.0 else angles[i]
 
     if count == 0:
         for k in range(1, rows):
@@ -399,16 +398,13 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     late = constants.latency_samples
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
-    encoders = _DELAY_LINE_START + int(late[2]) * width
-    wrench, moved, turned = reading[READ_WRENCH], reading[READ_ACCELERATION], reading[READ_ANGLES]
-    for i in range(6):
-        wrench[i] = memory[force + i]
-        moved[i] = memory[acceleration + 6 + i]
+    copy_into(reading, READ_WRENCH.start, memory, force, 6)
+    copy_into(reading, READ_ACCELERATION.start, memory, acceleration + 6, 6)
     reading[READ_SATURATED] = max(
         memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
     )
-    for i in range(_DELAY_LINE_ROW_SIZE, width):
-        turned[i - _DELAY_LINE_ROW_SIZE] = memory[encoders + i]
+    encoders = _DELAY_LINE_START + int(late[2]) * width + _DELAY_LINE_ROW_SIZE
+    copy_into(reading, READ_ANGLES.start, memory, encoders, angles.shape[0])
 
 
 @njit(cache=True)
