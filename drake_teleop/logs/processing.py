@@ -380,7 +380,7 @@ def eliminate_log(
         phi_gripper = phi_with_inertia_replaced(alone)[0]
     common = identification, phi_gripper, scales, cutoff_hz, delay, tare
     if untouched_s is not None and not tare:
-        what = "a span without contact determines the offsets, but those of the load are requested"
+        what = "a contact-free span excludes the load's offsets (--offsets load, tare=False)"
         raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
     found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
     free_motion = None if free is None else _read_and_eliminate_log(free, *common)

@@ -227,11 +227,7 @@ def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
 
 
 def _write_record(
-    out: Path,
-    name: str,
-    row: int,
-    touches: tuple[FingertipPush, ...],
-    random: np.random.Generator,
+    out: Path, name: str, row: int, touches: tuple[FingertipPush, ...], random: np.random.Generator
 ) -> None:
     from scipy.spatial.transform import Rotation
 

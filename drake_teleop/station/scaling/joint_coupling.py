@@ -38,7 +38,7 @@ class JointCoupling(LeafSystem):
             raise DrakeTeleopError(
                 f"the leader has {len(home)} joints, but the slave {len(start)} (they must agree)",
                 where="master.leader.leads",
-                remedy="lead by the pose, or give arms of the same kinematics",
+                remedy="set leads: pose, or give arms of the same kinematics",
             )
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
         self._state = self.DeclareVectorInputPort("master_state", 2 * n)
@@ -69,5 +69,7 @@ class JointCoupling(LeafSystem):
         self, context: Context, discrete_state: DiscreteValues
     ) -> None:
         memory = discrete_state.get_mutable_value(0)
-        memory[:-1] = self._commanded_joint_positions(context)
+        joints = self._commanded_joint_positions(context)
+        if np.isfinite(joints).all():  # an opened clutch must hold a finite command
+            memory[:-1] = joints
         memory[-1] = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5
