@@ -28,7 +28,6 @@ from drake_teleop.logs.pose_motion.estimate import (
     estimate_from_poses,
     fit_motion_to_load,
 )
-from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import (
     choose_delay,
@@ -55,44 +54,32 @@ _CHUNK_SAMPLES, _FILTER_NEIGHBOURS = 2**14, 2**8
 _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 
-def _estimate_motion_load_and_delay_source(
-    log: Log, delay: str | float
-) -> tuple[PoseEstimate, str]:
-    """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
-    assert log.posed is not None
-    estimate = partial(estimate_from_poses, gain_std=log.gain_std)
-    return _fit_with_fallback_delay_if_undetermined(
-        log, log.posed, delay, estimate, 0.0, "undetermined"
-    )
-
-
 def fit_motion_to_known_load(
     log: Log, delay: str | float, coefficients: Array, fallback_delay_s: float
 ) -> tuple[PoseMotion, str] | None:
     """Return the motion from poses that fits an identified load best, and the delay's source.
 
     `coefficients` (6, 16) are the load's, Eq. (T73). The delay is `fallback_delay_s` if the record
-    does not determine it. Return None for a short log, and without poses or if the IMU disagrees.
+    does not determine it. Return None for a short log, static or no poses, or a contradicting IMU.
     """
     if log.posed is None or log.static:
         return None
     fit = partial(fit_motion_to_load, coefficients=coefficients)
     with suppress(DrakeTeleopError):  # too short
-        found, source = _fit_with_fallback_delay_if_undetermined(
-            log, log.posed, delay, fit, fallback_delay_s, "load"
-        )
+        found, source = _fit_with_fallback_delay(log, delay, fit, fallback_delay_s, "load")
         return (found, source) if found.is_imu_consistent_with_poses else None
     return None
 
 
-def _fit_with_fallback_delay_if_undetermined(
+def _fit_with_fallback_delay(
     log: Log,
-    posed: PosesOfLog,
     delay: str | float,
     fit: Callable[..., _PoseMotionT],
     fallback_delay_s: float,
     fallback_source: str,
 ) -> tuple[_PoseMotionT, str]:
+    posed = log.posed
+    assert posed is not None
     arrays = log.t, log.wrench, posed.poses, posed.gravity_W
     fit = partial(fit, *arrays, lost=log.bridged, imu=posed.imu)
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
@@ -103,7 +90,10 @@ def _fit_with_fallback_delay_if_undetermined(
 
 
 def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with motion from splines of poses, and (N,) True near ends and gaps."""
+    """Return the log without delay, with motion from splines of the poses, and edge flags (N,).
+
+    A flag is True within two knot distances of an end or gap of the poses.
+    """
     assert log.posed is not None
     moved, splines = remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
@@ -119,7 +109,6 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
 
 
 def _clock_rate_notes(found: PoseMotion) -> list[str]:
-    """Return a note if the clock rate of the poses differs from that of the wrench."""
     if not found.clock_rate_error:
         return []
     side = "faster" if found.clock_rate_error > 0.0 else "slower"
@@ -135,7 +124,7 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: with acceleration instead of specific force if the robot had removed the weight.
+        log: its specific force is the acceleration if the robot had removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
         log_with_differentiated_motion: log with motion by numerical differentiation, if required.
@@ -158,16 +147,17 @@ def read_aligned_log(
     cutoff_hz: float | None,
     delay: str | float,
     differentiate: bool,
-    weight_removed: bool = False,
+    weight_removed: bool,
 ) -> AlignedLog:
     """Read a log and remove the delay between motion and wrench.
 
     The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
     `delay` [s] or "auto" is removed, or `fallback_delay_s` if the record does not determine it.
+    `differentiate` also returns numerically differentiated motion.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated
-    smooth = None
+    candidates = []
     coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
     with one_blas_thread():
         found = fit_motion_to_known_load(log, delay, coefficients, fallback_delay_s)
@@ -180,9 +170,9 @@ def read_aligned_log(
             plain = None if plain is None else replace_specific_force_by_acceleration(plain)
         edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
         notes = tuple(_clock_rate_notes(motion))
-        smooth = AlignedLog(moved, motion.delay_s, source, plain, edge, notes)
+        candidates = [AlignedLog(moved, motion.delay_s, source, plain, edge, notes)]
         if log.posed is None or log.posed.imu is None:
-            return smooth
+            return candidates[0]
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
     log = replace_specific_force_by_acceleration(log) if weight_removed else log
@@ -190,12 +180,16 @@ def read_aligned_log(
     if source == "undetermined":
         delay_s, source = fallback_delay_s, "load"
     log = remove_delay(log, delay_s)
-    other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
-    candidates = [other] if smooth is None else [smooth, other]
-    return min(
-        candidates,
-        key=lambda aligned: _summed_logarithms_of_residual_spread(aligned, phi, cutoff_hz),
-    )
+    edge = is_near_ends(log, log.one_sided_s, cutoff_hz)
+    candidates.append(AlignedLog(log, delay_s, source, log, edge))
+
+    def summed_logarithms_of_residual_spread(aligned: AlignedLog) -> float:
+        log = aligned.log
+        residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
+        residual = low_pass(residual, log.dt, cutoff_hz)[~aligned.edge]
+        return float(np.log(narrowest_half_width_and_centre(residual)[0] + 1e-12).sum())
+
+    return min(candidates, key=summed_logarithms_of_residual_spread)
 
 
 def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:
@@ -208,23 +202,15 @@ def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:
 
 
 def replace_specific_force_by_acceleration(log: Log) -> Log:
-    """Return the log with acceleration in place of specific force, by adding gravity."""
+    """Return the log with specific force + gravity, the acceleration, as `specific_force`."""
     if log.gravity is None:
         raise removed_weight_needs_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 
-def _summed_logarithms_of_residual_spread(
-    aligned: AlignedLog, phi: Array, cutoff_hz: float | None
-) -> float:
-    log = aligned.log
-    left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
-    return float(np.log(narrowest_half_width_and_centre(left[~aligned.edge])[0] + 1e-12).sum())
-
-
 @dataclass(frozen=True)
 class LoadFitOfPosedLog:
-    """Load identified from a log with poses, after removal of the delay `delay_s` [s].
+    """Load identified from a log with poses, after removal of the delay.
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
@@ -233,7 +219,6 @@ class LoadFitOfPosedLog:
 
     log: Log
     fit: BatchResult
-    delay_s: float
     delay_source: str
     motion: PoseEstimate
 
@@ -248,29 +233,25 @@ def fit_load_to_posed_log(
     """
     if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
-    found, source = _estimate_motion_load_and_delay_source(log, delay)
+    estimate = partial(estimate_from_poses, gain_std=log.gain_std)
+    found, source = _fit_with_fallback_delay(log, delay, estimate, 0.0, "undetermined")
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
         if not found.is_imu_consistent_with_poses or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
-    moved, one_sided = use_spline_motion_and_flag_edges(_reduce_log_rate(log, cutoff_hz), found)
-    shown = low_pass_log(moved, cutoff_hz).select_rows(
-        is_far_from_gaps(moved, cutoff_hz) & ~one_sided
-    )
+    moved, edge = use_spline_motion_and_flag_edges(_reduce_log_rate(log, cutoff_hz), found)
+    shown = low_pass_log(moved, cutoff_hz).select_rows(is_far_from_gaps(moved, cutoff_hz) & ~edge)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
     if finding is not None or not found.fit.is_explained_by_gains:
         fit = replace(fit, identification=fit.identification.with_unidentified_load())
     if finding is not None:
-        fit = replace(fit, note="")
-        finding = replace(
-            finding, message=f"{finding.message}{note_that_table_needs_description(log.source)}"
-        )
-    findings = () if finding is None else (finding,)
-    return LoadFitOfPosedLog(shown, fit, found.delay_s, source, found), findings
+        text = f"{finding.message}{note_that_table_needs_description(log.source)}"
+        fit, finding = replace(fit, note=""), replace(finding, message=text)
+    return LoadFitOfPosedLog(shown, fit, source, found), () if finding is None else (finding,)
 
 
 def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
@@ -312,9 +293,8 @@ def _batch_result_of_estimate(
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    return BatchResult(
-        load, noise, rejected, _note_on_disturbances_clock_and_misfit(found, gain_std), equations
-    )
+    note = _note_on_disturbances_clock_and_misfit(found, gain_std)
+    return BatchResult(load, noise, rejected, note, equations)
 
 
 def _physically_consistent_theta(found: PoseEstimate) -> Array:

@@ -105,6 +105,5 @@ def compute_causal_wrench(
         rows = np.maximum(np.arange(len(filtered)) - wait, 0)
         return filtered[rows]
 
-    return CausalContactAndScaledWrench(
-        mode, lag, filter_and_delay(contact), filter_and_delay(scaled)
-    )
+    contact, scaled = filter_and_delay(contact), filter_and_delay(scaled)
+    return CausalContactAndScaledWrench(mode, lag, contact, scaled)

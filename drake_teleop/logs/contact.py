@@ -27,8 +27,6 @@ from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
 MIN_NOISE_FLOOR_SAMPLES = 100
-"""Fewest samples for a noise floor."""
-
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
 _MIN_NOISE_FLOOR = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
@@ -37,13 +35,9 @@ _MAX_QUIET_WRENCH_OVER_NOISE = 4.0
 _CUTOFF_WITHOUT_LOW_PASS_HZ = 30.0  # assumed cut-off without a low-pass
 _MIN_FLOOR_BLOCK_DURATION_S, _MIN_FLOOR_BLOCKS = 0.1, 20
 _QUIET_HALF_ITERATIONS, _NUM_CONTACT_REMOVAL_ROUNDS = 4, 3
-_THRESHOLD_OVER_MAXIMUM, _MIN_STATISTIC_MAXIMUM = (
-    1.6,
-    5.0,
-)  # times 1.25 is about `NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES`
-_MAX_SAMPLES_FOR_NOISE_FLOOR = (
-    30_000  # largest number of samples for a noise floor, in spans of ten blocks
-)
+# The least expected maximum times 1.25 is about `NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES`.
+_FINAL_THRESHOLD_OVER_EXPECTED_MAX, _MIN_EXPECTED_MAX = 1.6, 5.0
+_MAX_SAMPLES_FOR_NOISE_FLOOR = 30_000  # in spans of ten blocks
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
 _MAX_CONTACT_SHARE, _MAX_NOISE_FLOOR_OVER_FIT_RESIDUAL = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
@@ -55,7 +49,7 @@ class Detection:
     """Contact in a log of N samples.
 
     Attributes:
-        noise_floor: that of the free motion.
+        noise_floor: noise of the contact wrench in free motion.
         statistic, threshold: name of the used statistic, and its threshold.
         statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
@@ -175,17 +169,15 @@ def _fit_floor_and_threshold_to_log(
         reached = _expected_maximum_in_free_motion(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
-        reached = max(_MIN_STATISTIC_MAXIMUM, reached)
-        detector = ContactDetector(
-            floor, THRESHOLD_OVER_MAX * reached, statistic=statistic, hold=hold
-        )
+        reached = max(_MIN_EXPECTED_MAX, reached)
+        threshold = THRESHOLD_OVER_MAX * reached
+        detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
-        if (
-            selected & without_contact
-        ).sum() < MIN_NOISE_FLOOR_SAMPLES or attempt == _NUM_CONTACT_REMOVAL_ROUNDS - 1:
+        too_few = (selected & without_contact).sum() < MIN_NOISE_FLOOR_SAMPLES
+        if too_few or attempt == _NUM_CONTACT_REMOVAL_ROUNDS - 1:
             break
         quiet = without_contact
-    return floor, _THRESHOLD_OVER_MAXIMUM * reached, rows.select_rows(quiet)
+    return floor, _FINAL_THRESHOLD_OVER_EXPECTED_MAX * reached, rows.select_rows(quiet)
 
 
 def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
@@ -240,7 +232,7 @@ def _notes_if_mostly_contact(
 
 
 def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
+    """Return a note if the offsets differ by `shift` (6,) from those of free motion, else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_OFFSET_NOTE:
         return ()
@@ -269,7 +261,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the RMS noise (6,) of a contact wrench (N, 6), half free of contact, Eq. (T12)."""
+    """Return the RMS noise (6,) of a wrench (N, 6) that is half free of contact, Eq. (T12)."""
     floor = narrowest_half_width_and_centre(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
@@ -288,22 +280,21 @@ def _find_quiet_samples(contact: Array, floor: Array) -> NDArray[np.bool_]:
 def summarize_contacts(
     t: Array, contact: Array, touched: NDArray[np.bool_]
 ) -> list[dict[str, Any]]:
-    """Return times [s], peaks [N, N m], direction and point (in S) of each contact."""
+    """Return times [s], peaks [N, N m], direction of the push and point (in S) of each contact."""
     rows = []
     for start, stop in find_runs_of_true(touched):
         wrench = contact[start:stop]
         forces = np.linalg.norm(wrench[:, :3], axis=1)
         direction, point, _ = central_axis_of_wrenches(wrench[np.argmax(forces)])
         known = bool(np.isfinite(direction).all())
-        rows.append(
-            {
-                "start_s": float(t[start]),
-                "stop_s": float(t[stop - 1]),
-                "peak_N": float(forces.max()),
-                "peak_Nm": float(np.linalg.norm(wrench[:, 3:], axis=1).max()),
-                # Eq. (13) is the wrench of the sensor on the load.
-                "push": -direction if known else None,
-                "point_m": point if known else None,
-            }
-        )
+        row = {
+            "start_s": float(t[start]),
+            "stop_s": float(t[stop - 1]),
+            "peak_N": float(forces.max()),
+            "peak_Nm": float(np.linalg.norm(wrench[:, 3:], axis=1).max()),
+            # Eq. (13) is the wrench of the sensor on the load.
+            "push": -direction if known else None,
+            "point_m": point if known else None,
+        }
+        rows.append(row)
     return rows

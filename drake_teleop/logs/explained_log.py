@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -81,21 +81,14 @@ def _corrected_fields_and_texts_by_cause(
     touched: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
-        if cause.name == "gain":
-            _correct_scale_of_gain_channel(fields, cause.values, column)
-        elif cause.name in _CORRECTION_OF_CAUSE:
-            _CORRECTION_OF_CAUSE[cause.name](fields, cause.values)
+        _correct_fields_by_cause(fields, cause.name, cause.values, column)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
-    texts, corrected = [], []
+    texts, corrected, note = [], [], note_that_table_needs_description(log.source)
     for cause, names in zip(causes, touched, strict=True):
-        corrected.append(
-            {name: parse_yaml(_yaml_value(name, fields[name]), name) for name in names}
-        )
+        corrected.append({k: parse_yaml(_yaml_value(k, fields[k]), k) for k in names})
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(
-            f"set {lines}{note_that_table_needs_description(log.source)}" if lines else otherwise
-        )
+        texts.append(f"set {lines}{note}" if lines else otherwise)
     return fields, texts, corrected
 
 
@@ -146,8 +139,34 @@ def _yaml_value(name: str, value: Any) -> str:
     return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
 
 
-def _correct_wrench_sign_and_frame(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    Q = np.array(values["matrix"])
+def _correct_fields_by_cause(
+    fields: DescriptionFields, cause: str, values: dict[str, Any], column: list[int] | None
+) -> None:
+    match cause:
+        case "axes":
+            _correct_wrench_sign_and_frame(fields, np.array(values["matrix"]))
+        case "sensor rotation":
+            R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
+            for name in {*_ROTATION_FIELDS, *_POSITION_FIELDS} & set(fields):
+                fields[name] = R @ fields[name]
+        case "gravity direction":
+            true = np.array(values["gravity"])
+            fields["gravity"] = true * np.linalg.norm(fields["gravity"]) / np.linalg.norm(true)
+        case "weight removed" | "payload configured":  # an estimated payload would count as exact
+            fields["wrench.weight"] = "removed"
+        case "torque factor":
+            _correct_unit_or_torque_scale(fields, values["factor"])
+        case "pose frame":
+            for name in set(_POSITION_FIELDS) & set(fields):
+                fields[name] = fields[name] + values["position_in_sensor"]
+        case "gain" if column is not None:
+            c = CHANNEL_NAMES.index(values["channel"])
+            name = "wrench.force.scale" if c < 3 else "wrench.torque.scale"
+            fields[name] = fields[name].copy()
+            fields[name][column[c % 3]] /= values["gain"]
+
+
+def _correct_wrench_sign_and_frame(fields: DescriptionFields, Q: Array) -> None:
     sign = 1 if np.linalg.det(Q) > 0.0 else -1
     base = isinstance(fields["wrench.frame"], str)
     if base and not (sign * np.eye(3) == Q).all():
@@ -157,75 +176,29 @@ def _correct_wrench_sign_and_frame(fields: DescriptionFields, values: dict[str, 
         fields["wrench.frame"] = sign * Q.T @ fields["wrench.frame"]
 
 
-def _rotate_described_frames_and_positions(
-    fields: DescriptionFields, values: dict[str, Any]
-) -> None:
-    R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
-    for name in {*_ROTATION_FIELDS, *_POSITION_FIELDS} & set(fields):
-        fields[name] = R @ fields[name]
-
-
-def _correct_gravity_direction(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    true = np.array(values["gravity"])
-    fields["gravity"] = true * np.linalg.norm(fields["gravity"]) / np.linalg.norm(true)
-
-
-def _mark_weight_as_removed(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    fields["wrench.weight"] = "removed"
-
-
-def _correct_unit_or_torque_scale(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _correct_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
     force = SI_VALUE_OF_UNIT[fields["wrench.force.unit"]]
     torque = SI_VALUE_OF_UNIT[fields["wrench.torque.unit"]]
-    ratios = [
-        (torque / SI_VALUE_OF_UNIT[unit], "wrench.torque.unit", unit) for unit in _TORQUE_UNITS
-    ]
-    ratios += [(SI_VALUE_OF_UNIT[unit] / force, "wrench.force.unit", unit) for unit in _FORCE_UNITS]
+    ratios = [(torque / SI_VALUE_OF_UNIT[u], "wrench.torque.unit", u) for u in _TORQUE_UNITS]
+    ratios += [(SI_VALUE_OF_UNIT[u] / force, "wrench.force.unit", u) for u in _FORCE_UNITS]
     for ratio, name, unit in ratios:
-        if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _UNIT_RATIO_TOLERANCE:
+        if unit != fields[name] and abs(torque_factor / ratio - 1.0) < _UNIT_RATIO_TOLERANCE:
             fields[name] = unit
             return
-    fields["wrench.torque.scale"] = fields["wrench.torque.scale"] / values["factor"]
-
-
-def _correct_scale_of_gain_channel(
-    fields: DescriptionFields, values: dict[str, Any], column: list[int] | None
-) -> None:
-    if column is None:
-        return
-    c = CHANNEL_NAMES.index(values["channel"])
-    name = "wrench.force.scale" if c < 3 else "wrench.torque.scale"
-    fields[name] = fields[name].copy()
-    fields[name][column[c % 3]] /= values["gain"]
-
-
-def _shift_pose_and_imu_positions(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    for name in _POSITION_FIELDS:
-        if name in fields:
-            fields[name] = fields[name] + values["position_in_sensor"]
-
-
-_CORRECTION_OF_CAUSE: dict[str, Callable[[DescriptionFields, dict[str, Any]], None]] = {
-    "axes": _correct_wrench_sign_and_frame,
-    "sensor rotation": _rotate_described_frames_and_positions,
-    "gravity direction": _correct_gravity_direction,
-    "weight removed": _mark_weight_as_removed,
-    "payload configured": _mark_weight_as_removed,  # an estimated payload would count as exact
-    "torque factor": _correct_unit_or_torque_scale,
-    "pose frame": _shift_pose_and_imu_positions,
-}
+    fields["wrench.torque.scale"] = fields["wrench.torque.scale"] / torque_factor
 
 
 _SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
 _MIN_BLOCK_MEANS_TO_EXPLAIN = 100
 _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
-_BLOCK_MEAN_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
+_BLOCK_MEAN_BANDWIDTH_HZ = 25.0
 
 
-def explain_log(
-    log: Log, delay_s: float, found: PoseEstimate | None = None
-) -> MisfitExplanation | None:
-    """Search for causes why a rigid load does not explain the wrench; None for a short log."""
+def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
+    """Search for causes why a rigid load does not explain the wrench; None for a short log.
+
+    `delay_s` [s] is that of the motion, which is from splines of `found` or, for None, the log.
+    """
 
     def instants_at_delay(more: float) -> BlockMeans:
         late = delay_s + more
@@ -239,8 +212,7 @@ def explain_log(
     why = explain_misfit(data, instants_at_delay, log.estimated)
     if log.described is None:
         return why
-    causes = add_description_lines(why.causes, log, by_pose=found is not None)
-    return replace(why, causes=causes)
+    return replace(why, causes=add_description_lines(why.causes, log, by_pose=found is not None))
 
 
 def _block_means_of_splines(log: Log, found: PoseEstimate, late: float) -> BlockMeans:
@@ -260,9 +232,8 @@ def _block_means_of_splines(log: Log, found: PoseEstimate, late: float) -> Block
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    return block_means_of_record(
-        log.t, log.wrench, motion_at, gravity, lost, _noise_of_spline_acceleration(splines)
-    )
+    noise = _noise_of_spline_acceleration(splines)
+    return block_means_of_record(log.t, log.wrench, motion_at, gravity, lost, noise)
 
 
 def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
@@ -270,14 +241,12 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
     share = noise_share_passed_by_splines(f, splines.spacing)
     if splines.imu_rows is not None:
         share = share * splines.imu_rows.pose_noise_shares_left_by_imu(f)[0]
-    power = (
-        2.0 * splines.estimate_pose_noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
-    )
-    return float(np.sqrt(np.trapezoid(power, f)))
+    density = 2.0 * splines.estimate_pose_noise()[0] ** 2 / splines.rate
+    return float(np.sqrt(np.trapezoid(density * share * (2.0 * np.pi * f) ** 4, f)))
 
 
 def explained_load(load: Identification, why: MisfitExplanation) -> Identification:
-    """Return the load fitted with the causes; without causes, `load` with wider intervals."""
+    """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
     load = _load_with_causes_or_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load
@@ -334,7 +303,6 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Caus
 
 
 def unexplained_finding(why: MisfitExplanation) -> Finding:
-    """Return the finding that a misfit has no known cause."""
     ratio = why.state.residual_ratio
     return Finding(
         "misfit",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,6 @@ def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
 
 def summarize_load(load: Identification) -> dict[str, Any]:
     deviations = load.standard_deviations
-    ends = confidence_intervals(load)
     return {
         "mass": load.mass,
         "mass_std": deviations[6],
@@ -67,10 +66,10 @@ def summarize_load(load: Identification) -> dict[str, Any]:
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
-        "phi_interval": np.stack(ends, axis=1)[6:],
+        "phi_interval": np.stack(confidence_intervals(load), axis=1)[6:],
         "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
-        "identifiable": _names_by_identifiability(load, True),
-        "not_identifiable": _names_by_identifiability(load, False),
+        "identifiable": list(compress(PARAMETER_NAMES, load.identifiable)),
+        "not_identifiable": list(compress(PARAMETER_NAMES, ~load.identifiable)),
         "physically_consistent": load.physically_consistent,
     }
 
@@ -86,10 +85,8 @@ def summarize_object_alone(alone: Identification) -> dict[str, Any]:
 def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT_STDS_BELOW_ZERO * deviation:
-        return [
-            f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
-            f" ± {deviation:.2g} kg"
-        ]
+        excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
+        return [f"no object: the total mass exceeds the gripper's by {excess}"]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
@@ -101,27 +98,24 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def _names_by_identifiability(result: Identification, identifiable: bool) -> list[str]:
-    pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
-    return [name for name, flag in pairs if bool(flag) == identifiable]
-
-
 def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:
-    """Return RMS and peak values of the wrenches, without samples near ends and gaps."""
-
-    def rms_over_samples(x: Array) -> Array:
-        return np.sqrt(np.mean(x**2, axis=0))
-
-    def peak_over_samples(x: Array) -> Array:
-        return np.abs(x).max(axis=0)
-
-    inner, weightless = ~found.edge, found.gravity_only
-    weightless = None if weightless is None else weightless[inner]
-    figures = _summarize_force_and_torque("raw", "rms", found.measured[inner], rms_over_samples)
-    figures |= _summarize_force_and_torque("gravity_only", "rms", weightless, rms_over_samples)
-    for suffix, reduce in (("rms", rms_over_samples), ("peak", peak_over_samples)):
-        contact = found.contact[inner]
-        figures |= _summarize_force_and_torque("residual", suffix, contact, reduce)
+    """Return RMS and peak of |force|, |torque| and each channel, away from ends and gaps."""
+    figures: dict[str, Any] = {}
+    for name, suffix, wrench in (
+        ("raw", "rms", found.measured),
+        ("gravity_only", "rms", found.gravity_only),
+        ("residual", "rms", found.contact),
+        ("residual", "peak", found.contact),
+    ):
+        keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
+        figures |= dict.fromkeys(keys)
+        if wrench is None:
+            continue
+        x = wrench[~found.edge]
+        parts = np.linalg.norm(x[:, :3], axis=1), np.linalg.norm(x[:, 3:], axis=1), x
+        peaks = (np.abs(part).max(axis=0) for part in parts)
+        rms = (np.sqrt(np.mean(part**2, axis=0)) for part in parts)
+        figures |= zip(keys, peaks if suffix == "peak" else rms, strict=True)
     return figures
 
 
@@ -169,13 +163,3 @@ def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dic
         return float((np.linalg.norm(wrench[~found.edge, :3], axis=1) > threshold).mean())
 
     return {name: None if w is None else share_above(w) for name, w in wrenches.items()}
-
-
-def _summarize_force_and_torque(
-    name: str, suffix: str, wrench: Array | None, reduce: Callable[[Array], Array]
-) -> dict[str, Any]:
-    keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
-    if wrench is None:
-        return dict.fromkeys(keys)
-    norms = [reduce(np.linalg.norm(part, axis=1)) for part in (wrench[:, :3], wrench[:, 3:])]
-    return dict(zip(keys, [*norms, reduce(wrench)], strict=True))

@@ -178,9 +178,7 @@ def _inspect_described_log(
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
         table = tables[stream.source].rows_with_any_number(stream.columns)
-        figures, more, rows = _inspect_stream_and_find_bad_rows(
-            name, stream, table, description, source
-        )
+        figures, more, rows = _inspect_stream(name, stream, table, description, source)
         summary["streams"][name] = figures
         findings += more
         bad.setdefault(stream.source, []).append(rows)
@@ -206,7 +204,7 @@ def _inspect_described_log(
     return findings
 
 
-def _inspect_stream_and_find_bad_rows(
+def _inspect_stream(
     name: str, stream: Any, table: Table, description: Description, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [

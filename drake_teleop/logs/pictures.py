@@ -102,7 +102,7 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
 
 
 def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
-    """Write the image of two PNG files of equal width, one above the other, to `page`."""
+    """Write two PNG files of equal width, one above the other, to `page`."""
     from matplotlib.image import imread, imsave
 
     with replace_file_on_success(page) as unfinished:

@@ -74,7 +74,6 @@ _MIN_TARE_SAMPLES = 10
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
 _MIN_CORRECTED_DELAY_S = 1e-4
 _MAX_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
-_SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,13 +117,13 @@ class EliminatedLog:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
         offsets: (6,) sensor offsets of this record [N, N m].
-        tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
+        tare_fraction: share of samples that agree on `offsets`; 1 for given offsets or span.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
         measured: wrench without offsets.
         non_contact: load's wrench V phi.
         contact: contact wrench F_c, Eq. (13).
         scaled: scaled wrench gamma F_c + sigma V phi.
-        gravity_only: wrench without offsets and weight; None without orientation.
+        gravity_only: wrench without weight and its own offsets; None without orientation.
         noise_floor: (6,) noise of `contact` [N, N m].
         causal: wrenches as in a control loop, if requested.
         edge: (N,) True for samples near ends and gaps, excluded from all figures.
@@ -185,14 +184,13 @@ def identify_log(
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     raw = log
+    motion = None if posed is None else posed.motion
     if posed is not None:
-        log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.delay_source
+        log, fit, delay_s, source = posed.log, posed.fit, posed.motion.delay_s, posed.delay_source
     else:
         log, fit, delay_s, source = _fit_load_to_motion(raw, method, cutoff_hz, delay)
-    motion = None if posed is None else posed.motion
-    why = None
-    if _is_explanation_possible(raw, posed is not None):
-        why = explain_log(raw, delay_s, motion)
+    possible = _is_explanation_possible(raw, posed is not None)
+    why = explain_log(raw, delay_s, motion) if possible else None
     names = {x.name for x in why.causes} if why is not None else set()
     if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
@@ -223,9 +221,8 @@ def identify_log(
     if errors:
         findings = errors
     elif not causes and not raw.estimated:
-        findings = (
-            findings_if_load_is_suspicious(log, result, predicted, known_delay, check) or other
-        )
+        findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
+        findings = findings or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
@@ -381,24 +378,14 @@ def eliminate_log(
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
         load_of_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = phi_with_inertia_replaced(alone)[0]
-    eliminated = partial(
-        _read_and_eliminate_log,
-        identification=identification,
-        phi_gripper=phi_gripper,
-        scales=scales,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-        tare=tare,
-    )
+    common = identification, phi_gripper, scales, cutoff_hz, delay, tare
     if untouched_s is not None and not tare:
-        what = "a span without contact determines the offsets, but those of the load are requested"
+        what = "a contact-free span excludes the load's offsets (--offsets load, tare=False)"
         raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
-    found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
-    free_motion = None if free is None else eliminated(free)
+    found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
+    free_motion = None if free is None else _read_and_eliminate_log(free, *common)
     if free_motion is not None and (found.log.static or free_motion.log.static):
-        raise _no_contact_in_static_log_error(
-            (free_motion if free_motion.log.static else found).log
-        )
+        raise _no_contact_in_static_log_error(free_motion if free_motion.log.static else found)
     if found.log.static:
         return found
     samples = samples_for_detector(found.log, found.contact, cutoff_hz)
@@ -407,18 +394,21 @@ def eliminate_log(
         free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
     covariance = limit_covariance_to_scales(found.phi, identification.covariance, tared=tare)
-    options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
-    usual = identification.residual_rms
-    detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
+    detection = detect_contact(
+        *(samples, found.log.dt, cutoff_hz, covariance, identification.residual_rms),
+        edge=found.edge,
+        free=reference,
+        statistic=statistic,
+    )
     if free_motion is not None and tare and detection is not None:
         notes = note_on_drift_or_much_contact(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
 
-def _no_contact_in_static_log_error(log: Log) -> DrakeTeleopError:
+def _no_contact_in_static_log_error(found: EliminatedLog) -> DrakeTeleopError:
     what = "contains only poses at rest (`static`), in which no contact can be detected"
-    return DrakeTeleopError(what, where=log.source, remedy="give a log of a motion")
+    return DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
 
 
 def _read_and_eliminate_log(
@@ -426,7 +416,6 @@ def _read_and_eliminate_log(
     identification: Identification,
     phi_gripper: Array,
     scales: dict[str, Any],
-    *,
     cutoff_hz: float | None,
     delay: str | float,
     tare: bool,
@@ -439,10 +428,8 @@ def _read_and_eliminate_log(
         remedy = "give causal as well, or remove it"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     phi = phi_with_inertia_replaced(identification)[0]
-    phi_object = phi - phi_gripper
-    known_load = phi, identification.delay_s
-    removed = identification.weight_removed
-    aligned = read_aligned_log(path, *known_load, cutoff_hz, delay, causal is not None, removed)
+    removed, late_s = identification.weight_removed, identification.delay_s
+    aligned = read_aligned_log(path, phi, late_s, cutoff_hz, delay, causal is not None, removed)
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
     if log.static and causal is not None:
         raise DrakeTeleopError(
@@ -466,15 +453,20 @@ def _read_and_eliminate_log(
     motion = log.motion
     gravity_only = None
     removed = removed or "weight" in log.estimated
-    _require_gravity_for_unequal_scales(log, removed, scales)
+    sigmas = {name: value for name, value in scales.items() if name != "gamma"}
+    weights, inertias = weight_scales_and_inertia_scales(**sigmas)
+    if weights != inertias and removed:
+        raise weight_scale_without_effect_error(log.source)
+    if weights != inertias and log.gravity is None:
+        where = f"{log.source}: gravity in the sensor frame"
+        raise unknown_gravity_error(where, "add an orientation, or use sigma alone")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
         weightless = low_pass_wrench(weightless)
         gravity_only = weightless - choose_offsets(weightless)[0]
-    contact = contact_wrench(log.wrench, offsets, *motion, phi)
-    parts = phi_gripper, phi_object
+    parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
     scaled = scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
     causal_wrench = None
@@ -497,10 +489,9 @@ def _read_and_eliminate_log(
             contact=causal_wrench.contact[known],
             scaled=causal_wrench.scaled[known],
         )
-    contact = low_pass_wrench(contact)
-    findings = _findings_if_contact_is_large(
-        Path(path), log.wrench - offsets, contact, identification
-    )
+    contact = low_pass_wrench(contact_wrench(log.wrench, offsets, *log.motion, phi))
+    measured = log.wrench - offsets
+    findings = _findings_if_contact_is_large(Path(path), measured, contact, identification)
     notes = (*log.notes, *notes_on_undetermined_load(identification))
     # A wrong description would explain the clock, too.
     shown = replace(shown, notes=notes if findings else (*notes, *aligned.clock_notes))
@@ -511,7 +502,7 @@ def _read_and_eliminate_log(
         tare_fraction=fraction,
         delay_s=delay_s,
         delay_source=source,
-        measured=low_pass_wrench(log.wrench - offsets),
+        measured=low_pass_wrench(measured),
         non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
         contact=contact,
         scaled=low_pass_wrench(scaled),
@@ -591,19 +582,6 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
     )
 
 
-def _require_gravity_for_unequal_scales(log: Log, removed: bool, scales: dict[str, Any]) -> None:
-    sigmas = {name: value for name, value in scales.items() if name != "gamma"}
-    weights, inertias = weight_scales_and_inertia_scales(**sigmas)
-    if weights == inertias:
-        return
-    if removed:
-        raise weight_scale_without_effect_error(log.source)
-    if log.gravity is None:
-        raise unknown_gravity_error(
-            f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
-        )
-
-
 def _checked_scales(
     sigma: float,
     sigma_object: float | None,
@@ -621,14 +599,14 @@ def _checked_scales(
         what = "sigma_object requires a gripper"
         remedy = "give the gripper's identification.json as well, or use sigma"
         raise DrakeTeleopError(what, where="sigma_object", remedy=remedy)
-    if eta is None:
-        kept = sigma if sigma_object is None else sigma_object
-        return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
-    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
-        what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
-        raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
-    sigma_gripper, kept, gamma = scales_from_eta(eta)
-    return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
+    kept = sigma if sigma_object is None else sigma_object
+    if eta is not None:
+        others = [sigma_object, *separate.values()]
+        if sigma != 0 or gamma != 1 or any(other is not None for other in others):
+            what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
+            raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
+        sigma, kept, gamma = scales_from_eta(eta)
+    return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
 
 
 @dataclass(frozen=True)
@@ -664,7 +642,7 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise _no_contact_in_static_log_error(found.log)
+        raise _no_contact_in_static_log_error(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
         remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"

@@ -29,7 +29,7 @@ _STYLE_OF_VERDICT = {"identified": "agrees", "not": "differs"}
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Row of one parameter in the report, as text, with numbers in `unit`."""
+    """Row of one parameter in the report, as text; numbers are in `unit`."""
 
     symbol: str
     index: str
@@ -42,7 +42,7 @@ class ParameterRow:
 
 
 def parameter_rows(load: Identification) -> list[ParameterRow]:
-    """Return the 16 rows of [offsets; phi], Eq. (7), without values of unidentified parameters."""
+    """Return the 16 rows of [offsets; phi], Eq. (7); unidentified parameters have no value."""
     theta = np.concatenate([load.offsets, load.phi])
     columns = np.stack([theta, load.standard_deviations, *confidence_intervals(load)], axis=1)
     rows = []
@@ -52,13 +52,10 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
         words, pill = VERDICT_WORDS[verdict], _STYLE_OF_VERDICT.get(verdict, "")
         texts = ("–", "", "")
         if verdict != "not" and np.isfinite(values).all():
-            value, deviation, low, high = scale * values
             # Two digits of the uncertainty determine the decimals of the value.
-            exponent = np.floor(np.log10(deviation)) if deviation > 0 else -3
+            exponent = np.floor(np.log10(scale * values[1])) if values[1] > 0 else -3
             decimals = int(np.clip(1 - exponent, 0, 9))
-            value, deviation, low, high = (
-                f"{x:.{decimals}f}" for x in (value, deviation, low, high)
-            )
+            value, deviation, low, high = (f"{x:.{decimals}f}" for x in scale * values)
             texts = (value, deviation, f"{low} … {high}")
         rows.append(ParameterRow(symbol, index, *texts, unit, words, pill))
     return rows

@@ -52,7 +52,7 @@ _DH_PARAMETERS = np.array(
     ]
 )
 HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
-_JOINT_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
+_JOINT_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])
 _NUM_RECORD_HARMONICS = 6
 TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 """Load phi (10,) of the gripper."""
@@ -60,12 +60,7 @@ TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 
 @dataclass(frozen=True)
 class FingertipPush:
-    """Push at the fingertips, a half sine over time.
-
-    Args:
-        start_s, stop_s: times on the sensor's clock.
-        push_W: (3,) largest force on the gripper, in the world [N].
-    """
+    """Push at the fingertips, a half sine over time; `push_W` is its peak on the gripper [N]."""
 
     start_s: float
     stop_s: float
@@ -125,11 +120,19 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
             text = to_yaml_text(_description_of_record(name), head=head, comments=_FIELD_COMMENTS)
             write_text(out / f"{name}.yaml", text)
-            motion, wrench_file = _motion_of_record(row), out / f"{name}_wrench.csv"
-            _write_wrench(wrench_file, motion, touches, TRUE_OFFSETS[row], random)
-            _write_pose(out / f"{name}_pose.csv", motion, random)
+            _write_record(out, name, row, touches, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
-        write_json(out / "truth.json", _true_values())
+        truth = {
+            "mass": TRUE_MASS_KG,
+            "com": TRUE_COM_S,
+            "inertia_com": TRUE_INERTIA_COM,
+            "phi": TRUE_PHI,
+            "offsets": TRUE_OFFSETS[0],
+            "offsets_touched": TRUE_OFFSETS[1],
+            "delay_s": POSE_DELAY_S,
+            "contacts": [_true_contact(touch) for touch in FINGERTIP_PUSHES],
+        }
+        write_json(out / "truth.json", truth)
         summary = {
             "seed": seed,
             "files": [*files, "truth.json"],
@@ -143,19 +146,6 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     return summary
 
 
-def _true_values() -> dict[str, Any]:
-    return {
-        "mass": TRUE_MASS_KG,
-        "com": TRUE_COM_S,
-        "inertia_com": TRUE_INERTIA_COM,
-        "phi": TRUE_PHI,
-        "offsets": TRUE_OFFSETS[0],
-        "offsets_touched": TRUE_OFFSETS[1],
-        "delay_s": POSE_DELAY_S,
-        "contacts": [_true_contact(touch) for touch in FINGERTIP_PUSHES],
-    }
-
-
 def _true_contact(touch: FingertipPush) -> dict[str, Any]:
     middle = np.array([(touch.start_s + touch.stop_s) / 2])
     R_WS = _motion_of_record(1)(middle)[3][0]
@@ -167,10 +157,8 @@ def _true_contact(touch: FingertipPush) -> dict[str, Any]:
 def _print_summary(out: Path) -> None:
     from rich.console import Console
 
-    load, free, touched = (
-        "out/load/identification.json",
-        *(shlex.quote(f"{out}/{name}.yaml") for name in ("free", "touched")),
-    )
+    load = "out/load/identification.json"
+    free, touched = (shlex.quote(f"{out}/{name}.yaml") for name in ("free", "touched"))
     for line in (
         f"a gripper in free motion ({out}/free.yaml) and touched three times ({out}/touched.yaml)",
         "try:",
@@ -194,19 +182,21 @@ def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
 def _random_motion(
     random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
 ) -> Callable[[Array], _Motion]:
-    """Return a random motion between rests: `sensor_motion` as a function of times [s].
+    """Return `sensor_motion` of a random motion between two rests, as a function of times [s].
 
     `scale` multiplies the amplitudes of the joints.
     """
-    sine, cosine = (
-        random.normal(size=(2, 6, harmonics - 1)) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
-    )
+    size = 2, 6, harmonics - 1
+    sine, cosine = random.normal(size=size) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
     path = FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period_s)
     return lambda t: sensor_motion(*path.evaluate(np.clip(t - rest_s, 0, period_s)))
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> _Motion:
-    """Return specific force, omega, alpha, R_WS and p_WS of the last link, frame S."""
+    """Return specific force of So, omega and alpha of S (N, 3) in S, and R_WS and p_WS.
+
+    S is the last link's frame; q, qd, qdd (N, 6) are angles, rates and accelerations of the joints.
+    """
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
     s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -236,39 +226,31 @@ def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
     return t + _MAX_CLOCK_JITTER_S * random.uniform(0, 1, len(t))
 
 
-def _write_wrench(
-    path: Path,
-    motion_at: Callable[[Array], _Motion],
-    touches: tuple[FingertipPush, ...],
-    offsets: Array,
-    random: np.random.Generator,
+def _write_record(
+    out: Path, name: str, row: int, touches: tuple[FingertipPush, ...], random: np.random.Generator
 ) -> None:
-    t = _jittered_clock(WRENCH_HZ, random)
+    from scipy.spatial.transform import Rotation
+
+    t, motion_at = _jittered_clock(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
-    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + offsets
+    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_OFFSETS[row]
     for touch in touches:
         wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
-    _write_columns(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading], 4)
-
-
-def _write_pose(
-    path: Path, motion_at: Callable[[Array], _Motion], random: np.random.Generator
-) -> None:
-    from scipy.spatial.transform import Rotation
-
+    _write_columns(out / f"{name}_wrench.csv", "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading])
     t = _jittered_clock(POSE_HZ, random)
     _, _, _, R_WS, p_WS = motion_at(t - POSE_DELAY_S)
     turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
-    _write_columns(path, "uptime x y z rx ry rz", [t + CLOCK_START_S, 1e3 * p_WS, turn], 4)
+    columns = [t + CLOCK_START_S, 1e3 * p_WS, turn]
+    _write_columns(out / f"{name}_pose.csv", "uptime x y z rx ry rz", columns)
 
 
-def _write_columns(path: Path, names: str, columns: list[Array], digits: int) -> None:
+def _write_columns(path: Path, names: str, columns: list[Array]) -> None:
     import polars as pl
 
-    table = np.round(np.column_stack(columns), digits)
-    write_table(path, pl.DataFrame(table, schema=names.split()), float_precision=digits)
+    table = np.round(np.column_stack(columns), 4)
+    write_table(path, pl.DataFrame(table, schema=names.split()), float_precision=4)
 
 
 _POSE_NOISE_STD = np.repeat([5e-5, 2e-4], 3)  # m, rad
@@ -277,7 +259,10 @@ _MIN_CONTACT_FORCE_N = 0.5
 
 
 class SampleEpisode(NamedTuple):
-    """Frames of one episode: times, pose of S, reported wrench; true wrench and contact."""
+    """Episode of N frames: times [s], poses of S in W, measured wrenches, and true contact.
+
+    Wrenches (N, 6) are those on the load in S; `contact_wrench` is F_c of Eq. (13).
+    """
 
     t: Array
     position: Array

@@ -293,7 +293,7 @@ def test_unit_of_force_or_torque_follows_from_the_factor(force, torque, factor, 
     fields = {"wrench.force.unit": force, "wrench.torque.unit": torque}
     fields |= {"wrench.force.scale": np.ones(3), "wrench.torque.scale": np.full(3, 2.0)}
     expected = fields | {name: value}
-    _correct_unit_or_torque_scale(fields, {"factor": factor})
+    _correct_unit_or_torque_scale(fields, factor)
     assert fields.keys() == expected.keys()
     for key in fields:
         assert fields[key] == pytest.approx(expected[key])

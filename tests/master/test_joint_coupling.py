@@ -112,6 +112,20 @@ def test_open_clutch_holds_and_closed_clutch_returns(scenario):
     np.testing.assert_allclose(joints.Eval(context), start + 0.1)
 
 
+def test_clutch_that_opens_while_the_leader_is_not_finite_holds_the_last_command(scenario):
+    slave = NominalSlave(scenario.slave)
+    coupling = JointCoupling(slave.arm, slave.start, np.array(HOME), 0.01)
+    context = coupling.CreateDefaultContext()
+    leads, clutch = coupling.GetInputPort("master_state"), coupling.GetInputPort("clutch")
+    for leader, closed in ((0.1, 1.0), (0.1, 1.0), (np.nan, 1.0), (np.nan, 0.0)):
+        leads.FixValue(context, np.append(np.array(HOME) + leader, np.zeros(6)))
+        clutch.FixValue(context, [closed])
+        coupling.ExecuteInitializationEvents(context)
+    np.testing.assert_allclose(
+        coupling.GetOutputPort("leader_joints").Eval(context), slave.start + 0.1
+    )
+
+
 def test_follower_respects_position_and_speed_limits(scenario):
     slave = NominalSlave(scenario.slave)
     follower = LeaderJointFollower(slave.arm, slave.start, 0.001)

@@ -67,9 +67,7 @@ _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_ROWS = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_UNEXPLAINED_LOGARITHM_OF_SPREAD = (
-    1.5  # log spread beyond the usual one that no hypothesis explains
-)
+_MAX_LN_SPREAD_OVER_USUAL = 1.5  # of the residual of the best hypothesis
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
@@ -118,15 +116,14 @@ def dataset_command(
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
         task = SharedJudgingData(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
-        columns = [_read_judged_columns(work / f"{k}.npy") for k in range(len(rows))]
+        judged = [np.load(work / f"{k}.npy", allow_pickle=False) for k in range(len(rows))]
+        columns = [ContactColumns(x[:, :6], x[:, 6] > 0.5) for x in judged]
         write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = to_json_data(_dataset_summary(dataset, copied, shared, rows))
-        report = render_page(
-            "drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary
-        )
-        write_text(out / "report.html", report)
+        page = render_page("drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary)
+        write_text(out / "report.html", page)
         shutil.rmtree(work)
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -294,9 +291,8 @@ def _judge_all_episodes(
     count = len(task.dataset.episodes)
     left = [k for k in range(count) if not (work / f"{k}.json").is_file()]
     progress(1.0 - len(left) / count)
-    done = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-        delayed(partial(_judge_episode, task, work))(k) for k in left
-    )
+    judge = delayed(partial(_judge_episode, task, work))
+    done = Parallel(n_jobs=jobs, return_as="generator_unordered")(map(judge, left))
     for number, _ in enumerate(done, start=count - len(left) + 1):
         progress(number / count, f"{number} of {count}")
     return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
@@ -316,22 +312,16 @@ def _judge_episode(task: SharedJudgingData, work: Path, number: int) -> None:
     write_json(work / f"{number}.json", {"episode": episode.name} | row)
 
 
-def _read_judged_columns(path: Path) -> ContactColumns:
-    values = np.load(path, allow_pickle=False)
-    return ContactColumns(values[:, :6], values[:, 6] > 0.5)
-
-
 def _verdict_on_episode(
     task: SharedJudgingData, episode: Episode
 ) -> tuple[dict[str, Any], ContactColumns]:
-    shared = task.shared_load
+    shared, usual = task.shared_load, task.shared_load.usual_half_widths
+    usual_lag = shared.lag_frames
     log, at = _read_log_and_row_times(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
-    found, residual = find_simplest_hypothesis_and_residual(
-        signals, shared.phi, shared.lag_frames, shared.usual_half_widths
-    )
-    faults: list[EpisodeFault] = saturation_faults(log.wrench)
-    faults += name_faults(found, shared.lag_frames, shared.phi, 1.0 / log.dt)
+    found, residual = find_simplest_hypothesis_and_residual(signals, shared.phi, usual_lag, usual)
+    faults = saturation_faults(log.wrench)
+    faults += name_faults(found, usual_lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = find_offset_step(residual, found.spread)
     if step is not None:
@@ -340,14 +330,15 @@ def _verdict_on_episode(
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
-    usual = shared.usual_half_widths
-    spread = ln_half_width_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0] - np.log(
-        usual
-    )
+    spread = ln_half_width_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0]
+    spread -= np.log(usual)
     spread -= np.log(found.force_torque_gains).repeat(3)
-    if not faults and spread.mean() > _MAX_UNEXPLAINED_LOGARITHM_OF_SPREAD:
-        text = "no single fault explains the wrench: it is in contact most of the time, or the load"
-        faults.append(EpisodeFault("unexplained", f"{text} changes", None))
+    if not faults and spread.mean() > _MAX_LN_SPREAD_OVER_USUAL:
+        text = (
+            "no single fault explains the wrench: it is in contact most of the time, or the load"
+            " changes"
+        )
+        faults.append(EpisodeFault("unexplained", text, None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
     rows = resample(at, log.t, contact)
     nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)

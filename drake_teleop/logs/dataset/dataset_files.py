@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,11 +68,12 @@ class Dataset(NamedTuple):
             return read_table(episode.file)
         rows = slice(episode.first_row, episode.first_row + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
-            if self.kind == "hdf5":
-                arrays = read_hdf5(episode.file, group=episode.group)
-                return Table(episode.file, array_columns(arrays, None))
-            if self.kind == "zarr":
-                arrays = read_zarr(episode.file / "data", rows=rows)
+            if self.kind != "lerobot":
+                arrays = (
+                    read_hdf5(episode.file, group=episode.group)
+                    if self.kind == "hdf5"
+                    else read_zarr(episode.file / "data", rows=rows)
+                )
                 return Table(episode.file, array_columns(arrays, None))
             frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first_row, episode.rows)
@@ -184,12 +186,11 @@ def _hard_link_or_copy(file: Path, target: Path, *, copied: bool) -> None:
     make_folder(target.parent)
     with replace_file_on_success(target) as temporary:
         temporary.unlink(missing_ok=True)
-        try:
-            if copied:
-                raise OSError
-            os.link(file.resolve(), temporary)
-        except OSError:  # another file system
-            shutil.copyfile(file, temporary)
+        with suppress(OSError):  # on another file system
+            if not copied:
+                os.link(file.resolve(), temporary)
+                return
+        shutil.copyfile(file, temporary)
 
 
 def _write_parquet(path: Path, target: Path, new: ContactColumns) -> None:
@@ -228,9 +229,8 @@ def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
     names = [f"{CONTACT_WRENCH_COLUMN}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT_COLUMN]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
-    texts = {head: names} | {
-        k: [f"{x:.6g}" for x in row] for k, row in zip(rows, cells, strict=True)
-    }
+    numbers = [[f"{x:.6g}" for x in row] for row in cells]
+    texts = {head: names} | dict(zip(rows, numbers, strict=True))
     for k, values in texts.items():
         text = lines[k].rstrip(b"\r\n")
         added = separator + separator.join(value.encode() for value in values)

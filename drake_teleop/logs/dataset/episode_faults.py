@@ -17,7 +17,7 @@ _SI_AND_OTHER_UNITS_OF_QUANTITIES = (
 )
 _UNIT_FACTOR_TOLERANCE, _MIN_UNIT_FACTOR_ERROR = 0.04, 0.06
 _MIN_WRENCH_ROTATION_DEG = 4.0
-_MIN_UNUSUAL_LAG_FRAMES = 0.6  # frames
+_MIN_UNUSUAL_LAG_FRAMES = 0.6
 _MIN_SATURATED_FRAMES = 4
 
 
@@ -46,10 +46,9 @@ def name_faults(
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(EpisodeFault("weight removed", text, None))
-    found += _rotation_faults(
-        x.force_axes, "the wrench" if np.allclose(x.force_axes, x.torque_axes) else "the force"
-    )
-    if not np.allclose(x.force_axes, x.torque_axes):
+    same = np.allclose(x.force_axes, x.torque_axes)
+    found += _rotation_faults(x.force_axes, "the wrench" if same else "the force")
+    if not same:
         found += _rotation_faults(x.torque_axes, "the torque")
     found += _unit_faults(x.force_torque_gains)
     late = x.lag - usual_lag
@@ -93,7 +92,7 @@ def _unit_faults(gain: Array) -> list[EpisodeFault]:
 
 
 def saturation_faults(wrench: Array) -> list[EpisodeFault]:
-    """Return a finding for channels of a wrench (N, 6) that stay at an end of their range."""
+    """Return the fault of channels of a wrench (N, 6) that are constant or stay at a range end."""
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():

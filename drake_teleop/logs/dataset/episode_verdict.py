@@ -31,7 +31,7 @@ HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
-_FORCE_CHANNELS, _TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
+_FORCE_AND_TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
 _REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
 # Required reduction of the log spread, for each deviation.
 _SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
@@ -70,12 +70,8 @@ class WrenchHypothesis:
     def reading_of_load(self, load_wrench: Array) -> Array:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
-        return np.hstack(
-            [
-                self.force_torque_gains[0] * f @ self.force_axes.T,
-                self.force_torque_gains[1] * tau @ self.torque_axes.T,
-            ]
-        )
+        f_gain, tau_gain = self.force_torque_gains
+        return np.hstack([f_gain * f @ self.force_axes.T, tau_gain * tau @ self.torque_axes.T])
 
     def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
@@ -112,7 +108,7 @@ def find_simplest_hypothesis_and_residual(
     for kind in HYPOTHESIS_KINDS:
         best_lag = search.best_lag(replace(usual, kind=kind))
         for lag in {usual_lag, best_lag, search.lag_of_linear_fit(kind)}:
-            found += search._hypotheses_at_lag(kind, lag)
+            found += search.hypotheses_at_lag(kind, lag)
             found += [search.hypothesis_of_other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
@@ -138,39 +134,30 @@ class HypothesisSearch:
         return wrench - x.reading_of_load(load_wrench)
 
     def with_spread_and_cost(self, x: WrenchHypothesis) -> WrenchHypothesis:
-        spread, offsets = ln_half_width_and_centre_of_calm_half(
-            self.unexplained_reading(x), self.floor
-        )
+        residual = self.unexplained_reading(x)
+        spread, offsets = ln_half_width_and_centre_of_calm_half(residual, self.floor)
         cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
     def _best_rows_of(self, x: WrenchHypothesis) -> NDArray[np.bool_]:
-        return _rows_of_smallest_residual(
-            (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
-        )
+        residual = (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
+        return _rows_of_smallest_residual(residual)
 
-    def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
-        both, one = self.predict(kind, lag), np.ones(2)
-        force, torque = (
-            self.best_permutation(*both, channels)
-            for channels in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
-        )
-        plain = WrenchHypothesis(kind, lag, np.eye(3), np.eye(3), one)
+    def hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
+        both, one, eye = self.predict(kind, lag), np.ones(2), np.eye(3)
+        force, torque = (self.best_permutation(*both, c) for c in _FORCE_AND_TORQUE_CHANNELS)
+        plain = WrenchHypothesis(kind, lag, eye, eye, one)
         yield self.with_spread_and_cost(plain)
-        yield self.with_spread_and_cost(
-            replace(plain, force_axes=-np.eye(3), torque_axes=-np.eye(3))
-        )
+        yield self.with_spread_and_cost(replace(plain, force_axes=-eye, torque_axes=-eye))
         for M, T in ((force, force), (torque, torque), (force, torque)):
             yield self.with_spread_and_cost(replace(plain, force_axes=M, torque_axes=T))
         for det in (1.0, -1.0):
-            start = self.refit_to_best_rows(plain, det=det, scale=True)
+            start = self.refit_best_rows(plain, det=det, scale=True)
             yield start
-            yield self.refit_to_best_rows(
-                replace(start, force_torque_gains=one), det=det, scale=False
-            )
+            yield self.refit_best_rows(replace(start, force_torque_gains=one), det=det, scale=False)
             nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force_axes).sum()))
-            for M in (np.eye(3), -np.eye(3), nearest):
-                yield self.refit_to_best_rows(
+            for M in (eye, -eye, nearest):
+                yield self.refit_best_rows(
                     replace(start, force_axes=M, torque_axes=M), det=0.0, scale=True
                 )
 
@@ -179,9 +166,8 @@ class HypothesisSearch:
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         pairs = pairs.reshape(len(w), -1)
-        spread = ln_half_width_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0].reshape(
-            3, 3, 2
-        )
+        spread = ln_half_width_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0]
+        spread = spread.reshape(3, 3, 2)
         costs = [
             sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
             for M in _SIGNED_PERMUTATIONS
@@ -195,10 +181,8 @@ class HypothesisSearch:
         for part in range(_NUM_START_FIT_PARTS):
             yield at == part
 
-    def refit_to_best_rows(
-        self, x: WrenchHypothesis, *, det: float, scale: bool
-    ) -> WrenchHypothesis:
-        """Return the hypothesis with rotation and factors fitted to the best rows.
+    def refit_best_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
+        """Return the hypothesis with rotation and factors fitted to the frames that fit best.
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
         """
@@ -214,7 +198,7 @@ class HypothesisSearch:
             if scale:
                 ratio = [
                     np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
-                    for c in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
+                    for c in _FORCE_AND_TORQUE_CHANNELS
                 ]
                 x = replace(x, force_torque_gains=np.maximum(ratio, 1e-9))
             if det:
@@ -227,11 +211,9 @@ class HypothesisSearch:
         return x
 
     def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
-        """Return the hypothesis of another load, fitted to the best rows."""
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        found = [
-            self._fit_other_load(wrench, V, lag, rows) for rows in self.row_flags_for_first_fits()
-        ]
+        first_fits = self.row_flags_for_first_fits()
+        found = (self._fit_other_load(wrench, V, lag, rows) for rows in first_fits)
         return min(found, key=lambda x: x.cost)
 
     def _fit_other_load(
@@ -286,7 +268,7 @@ def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
     H = np.zeros((3, 3))
-    for channels, factor in zip((_FORCE_CHANNELS, _TORQUE_CHANNELS), gain, strict=True):
+    for channels, factor in zip(_FORCE_AND_TORQUE_CHANNELS, gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
         H += w[:, channels].T @ p[:, channels] * factor / size**2
     U, _, Vt = np.linalg.svd(H)
@@ -295,7 +277,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: WrenchHypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE_CHANNELS, x.force_axes), (_TORQUE_CHANNELS, x.torque_axes)):
+    for channels, M in zip(_FORCE_AND_TORQUE_CHANNELS, (x.force_axes, x.torque_axes), strict=True):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
@@ -325,9 +307,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL)
-    deviation = np.minimum(
-        np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise
-    )
+    by_spread = np.exp(spread) / HALF_WIDTH_OF_NORMAL
+    deviation = np.minimum(by_spread, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -36,9 +36,9 @@ from drake_teleop.logs.read.canonical import Log
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 # Log spread beyond that of an episode's own load.
 _MAX_COUNTED_EXCESS_SPREAD, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
-_LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0  # frames
+_LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0
 _MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
-_THRESHOLD_OVER_LARGEST_LEVEL = 1.1  # over the largest level of free frames
+_THRESHOLD_OVER_LARGEST_FREE_LEVEL = 1.1
 
 
 @dataclass(frozen=True)
@@ -99,18 +99,17 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         for k, (x, residual) in zip(chosen, usual, strict=True)
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
-    floor = fit_noise_floor(
-        *pooled, limit_covariance_to_scales(phi, load.covariance, tared=True), fade=0.0
-    )
+    covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
+    floor = fit_noise_floor(*pooled, covariance, fade=0.0)
     threshold = max(
         NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
-        _THRESHOLD_OVER_LARGEST_LEVEL * float(floor.free_maxima[0]),
+        _THRESHOLD_OVER_LARGEST_FREE_LEVEL * float(floor.free_maxima[0]),
     )
     return SharedLoad(load, phi, lag, typical, floor, threshold)
 
 
 def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
-    """Return the load that explains an episode best, and its lag."""
+    """Return the hypothesis of the load and lag that explain an episode best."""
     search = HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
@@ -128,7 +127,6 @@ def _excess_spread_over_own_loads(
 def _faultless_hypothesis_at_best_lag(
     signals: EpisodeSignals, phi: Array, near_lag: float
 ) -> tuple[WrenchHypothesis, Array]:
-    """Return the hypothesis without fault at the best lag near one [frames], and its residual."""
     search = HypothesisSearch(signals, phi, near_lag, _MIN_RESIDUAL_HALF_WIDTH)
     lags = near_lag + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
     found = (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags)
@@ -190,6 +188,5 @@ def _contact_free_samples(
 
 
 def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:
-    """Return the input of the contact detector for a contact wrench (N, 6)."""
     at = signals.motion_at_lag(lag)
     return DetectorSamples(contact, at.s, at.omega, at.alpha, at.s + at.gravity)

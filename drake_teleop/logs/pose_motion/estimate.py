@@ -47,8 +47,7 @@ from drake_teleop.logs.pose_motion.spectra import (
 )
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-SEARCHED_RECORD_PART_S = 120.0
-"""Length of the searched part of a record [s]."""
+_SEARCHED_RECORD_PART_S = 120.0
 MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
 MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG = 5.0, 1.0
@@ -69,7 +68,7 @@ class PoseFrame:
     Attributes:
         p_SoPo_S: (3,) origin of P from So, in S [m].
         R_SP: (3, 3) rotation from axes of P to those of S.
-        position_stds_m: (3,) standard deviations of the origin [m]; inf if undetermined.
+        position_stds_m: (3,) standard deviations of `p_SoPo_S` [m]; inf if undetermined.
         rotation_stds_deg: (3,) standard deviations of R_SP about the axes of S [deg].
         is_shifted, is_rotated: whether origin, axes differ significantly from the description.
     """
@@ -83,10 +82,12 @@ class PoseFrame:
 
     @property
     def is_position_known(self) -> NDArray[np.bool_]:
+        """Booleans (3,): whether it is known to 2 cm along the axes of S."""
         return np.asarray(self.position_stds_m < MAX_KNOWN_FRAME_SHIFT_STD_M)
 
     @property
     def is_rotation_known(self) -> NDArray[np.bool_]:
+        """Booleans (3,): whether it is known to 1 degree about the axes of S."""
         return np.asarray(self.rotation_stds_deg < MAX_KNOWN_FRAME_ROTATION_STD_DEG)
 
 
@@ -160,9 +161,8 @@ def estimate_from_poses(
     are excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
-        found, _, window = _find_splines_and_delay(
-            *(t, wrench, poses, gravity_W, delay, lost, imu), fewest=_MIN_SHARED_INSTANTS
-        )
+        inputs = t, wrench, poses, gravity_W, delay, lost, imu
+        found, _, window = _find_splines_and_delay(*inputs, fewest=_MIN_SHARED_INSTANTS)
         splines, late, grid = found.splines, found.delay_s, window.grid
         window = replace(window, taper=_taper_without_gaps(grid, splines.poses, lost, late))
         spectra = window.spectra_at_delay(splines, late)
@@ -214,15 +214,17 @@ def fit_motion_to_load(
     lost: NDArray[np.bool_] | None = None,
     imu: ImuData | None = None,
 ) -> PoseMotion:
-    """Return the motion from poses of S with which a load (6, 16), Eq. (T73), fits best."""
+    """Return the motion from poses of S with which a load fits a wrench best.
+
+    `coefficients` (6, 16) are the load's, Eq. (T73).
+    """
     with one_blas_thread():
         motion, last, _ = _find_splines_and_delay(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
             fewest=_MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD,
             load=coefficients,
         )
-        known = delay is not None
-        return replace(motion, delay_std_s=0.0 if known else delay_std(last))
+        return replace(motion, delay_std_s=delay_std(last) if delay is None else 0.0)
 
 
 def _find_splines_and_delay(
@@ -237,9 +239,8 @@ def _find_splines_and_delay(
     fewest: int,
     load: Array | None = None,
 ) -> tuple[PoseMotion, Spectra, FitWindow]:
-    t = finite_array("t", t, np.size(t))
+    t, gravity = finite_array("t", t, np.size(t)), finite_array("gravity_W", gravity_W, 3)
     wrench = finite_array("wrench", wrench, len(t), 6)
-    gravity = finite_array("gravity_W", gravity_W, 3)
     grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
     taper = _taper_without_gaps(grid, poses, lost, guess)
@@ -254,7 +255,9 @@ def _find_splines_and_delay(
     whole = FitWindow(grid, taper, gravity, top)
     rows = _part_with_most_varied_force(grid)
     part = whole.select_rows(rows)
-    near_poses = _select_poses_near_grid(poses, part.grid)
+    margin = 2 * DELAY_SEARCH_HALF_RANGE_S
+    near = (poses.t >= part.grid.t[0] - margin) & (poses.t <= part.grid.t[-1] + margin)
+    near_poses = Poses(poses.t[near], poses.position[near], poses.quaternion[near])
     cache = spline_cache_of_averaged_poses(near_poses)
     spacing, late = guess_knot_spacing_and_delay(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
@@ -265,11 +268,11 @@ def _find_splines_and_delay(
         near_poses = correct_clock_rate(near_poses, rate, part.grid, late)
         poses = correct_clock_rate(poses, rate, part.grid, late)
         cache = spline_cache_of_averaged_poses(near_poses)
-    choices, agrees, imu_spacing = [cache], True, spacing
+    choices, imu_rows, imu_spacing = [cache], None, spacing
     if imu is not None:
         imu_rows = correct_imu_data(PoseSplines(near_poses, imu_spacing), imu, gravity)
-        agrees = imu_rows is not None
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
+    agrees = imu is None or imu_rows is not None
     chosen, spacing, late = choose_knot_spacing_and_delay(part, choices, late, known=known)
     imu_rows = chosen.imu_rows
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
@@ -279,14 +282,8 @@ def _find_splines_and_delay(
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
-def _select_poses_near_grid(poses: Poses, grid: WrenchGrid) -> Poses:
-    margin = 2 * DELAY_SEARCH_HALF_RANGE_S
-    inside = (poses.t >= grid.t[0] - margin) & (poses.t <= grid.t[-1] + margin)
-    return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
-
-
 def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
-    rows, length = len(grid.t), round(SEARCHED_RECORD_PART_S / grid.dt)
+    rows, length = len(grid.t), round(_SEARCHED_RECORD_PART_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     starts = range(0, rows - length, length // 2)
@@ -350,11 +347,10 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     turned = Rotation.from_matrix(start.R_PS.T @ free.parameters.R_PS).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    limits = np.radians([MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG])
-    shifted = _is_frame_wrong(
-        moved, covariance[:3, :3], MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
-    )
-    tilted = _is_frame_wrong(turned, covariance[3:, 3:], *limits)
+    limits = MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
+    shifted = _is_frame_wrong(moved, covariance[:3, :3], *limits)
+    limits = MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG
+    tilted = _is_frame_wrong(turned, covariance[3:, 3:], *np.radians(limits))
     return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,

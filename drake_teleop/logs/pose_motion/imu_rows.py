@@ -12,9 +12,8 @@ from drake_teleop.logs.pose_motion.poses import ImuData
 from drake_teleop.logs.pose_motion.spectra import ComplexArray, end_taper, exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import ImuSplineRows, PoseSplines
 
-_GAIN_ERROR_PRIOR_STD = 0.1
+_GAIN_ERROR_PRIOR_STD, _MAX_GAIN_ERROR = 0.1, 0.2
 _SENSOR_FIT_STEPS, _MAX_IMU_SHIFT_S, _NOISE_POWER_STEPS, _MIN_NOISE_FREQUENCIES = 4, 0.1, 10, 40
-_MAX_GAIN_ERROR = 0.2  # largest entry of D
 # Share of 1 / h that splines pass, and largest unexplained share of the motion.
 _COMPARED_FREQUENCY_OVER_KNOT_RATE, _MAX_RESIDUAL_OVER_MOTION_POWER = 0.25, 0.05
 # Rates of comparison and of added rows [Hz], and least length of a comparison [s].
@@ -29,9 +28,6 @@ class _ImuSensorModel:
     bias: Array
     time_shift_s: float
     noise_power: float
-
-    def corrected_data(self, y: Array) -> Array:
-        return np.asarray(np.linalg.solve(np.eye(3) + self.gain_errors, (y - self.bias).T).T)
 
 
 def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
@@ -53,7 +49,9 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     t = rows.t + fitted[-1].time_shift_s  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
-        None if sensor is None or y is None else sensor.corrected_data(y[inside])
+        None
+        if sensor is None or y is None
+        else np.linalg.solve(np.eye(3) + sensor.gain_errors, (y[inside] - sensor.bias).T).T
         for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
     )
     own = [0.0 if sensor is None else sensor.noise_power for sensor in sensors]
@@ -83,9 +81,8 @@ def _fit_sensor_model(
     lost, values = np.ones(len(even), bool), np.zeros((len(even), 3))
     lost[place], values[place] = False, y
     start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
-    taper = exclude_from_taper(
-        end_taper(even, start + _MAX_IMU_SHIFT_S, stop - _MAX_IMU_SHIFT_S), lost, dt
-    )
+    ends = start + _MAX_IMU_SHIFT_S, stop - _MAX_IMU_SHIFT_S
+    taper = exclude_from_taper(end_taper(even, *ends), lost, dt)
     if (taper > 0.5).sum() * dt < _MIN_COMPARED_DURATION_S:
         return None
     frequency = np.fft.rfftfreq(len(even), dt)

@@ -17,13 +17,11 @@ from drake_teleop.logs.pose_motion.spectra import (
     NoiseLevels,
     WrenchGrid,
     end_taper,
+    filter_by_response,
     make_frequency_bands,
     random_walk_relative_power,
     second_moments,
-    shift_spectrum,
-    shift_taper,
     signal_spectrum,
-    taper_derivative,
     wrench_spectrum,
 )
 from drake_teleop.logs.pose_motion.splines import (
@@ -159,7 +157,7 @@ class Spectra:
 
     Attributes:
         grid, taper: instants of the record, and their weights (M,).
-        delay: delay of the signals [s].
+        delay: delay of the signals behind the wrench [s].
         motion_signals: (M, 16) signals over time, see `PoseSplines.signals`.
     """
 
@@ -183,18 +181,20 @@ class Spectra:
         return bool(edged or self.grid.known_load is not None)
 
     def with_delay(self, delay: float) -> Spectra:
+        """Return the spectra with signals shifted to a delay [s]; only `signals` changes."""
         shift, signals = delay - self.delay, self.signals
         if self.is_taper_fixed:
-            before = shift_taper(self.grid, self.taper, shift)
+            advance = np.exp(-2j * np.pi * self.grid.frequency * shift)
+            before = filter_by_response(self.grid, self.taper, advance)
             signals = signal_spectrum(self.grid, before, self.motion_signals, len(signals))
-        late = shift_spectrum(signals, self.bands.frequency, shift)
+        late = signals * np.exp(2j * np.pi * self.bands.frequency * shift)[:, None]
         late[:, 0] = self.signals[:, 0]
         return replace(self, signals=late)
 
     def second_moments(self) -> Array:
         """Return second moments (bands, 38, 38) of signals, wrench, and derivatives of signals."""
         rates = 2j * np.pi * self.bands.frequency[:, None] * self.signals
-        edges = taper_derivative(self.grid, self.taper)
+        edges = filter_by_response(self.grid, self.taper, 2j * np.pi * self.grid.frequency)
         rates -= signal_spectrum(self.grid, edges, self.motion_signals, len(rates))
         rates[:, 0] = 0.0
         return second_moments(self.signals, self.wrench, self.bands, rates)
@@ -315,9 +315,8 @@ def guess_knot_spacing_and_delay(
         if known:
             found.append((spectra.fit_coefficients().cost, h, delay))
             continue
-        late, cost = find_best_delay_and_cost(
-            spectra, spectra.delay_search_half_range_s, _FINE_DELAY_STEP_S
-        )
+        reach = spectra.delay_search_half_range_s
+        late, cost = find_best_delay_and_cost(spectra, reach, _FINE_DELAY_STEP_S)
         found.append((cost, h, late))
     return min(found)[1:]
 
@@ -355,10 +354,9 @@ def choose_knot_spacing_and_delay(
 
 
 def spline_cache_of_averaged_poses(poses: Poses) -> SplineCache:
-    """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
-    return SplineCache(
-        poses.average_consecutive(max(1, int(poses.rate / _MIN_AVERAGED_POSE_RATE_HZ + 1e-6)))
-    )
+    """Return splines of poses that are averaged to 125 Hz or more."""
+    count = max(1, int(poses.rate / _MIN_AVERAGED_POSE_RATE_HZ + 1e-6))
+    return SplineCache(poses.average_consecutive(count))
 
 
 def _knot_spacings_for_pose_rate(cache: SplineCache) -> list[float]:
@@ -395,7 +393,7 @@ def estimate_clock_rate_error(
 
 
 def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
+    """Return the poses with stamps on the wrench's clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 

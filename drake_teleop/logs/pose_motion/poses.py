@@ -29,7 +29,7 @@ class Poses:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def with_continuous_quaternions(self) -> Poses:
-        """Return the poses with quaternions whose signs do not jump."""
+        """Return the poses with quaternions without sign jumps."""
         products = np.einsum("ki,ki->k", self.quaternion[1:], self.quaternion[:-1])
         if (products >= 0.0).all():
             return self
@@ -65,26 +65,23 @@ class ImuData:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def average_to_rate(self, min_rate_hz: float) -> ImuData:
-        """Return means of consecutive rows, at a rate of at least `min_rate_hz` [Hz]."""
+        """Return means of consecutive rows without gaps, at `min_rate_hz` [Hz] or just above."""
         count = max(1, int(self.rate / min_rate_hz))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
         whole = at[:, -1] - at[:, 0] < count / self.rate
-
-        def means_of_consecutive(x: Array | None) -> Array | None:
-            return None if x is None else x[:rows].reshape(-1, count, 3).mean(axis=1)[whole]
-
-        both = map(means_of_consecutive, (self.specific_force, self.angular_velocity))
+        both = (
+            None if x is None else x[:rows].reshape(-1, count, 3).mean(axis=1)[whole]
+            for x in (self.specific_force, self.angular_velocity)
+        )
         return ImuData(at.mean(axis=1)[whole], *both)
 
 
 @dataclass(frozen=True, eq=False)
 class PosesOfLog:
-    """Poses of S in a log, with gravity in the world [m/s^2], and the described pose frame P.
+    """Poses of S in a log, with gravity (3,) in the world [m/s^2].
 
-    Attributes:
-        p_SoPo_S: (3,) described origin of P [m].
-        R_SP: (3, 3) described rotation of P.
+    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are the described pose of frame P, which was recorded.
     """
 
     poses: Poses
@@ -94,6 +91,5 @@ class PosesOfLog:
     imu: ImuData | None = None
 
     def with_times_relative_to(self, start: float) -> PosesOfLog:
-        """Return poses and IMU data with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

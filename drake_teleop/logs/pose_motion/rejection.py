@@ -30,9 +30,8 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
     gain = 0.5 ** ((spectra.bands.frequency * spacing / _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE) ** 2)
     grid = spectra.grid
-    x, y = (
-        _spectrum_to_time_signal(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench)
-    )
+    filtered = (spectrum * gain[:, None] for spectrum in (spectra.signals, spectra.wrench))
+    x, y = (_spectrum_to_time_signal(spectrum, grid) for spectrum in filtered)
     inside = spectra.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]

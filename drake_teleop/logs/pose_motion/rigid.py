@@ -32,7 +32,7 @@ _MAX_RIGID_FIT_STEPS, _MAX_CONVERGED_STEP_OVER_STD = 40, 1e-4
 _MAX_RIGID_MISFIT_OVER_DOF, _MAX_GAIN_MISFIT_OVER_EXPECTED, _NOISE_MISFIT_OVER_DOF = 4.0, 1.5, 1.5
 _MAX_PARAMETER_FIT_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
 _MIN_WRENCH_NOISE_OVER_RESIDUAL = 0.1
-_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # rad, step of a numerical derivative
+_ROTATION_DIFFERENCE_STEP_RAD = 1e-4
 _MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
 
 
@@ -154,10 +154,8 @@ def fit_rigid(
     solution = _solve_rigid_fit(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
     plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.parameters)
-    least = min_noise_power(record.moments, levels.half_dof_of_bands)
-    power = np.maximum(
-        levels.noise_power(_residual_channel_powers(record, plain.parameters)), least
-    )
+    power = levels.noise_power(_residual_channel_powers(record, plain.parameters))
+    power = np.maximum(power, min_noise_power(record.moments, levels.half_dof_of_bands))
     fit = RigidFit(
         solution.parameters,
         covariance=np.zeros((0, 0)),
@@ -238,10 +236,8 @@ def _std_factors_of_estimated_weights(record: _RigidFitData, solution: _RigidSol
     levels, B = record.noise_levels, solution.residual_derivative
     half = np.einsum("cjk,ji->cik", B, solution.inverse_gram)
     weight = np.diagonal(solution.residual_weights, axis1=1, axis2=2)
-    part = (
-        np.einsum("cik,bkm,cim->bci", half, record.moments, half, optimize=True) * weight[..., None]
-    )
-    part = levels.sums_over_groups(part).reshape(-1, NUM_RIGID_PARAMETERS)
+    part = np.einsum("cik,bkm,cim->bci", half, record.moments, half, optimize=True)
+    part = levels.sums_over_groups(part * weight[..., None]).reshape(-1, NUM_RIGID_PARAMETERS)
     share = part / np.maximum(part.sum(axis=0), 1e-300)
     freedom = np.repeat(2.0 * levels.sums_over_groups(levels.half_dof_of_bands), 6)
     return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
@@ -259,21 +255,18 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 
 
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38) and e (6, 38): coefficients of 38 signals in the residual."""
+    """Return B = -de/dx (6, 23, 38) and e (6, 38), the residual's coefficients of 38 signals."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
+    step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
         lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
-        ahead, behind = (
-            _motion_map_with_delay(
-                replace(state, R_PS=_rotate_about_own_axes(state.R_PS, x * unit))
-            )
-            for x in (_ROTATION_DIFFERENCE_STEP_RAD, -_ROTATION_DIFFERENCE_STEP_RAD)
-        )
+        turned = (_rotate_about_own_axes(state.R_PS, x * unit) for x in (step, -step))
+        ahead, behind = (_motion_map_with_delay(replace(state, R_PS=R)) for R in turned)
         B[:, 17 + i] = -L @ lever
-        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_DIFFERENCE_STEP_RAD)
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * step)
     return B, L @ M
 
 
@@ -353,13 +346,12 @@ def _expected_misfit_by_gains(
 
 
 def _add_rigid_step(state: RigidParameters, step: Array) -> RigidParameters:
+    R_PS = _rotate_about_own_axes(state.R_PS, step[ROTATION_PARAMETERS])
     return RigidParameters(
         state.theta + step[OFFSET_AND_LOAD_PARAMETERS],
         state.delay_s + float(step[16]),
         state.p_PoSo_P + step[LEVER_PARAMETERS],
-        Rotation.from_matrix(
-            _rotate_about_own_axes(state.R_PS, step[ROTATION_PARAMETERS])
-        ).as_matrix(),
+        Rotation.from_matrix(R_PS).as_matrix(),
     )
 
 

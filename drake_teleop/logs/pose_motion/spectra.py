@@ -22,19 +22,17 @@ ComplexArray = NDArray[np.complex128]
 
 MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
-TAPER_RAMP_S = 1.0
-"""Length of the taper's ramps at the ends of the record [s]."""
-EXCLUSION_RAMP_S = 0.2
-"""Length of the taper's ramps beside excluded samples [s]."""
+# Length of the taper's ramps at the ends of the record, and beside excluded samples [s].
+_TAPER_RAMP_S, _EXCLUSION_RAMP_S = 1.0, 0.2
 _GRID_RATE_HZ = 100.0
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
 _MIN_NOISE_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
 _NARROW_BANDS_TO_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
-WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
-"""Columns of the wrench and of the signals' derivatives in the moments."""
-SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, 2 * NUM_MOTION_SIGNALS + 6)
 NUM_MOMENT_SIGNALS = 2 * NUM_MOTION_SIGNALS + 6
+# Columns of the wrench and of the signals' derivatives in `second_moments`.
+WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
+SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +62,6 @@ class WrenchGrid:
 
     @cached_property
     def transform_length(self) -> int:
-        """Number of samples of the Fourier transforms."""
         return int(next_fast_len(len(self.t), real=True))
 
     @cached_property
@@ -103,7 +100,7 @@ class FrequencyBands:
 
 
 def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
-    """Return frequency bands up to `top` [Hz]; small groups are joined to the next."""
+    """Return frequency bands up to `top` [Hz]; groups with few values are joined to the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.transform_length)
     weight = np.full(len(frequency), worth)
@@ -124,7 +121,7 @@ def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> Frequenc
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
     """Return a taper (M,): 0 outside `start` to `stop` [s], 1 inside after cosine ramps."""
-    ramp = min(TAPER_RAMP_S, 0.1 * (stop - start))
+    ramp = min(_TAPER_RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
@@ -133,7 +130,7 @@ def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((instants_to_nearest_flag(lost) * dt - margin) / EXCLUSION_RAMP_S, 0.0, 1.0)
+    edge = np.clip((instants_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
@@ -165,22 +162,8 @@ def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> 
     return out
 
 
-def shift_spectrum(spectrum: ComplexArray, frequency: Array, shift: float) -> ComplexArray:
-    """Return spectra (K, 16) of tapered signals `shift` [s] later; that of constant 1 is kept."""
-    out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
-    out[:, 0] = spectrum[:, 0]
-    return out
-
-
-def shift_taper(grid: WrenchGrid, taper: Array, shift: float) -> Array:
-    return _filter_by_response(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
-
-
-def taper_derivative(grid: WrenchGrid, taper: Array) -> Array:
-    return _filter_by_response(grid, taper, 2j * np.pi * grid.frequency)
-
-
-def _filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complexfloating]) -> Array:
+def filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complexfloating]) -> Array:
+    """Return x (M,), periodic after padding, filtered by a response at `grid.frequency`."""
     n = grid.transform_length
     return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * response, n)[: len(x)])
 
@@ -226,11 +209,10 @@ class NoiseLevels:
 
     @classmethod
     def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
-        """Return levels of noise that is white within each group of bands."""
         return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
-        """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
+        """Return the noise power (..., bands, 6) of residuals with summed power `sums`, same shape.
 
         `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """

@@ -20,11 +20,11 @@ MIN_POSES_PER_KNOT = 2.0
 NUM_MOTION_SIGNALS = 16
 """Number of columns of `PoseSplines.signals`."""
 GRAVITY_COLUMNS, SIGNALS_ZERO_AT_REST = slice(4, 7), [1, 2, 3, *range(7, 16)]
-"""Columns of gravity, and columns that are zero at rest."""
+"""Columns of minus gravity, and columns that are zero at rest."""
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _POSE_NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _MAX_ROWS_PER_BLOCK = 2**17
-_DERIVATIVES_LIMITED_AT_ENDS = range(1, 5)  # of derivatives at the ends
+_DERIVATIVES_LIMITED_AT_ENDS = range(1, 5)
 # Largest weight of the penalty or of a limit over that of the poses; rounding allows no more.
 _MAX_PENALTY_OVER_POSE_WEIGHT = 1e12
 
@@ -96,8 +96,7 @@ class PoseSplines:
         smooth: bool = False,
     ) -> None:
         self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
-        self._smooth = smooth
-        self._start = float(poses.t[0])
+        self._smooth, self._start = smooth, float(poses.t[0])
         t = poses.t - self._start
         self._blocks = _split_rows_into_blocks(len(t))
         knots = _place_knots(t, spacing, with_imu=imu_rows is not None)
@@ -108,17 +107,13 @@ class PoseSplines:
 
     def _fit_spline(self, t: Array, knots: Array) -> BSpline:
         poses, imu_rows = self.poses, self.imu_rows
-        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
-        times = (t[x] for x in self._blocks)
-        gram, right = _spline_normal_equations(
-            zip(times, values, strict=True), knots, SPLINE_DEGREE, 7
-        )
+        parts = ((t[x], np.hstack([poses.position[x], poses.quaternion[x]])) for x in self._blocks)
+        gram, right = _spline_normal_equations(parts, knots, SPLINE_DEGREE, 7)
         if imu_rows is None:
             if self._smooth:
                 return self._fit_smooth_spline(t, knots, gram, right)
             return BSpline(knots, solveh_banded(gram, right), SPLINE_DEGREE)
-        columns = []
-        shifted_t = imu_rows.t - self._start
+        columns, shifted_t = [], imu_rows.t - self._start
         inside = (shifted_t >= knots[0]) & (shifted_t <= knots[-1])
         for part, order, rows, pose, own in zip(
             (slice(0, 3), slice(3, 7)),
@@ -131,8 +126,8 @@ class PoseSplines:
             band, side = gram, right[:, part]
             if rows is not None:
                 weight = pose * self.rate / (own * imu_rows.rate)
-                at, x = shifted_t[inside], rows[inside]
-                more, other = _normal_equations_of_rates(at, x, knots, order)
+                inner = shifted_t[inside], rows[inside]
+                more, other = _normal_equations_of_rates(*inner, knots, order)
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), SPLINE_DEGREE)
@@ -208,7 +203,7 @@ class PoseSplines:
 
         They are [1, acceleration, -gravity, alpha, products of omega].
         """
-        a, minus_g, omega, alpha = self._motion_and_gravity_in_blocks(t, gravity_W)
+        a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
         zeta = np.empty((len(t), NUM_MOTION_SIGNALS))
         zeta[:, 0] = 1.0
         zeta[:, 1:4], zeta[:, 4:7], zeta[:, 7:10] = a, minus_g, alpha
@@ -219,39 +214,31 @@ class PoseSplines:
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
         """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""
-        a, minus_g, omega, alpha = self._motion_and_gravity_in_blocks(t, gravity_W)
+        a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
         """Return gravity (N, 3) at times t, in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
         for part in _split_rows_into_blocks(len(t)):
-            q = self.quaternion(t[part])
-            gravity_rows = np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _rotate_W_to_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
+            q, g = self.quaternion(t[part]), np.broadcast_to(gravity_W, out[part].shape)
+            out[part] = _rotate_W_to_P(q, np.sum(q * q, axis=1, keepdims=True), g)
         return out
 
-    def _motion_and_gravity_in_blocks(
-        self, t: Array, gravity_W: Array
-    ) -> tuple[Array, Array, Array, Array]:
+    def _acceleration_minus_gravity_omega_alpha(self, t: Array, gravity_W: Array) -> Array:
         out = np.empty((4, len(t), 3))
         for part in _split_rows_into_blocks(len(t)):
-            out[:, part] = self._motion_and_gravity_at(t[part], gravity_W)
-        return out[0], out[1], out[2], out[3]
-
-    def _motion_and_gravity_at(
-        self, t: Array, gravity_W: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        x, first, second = (self._evaluate_derivative(t, order) for order in range(3))
-        q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
-        n = np.sum(q * q, axis=1, keepdims=True)
-        omega = 2.0 * _vector_part_of_relative_quaternion(q, qd) / n
-        alpha = (
-            2.0 * _vector_part_of_relative_quaternion(q, qdd) / n
-            - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
-        )
-        gravity_rows = np.broadcast_to(-gravity_W, (len(t), 3))
-        return _rotate_W_to_P(q, n, second[:, :3]), _rotate_W_to_P(q, n, gravity_rows), omega, alpha
+            x, first, second = (self._evaluate_derivative(t[part], order) for order in range(3))
+            q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
+            n = np.sum(q * q, axis=1, keepdims=True)
+            omega = 2.0 * _vector_part_of_relative_quaternion(q, qd) / n
+            alpha = (
+                2.0 * _vector_part_of_relative_quaternion(q, qdd) / n
+                - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
+            )
+            minus_g = _rotate_W_to_P(q, n, np.broadcast_to(-gravity_W, omega.shape))
+            out[:, part] = _rotate_W_to_P(q, n, second[:, :3]), minus_g, omega, alpha
+        return out
 
     def estimate_pose_noise(self) -> tuple[float, float]:
         """Return the standard deviations per axis of noise of position [m] and rotation [rad]."""

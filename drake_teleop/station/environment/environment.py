@@ -154,9 +154,8 @@ def ExcludeContact(
     ]
     if not others:
         return
-    between = CollisionFilterDeclaration().ExcludeBetween(
-        GeometrySet(list(shapes)), GeometrySet(others)
-    )
+    sets = GeometrySet(list(shapes)), GeometrySet(others)
+    between = CollisionFilterDeclaration().ExcludeBetween(*sets)
     scene_graph.collision_filter_manager().Apply(between)
 
 

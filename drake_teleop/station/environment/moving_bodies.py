@@ -37,7 +37,6 @@ from drake_teleop.common.vectors import (
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 _PARENT_ROW_COLUMN, _JOINT_TYPE_COLUMN, _POSITION_INDEX_COLUMN, _VELOCITY_INDEX_COLUMN = range(4)
 _AXIS_COLUMN, _X_PF_COLUMN, _X_MB_COLUMN = 4, 7, 14
-#: Number of columns of the table of joints.
 NUM_JOINT_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
 BODY_STATE_SIZE = 13
@@ -82,18 +81,16 @@ def _joint_table_row(
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if parent_row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-    kind, axis = _joint_type_and_axis(joint)
+    kind, axis = _FIXED_JOINT, np.zeros(3)
+    if isinstance(joint, RevoluteJoint):
+        kind, axis = _REVOLUTE_JOINT, joint.revolute_axis()
+    elif isinstance(joint, PrismaticJoint):
+        kind, axis = _PRISMATIC_JOINT, joint.translation_axis()
+    elif isinstance(joint, QuaternionFloatingJoint):
+        kind = _FREE_JOINT
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
     return np.array([parent_row, kind, *places, *axis, *poses[0], *poses[1]])
-
-
-def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
-    if isinstance(joint, RevoluteJoint):
-        return _REVOLUTE_JOINT, joint.revolute_axis()
-    if isinstance(joint, PrismaticJoint):
-        return _PRISMATIC_JOINT, joint.translation_axis()
-    return _FREE_JOINT if isinstance(joint, QuaternionFloatingJoint) else _FIXED_JOINT, np.zeros(3)
 
 
 @njit(cache=True)
@@ -131,9 +128,8 @@ def poses_and_twists_into(joints, state, out):
         elif kind == _FREE_JOINT:
             lever = rotate_vector(turn, vector_at(state, q + 4))
             place = plus(place, lever)
-            speed = plus(
-                plus(speed, cross(spin, lever)), rotate_vector(turn, vector_at(state, v + 3))
-            )
+            speed = plus(speed, cross(spin, lever))
+            speed = plus(speed, rotate_vector(turn, vector_at(state, v + 3)))
             spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
             turn = quaternion_product(turn, normalized_quaternion(quaternion_at(state, q)))
         # From M to B.
@@ -173,10 +169,8 @@ def interpolate_joint_state(joints, h, u, start, end, out):
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):
             out[q], out[v] = _hermite_value_and_rate(h, u, start[q], start[v], end[q], end[v])
         elif kind == _FREE_JOINT:
-            for i in range(3):
-                out[q + 4 + i], out[v + 3 + i] = _hermite_value_and_rate(
-                    h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
-                )
+            for i, j in ((q + 4, v + 3), (q + 5, v + 4), (q + 6, v + 5)):
+                out[i], out[j] = _hermite_value_and_rate(h, u, start[i], start[j], end[i], end[j])
             a, b = quaternion_at(start, q), quaternion_at(end, q)
             a_dot = _quaternion_rate(vector_at(start, v), a)
             b_dot = _quaternion_rate(vector_at(end, v), b)
@@ -185,8 +179,7 @@ def interpolate_joint_state(joints, h, u, start, end, out):
             y, y_dot = _hermite_value_and_rate(h, u, a[2], a_dot[2], b[2], b_dot[2])
             z, z_dot = _hermite_value_and_rate(h, u, a[3], a_dot[3], b[3], b_dot[3])
             out[q], out[q + 1], out[q + 2], out[q + 3] = w, x, y, z
-            spin = quaternion_product(
-                (w_dot, x_dot, y_dot, z_dot), conjugate_quaternion((w, x, y, z))
-            )
+            inverse = conjugate_quaternion((w, x, y, z))
+            spin = quaternion_product((w_dot, x_dot, y_dot, z_dot), inverse)
             scale = 2.0 / (w * w + x * x + y * y + z * z)
             out[v], out[v + 1], out[v + 2] = scale * spin[1], scale * spin[2], scale * spin[3]

@@ -37,7 +37,7 @@ PAIR_STIFFNESS_COLUMN, PAIR_FRICTION_COLUMNS, BOX_BODY_ROW_COLUMN = 22, slice(24
 #: Number of columns of `ShapePairs.compiled_pairs` and `ShapePairs.monitored_pairs`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
-_SLIP_SPEED_REGULARIZATION_M_S = 1e-14  # m/s, as in Drake: a point at rest has a direction
+_SLIP_SPEED_REGULARIZATION_M_S = 1e-14  # as in Drake: a point at rest has a direction
 
 
 class ShapePairs(NamedTuple):
@@ -94,14 +94,10 @@ def FindContactPairs(
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
                     sphere, edges = _require_sphere_and_box(inspector, own, other)
-                    law = _combined_contact_law(
-                        *map(inspector.GetProximityProperties, (own, other))
-                    )
-                    half = np.array(edges.size()) / 2
-                    place = [X_SShape.translation(), [sphere.radius()]]
-                    compiled_pairs.append(
-                        _pair_row(place, X_Other, half, [direction, law, [slip_speed, row]])
-                    )
+                    materials = map(inspector.GetProximityProperties, (own, other))
+                    last = [direction, _combined_contact_law(*materials), [slip_speed, row]]
+                    place, half = [X_SShape.translation(), [sphere.radius()]], edges.size() / 2
+                    compiled_pairs.append(_pair_row(place, X_Other, half, last))
                 except DrakeTeleopError as beyond:
                     monitoring_reason = monitoring_reason or str(beyond)
                     own_box, box = _bounding_box(inspector, own), _bounding_box(inspector, other)
@@ -118,9 +114,8 @@ def FindContactPairs(
 
 
 def _pair_row(first: list[Any], X_Other: RigidTransform, half: Array, last: list[Any]) -> Array:
-    return np.concatenate(
-        [*first, X_Other.rotation().matrix().ravel(), X_Other.translation(), half, *last]
-    )
+    pose = X_Other.rotation().matrix().ravel(), X_Other.translation()
+    return np.concatenate([*first, *pose, half, *last])
 
 
 def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
@@ -178,7 +173,7 @@ def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -
 def depth_of_sphere_in_box(
     pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal_and_point: Array
 ) -> float:
-    """Return the depth of a sphere in a box [m], below 0 if they are apart.
+    """Return the depth of a sphere in a box [m]; below 0 if they are apart, not the distance.
 
     Args:
         pair: (28,) row of `ShapePairs.compiled_pairs`.

@@ -23,8 +23,8 @@ from drake_teleop.station.environment.environment import (
 )
 
 _BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
-_WALL_THICKNESS_M = 0.1  # m; deep enough that a tool leaves through the face
-_FOOT_RADIUS_M, _TABLE_THICKNESS_M = 0.002, 0.05  # m: radius of the balls, thickness of the table
+_WALL_THICKNESS_M = 0.1  # deep enough that a tool leaves through the face
+_FOOT_RADIUS_M, _TABLE_THICKNESS_M = 0.002, 0.05
 _BLOCK_BODY_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 
@@ -134,9 +134,8 @@ class Block(Surface):
     def AddTo(self, plant: MultibodyPlant) -> None:
         if min(self.table) > 0.0:
             below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS_M / 2]
-            AddFixedBox(
-                plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS_M], self
-            )
+            size = [*self.table, _TABLE_THICKNESS_M]
+            AddFixedBox(plant, "table", RigidTransform(below), size, self)
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
         body = plant.AddRigidBody(_BLOCK_BODY_NAME, NewInstance(plant, _BLOCK_BODY_NAME), inertia)
         x, y, foot = self.position
@@ -150,10 +149,8 @@ class Block(Surface):
         plant.RegisterVisualGeometry(body, here, box, _BLOCK_BODY_NAME, _BLOCK_COLOUR)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
             place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS_M))
-            ball = Sphere(_FOOT_RADIUS_M)
-            plant.RegisterCollisionGeometry(
-                body, place, ball, f"{_FOOT_NAME_PREFIX}{k}", self.material()
-            )
+            ball, name = Sphere(_FOOT_RADIUS_M), f"{_FOOT_NAME_PREFIX}{k}"
+            plant.RegisterCollisionGeometry(body, place, ball, name, self.material())
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex

@@ -11,19 +11,10 @@ from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
+from drake_teleop.load import regressor
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import FLAG_INDEX, ContactDetector, update_contact_flag
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_OVER_MAX, NoiseFloor
-from drake_teleop.load.regressor import (
-    FIRST_JOINT_INDEX,
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_TIME_INDEX,
-    SAMPLE_WRENCH,
-    SATURATION_FLAG_INDEX,
-    sample_size,
-)
 from drake_teleop.station.slave.arm import ArmModel, acceleration_from_specific_force_into
 
 
@@ -45,9 +36,9 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _contact_flag_with_arm(memory, sample, estimate, arm, settings):
-    acceleration = np.empty(3)
-    q = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]
-    acceleration_from_specific_force_into(arm, q, sample[SAMPLE_SPECIFIC_FORCE], acceleration)
+    s, acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE], np.empty(3)
+    q = sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX]
+    acceleration_from_specific_force_into(arm, q, s, acceleration)
     return update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings)
 
 
@@ -60,9 +51,9 @@ def update_contact_flag_with_sample(memory, sample, estimate, acceleration, sett
     if not (are_finite_and_in_range(sample) and are_finite_and_in_range(estimate)):
         return memory[FLAG_INDEX] != 0.0
     contact = np.empty(6)
-    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
-    wrench, offset, phi = sample[SAMPLE_WRENCH], estimate[:6], estimate[6:]
+    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
+    wrench, offset, phi = sample[regressor.SAMPLE_WRENCH], estimate[:6], estimate[6:]
     scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
     return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)
 
@@ -107,7 +98,7 @@ class ContactDetection(LeafSystem):
     def _declare_sample_ports(self, arm: ArmModel | None) -> Any:
         assert arm is not None
         self._arm = arm.table
-        return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+        return self.DeclareVectorInputPort("sample", regressor.sample_size(arm.num_joints) + 1)
 
     def _next_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array
@@ -117,7 +108,7 @@ class ContactDetection(LeafSystem):
     def _update_contact_flag_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
         blind = discrete_state.get_mutable_value(self._blind_samples)
-        if sample[SATURATION_FLAG_INDEX] > 0.5:
+        if sample[regressor.SATURATION_FLAG_INDEX] > 0.5:
             blind[0] = self._recovery
             return
         if blind[0] > 0.0:

@@ -24,7 +24,6 @@ from drake_teleop.load.online.watched import (
 )
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
-# Samples between two checks for settling.
 _SAMPLES_PER_SETTLING_CHECK = 16
 
 
@@ -106,22 +105,19 @@ class LoadEstimator(LeafSystem):
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
-        self.DeclareVectorOutputPort(
-            "load_state", 1, weak_callback(self._calc_load_state), {self.xd_ticket()}
-        )
+        calculate = weak_callback(self._calc_load_state)
+        self.DeclareVectorOutputPort("load_state", 1, calculate, {self.xd_ticket()})
         if config.watch:
-            unknown = np.zeros(MEMORY_SIZE)
             self.DeclareDiscreteState(
-                unknown if covariance is None else initial_monitor_memory(start, covariance)
+                np.zeros(MEMORY_SIZE)
+                if covariance is None
+                else initial_monitor_memory(start, covariance)
             )
             change = change_detector_parameters(
                 noise_std, motion_std, period, relative_wrench_error=config.relative_wrench_error
             )
-            self._watch_arguments = (
-                np.zeros(10) if fallback is None else np.array(fallback, dtype=float),
-                period,
-                *change,
-            )
+            safe = np.zeros(10) if fallback is None else np.array(fallback, dtype=float)
+            self._watch_arguments = safe, period, *change
         if config.enabled or config.watch:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_or_monitor_load)
 
@@ -136,9 +132,8 @@ class LoadEstimator(LeafSystem):
         if self._load_state_index(discrete_state) == STATE_LEARNING:
             self._update_estimate(estimate, sample, discrete_state, context.get_time())
         else:
-            monitor_load(
-                estimate, discrete_state.get_mutable_value(2), sample, *self._watch_arguments
-            )
+            memory = discrete_state.get_mutable_value(2)
+            monitor_load(estimate, memory, sample, *self._watch_arguments)
 
     def _update_estimate(
         self, estimate: Array, sample: Array, discrete_state: DiscreteValues, time: float

@@ -80,11 +80,7 @@ class ForceScalingConfig:
         None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
     )
     gripper_phi: list[float] | None = quantity(
-        None,
-        "kg, kg m, kg m^2",
-        -1e3,
-        1e3,
-        "phi of the gripper alone; null: all is gripper",
+        *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
         length=10,
     )
     force_scale: float = quantity(
@@ -100,8 +96,8 @@ class ForceScalingConfig:
     def scales(self, where: str = "force_scaling") -> Scales:
         """Return the scales of gripper, object and contact.
 
-        A DrakeTeleopError is raised if eta is combined with other scales, or gripper_phi is None,
-        or has a negative mass.
+        Raises:
+            DrakeTeleopError: for eta with other scales or without gripper_phi, or a negative mass.
         """
         if self.gripper_phi is not None and self.gripper_phi[0] < 0.0:
             raise DrakeTeleopError(
@@ -136,11 +132,7 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
 
 
 def wrench_to_master(
-    wrench_S: Array,
-    R_WS: Array,
-    R_WB: Array,
-    force_scale: float,
-    torque_scale: float,
+    wrench_S: Array, R_WS: Array, R_WB: Array, force_scale: float, torque_scale: float
 ) -> Array:
     """Return the wrench to render (..., 6), the scaled reaction to the sensor's wrench: F_E_B.
 
@@ -185,10 +177,8 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     )  # fmt: skip
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
-        gravity = np.empty(3)
-        acceleration_from_specific_force_into(
-            arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity
-        )
+        q, gravity = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.empty(3)
+        acceleration_from_specific_force_into(arm, q, np.zeros(3), gravity)
         add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
@@ -200,9 +190,8 @@ def find_sample_fault(sample, estimate, time, valid_range):
     """
     if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and are_finite_and_in_range(
-        sample[SAMPLE_MOTION]
-    )
+    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG
+    reading = reading and are_finite_and_in_range(sample[SAMPLE_MOTION])
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
@@ -296,21 +285,16 @@ class ForceScaling(LeafSystem):
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         # Without time: a change of scales advances with each new sample.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-        for name, calc in (
-            ("scaled_wrench_S", self._calc_scaled),
-            ("contact_wrench_S", self._calc_contact),
-            ("non_contact_wrench_S", self._calc_non_contact),
-            ("wrench_B", self._calc_wrench_B),
-            ("load_wrench_B", self._calc_load_wrench_B),
+        for name, size, calc in (
+            ("scaled_wrench_S", 6, self._calc_scaled),
+            ("contact_wrench_S", 6, self._calc_contact),
+            ("non_contact_wrench_S", 6, self._calc_non_contact),
+            ("wrench_B", 6, self._calc_wrench_B),
+            ("load_wrench_B", 6, self._calc_load_wrench_B),
+            ("fault", 1, self._calc_fault),
+            ("scaled_contact_and_fault", 13, self._calc_scaled_contact_and_fault),
         ):
-            self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
-        self.DeclareVectorOutputPort("fault", 1, weak_callback(self._calc_fault), inputs)
-        self.DeclareVectorOutputPort(
-            "scaled_contact_and_fault",
-            13,
-            weak_callback(self._calc_scaled_contact_and_fault),
-            inputs,
-        )
+            self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
     def SetScales(
         self,
@@ -342,9 +326,8 @@ class ForceScaling(LeafSystem):
         parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        _scaled_wrench_at_time_into(
-            *self._evaluate_inputs(context), self._arm, output.get_mutable_value()
-        )
+        inputs = self._evaluate_inputs(context)
+        _scaled_wrench_at_time_into(*inputs, self._arm, output.get_mutable_value())
 
     def _calc_scaled_contact_and_fault(self, context: Context, output: BasicVector) -> None:
         inputs = self._evaluate_inputs(context)
@@ -356,10 +339,8 @@ class ForceScaling(LeafSystem):
         output[0] = find_sample_fault(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        constants = self._arm, _CONTACT_ONLY_SCALES
-        _scaled_wrench_into(
-            *self._evaluate_inputs(context)[:3], *constants, output.get_mutable_value()
-        )
+        inputs = self._evaluate_inputs(context)[:3]
+        _scaled_wrench_into(*inputs, self._arm, _CONTACT_ONLY_SCALES, output.get_mutable_value())
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
@@ -379,9 +360,8 @@ class ForceScaling(LeafSystem):
 
     def _calc_rendered(self, context: Context, contact: float, output: BasicVector) -> None:
         constants = self._arm, self._R_WB, self._valid_range, contact
-        _rendered_wrench_into(
-            *self._evaluate_inputs(context), *constants, output.get_mutable_value()
-        )
+        inputs = self._evaluate_inputs(context)
+        _rendered_wrench_into(*inputs, *constants, output.get_mutable_value())
 
     def _evaluate_inputs(self, context: Context) -> tuple[Any, ...]:
         estimate = self._estimate.Eval(context)

@@ -14,8 +14,8 @@ from drake_teleop.station.slave.arm import ArmModel, pose_into
 class JointCoupling(LeafSystem):
     """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open the commanded joints are constant. When it closes they jump to the
-    leader's joints and follow them.
+    While the clutch is open the command is constant. When it closes the command jumps to
+    start + (leader's joints - home), and follows it.
 
     .. pydrake_system::
 
@@ -38,7 +38,7 @@ class JointCoupling(LeafSystem):
             raise DrakeTeleopError(
                 f"the leader has {len(home)} joints, but the slave {len(start)} (they must agree)",
                 where="master.leader.leads",
-                remedy="lead by the pose, or give arms of the same kinematics",
+                remedy="set leads: pose, or give arms of the same kinematics",
             )
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
         self._state = self.DeclareVectorInputPort("master_state", 2 * n)
@@ -54,7 +54,6 @@ class JointCoupling(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._update_held_joints_and_clutch)
 
     def _commanded_joint_positions(self, context: Context) -> Array:
-        """Return the leader's positions plus the offset, or the held command (n,) [rad]."""
         memory, n = context.get_discrete_state(0).value(), len(self._offset)
         joints: Array = memory[:n]
         return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints
@@ -63,15 +62,14 @@ class JointCoupling(LeafSystem):
         output.SetFromVector(self._commanded_joint_positions(context))
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        pose_into(
-            self._table,
-            np.array(self._commanded_joint_positions(context)),
-            output.get_mutable_value(),
-        )
+        joints = np.array(self._commanded_joint_positions(context))
+        pose_into(self._table, joints, output.get_mutable_value())
 
     def _update_held_joints_and_clutch(
         self, context: Context, discrete_state: DiscreteValues
     ) -> None:
         memory = discrete_state.get_mutable_value(0)
-        memory[:-1] = self._commanded_joint_positions(context)
+        joints = self._commanded_joint_positions(context)
+        if np.isfinite(joints).all():  # an opened clutch must hold a finite command
+            memory[:-1] = joints
         memory[-1] = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5

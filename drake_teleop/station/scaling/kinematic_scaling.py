@@ -14,11 +14,16 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     copy_into,
+    minus,
     normalized_quaternion,
+    plus,
+    quaternion_at,
     quaternion_exponential,
     quaternion_logarithm,
     quaternion_product,
     rotate_vector,
+    scale_vector,
+    vector_at,
 )
 
 
@@ -37,8 +42,7 @@ class KinematicScalingConfig:
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
     """Return the quaternion of the rotation about the same axis by `scale` times the angle."""
-    v = quaternion_logarithm(rotation)
-    return quaternion_exponential((scale * v[0], scale * v[1], scale * v[2]))
+    return quaternion_exponential(scale_vector(scale, quaternion_logarithm(rotation)))
 
 
 @njit(cache=True)
@@ -51,23 +55,15 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
     `pose` is X_BE of the master now, `master` and `command` are X_BE and X_WS at the closing of
     the clutch, `alignment` is the quaternion of R_WB.
     """
-    R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
-    offset = rotate_vector(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
-    now = (pose[0], pose[1], pose[2], pose[3])
-    reference = (master[0], master[1], master[2], master[3])
-    rotation_B = scaled_rotation(
-        quaternion_product(now, conjugate_quaternion(reference)), rotation_scale
-    )
-    rotation_W = quaternion_product(
-        quaternion_product(R_WB, rotation_B), conjugate_quaternion(R_WB)
-    )
-    orientation = normalized_quaternion(
-        quaternion_product(rotation_W, (command[0], command[1], command[2], command[3]))
-    )
-    for k in range(4):
-        out[k] = orientation[k]
-    for k in range(3):
-        out[4 + k] = command[4 + k] + translation_scale * offset[k]
+    R_WB, R_BE = quaternion_at(alignment, 0), quaternion_at(pose, 0)
+    offset = rotate_vector(R_WB, minus(vector_at(pose, 4), vector_at(master, 4)))
+    turn = quaternion_product(R_BE, conjugate_quaternion(quaternion_at(master, 0)))
+    turn_B = scaled_rotation(turn, rotation_scale)
+    turn_W = quaternion_product(quaternion_product(R_WB, turn_B), conjugate_quaternion(R_WB))
+    orientation = quaternion_product(turn_W, quaternion_at(command, 0))
+    out[0], out[1], out[2], out[3] = normalized_quaternion(orientation)
+    scaled = scale_vector(translation_scale, offset)
+    out[4], out[5], out[6] = plus(vector_at(command, 4), scaled)
 
 
 @njit(cache=True, omits_reference_counting=True)

@@ -27,20 +27,13 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_JOINT_POSITION,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    SATURATION_FLAG_INDEX,
-)
+from drake_teleop.load import regressor
 from drake_teleop.station.sensor.sensor_chain import (
     READ_ANGLES,
     READ_SATURATED,
     WristSensorConfig,
     butterworth_sections,
+    group_delay_samples,
     low_pass_in_place,
     settle_low_pass,
     shift_delay_line,
@@ -113,7 +106,7 @@ def steady_state_kalman_gains(
 ) -> Array:
     """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
 
-    The Kalman filter has a measured position x, and an acceleration a with a drifting error.
+    The Kalman filter has a measured position, and a measured acceleration with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -142,7 +135,8 @@ def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
     wrench, acceleration, encoders = sensor.reading_delays(period)
-    encoders += _group_delay_samples(_angle_low_pass_sections(config, sensor, period)) * period
+    sections = _angle_low_pass_sections(config, sensor, period)
+    encoders += float(np.sum([group_delay_samples(section) for section in sections])) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
@@ -154,10 +148,8 @@ def fusion_gains(
 ) -> tuple[Array, Array]:
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
-    angle_std, drift = (
-        _sensor_rotation_std_by_encoders(sensor, num_joints),
-        config.angular_acceleration_drift,
-    )
+    angle_std = _sensor_rotation_std_by_encoders(sensor, num_joints)
+    drift = config.angular_acceleration_drift
     return (
         steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
         steady_state_kalman_gains(
@@ -187,7 +179,6 @@ def estimated_motion_std(
 
 
 def _sensor_rotation_std_by_encoders(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the standard deviation [rad] of the rotation of S by the encoders' rounding."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
@@ -245,11 +236,6 @@ def _angle_low_pass_sections(
     return filters
 
 
-def _group_delay_samples(sections: Array) -> float:
-    b0, b1, b2, a1, a2 = sections.T
-    return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
-
-
 @njit(cache=True)
 def estimate_sample_into(constants, memory, arm, reading, sample):
     """Convert one reading of the sensor per period to a sample whose values have the same instant.
@@ -262,7 +248,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     n = arm.shape[0] - 1
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
-    angles = sample[SAMPLE_JOINT_POSITION]
+    angles = sample[regressor.SAMPLE_JOINT_POSITION]
     _align_signal_paths(constants, memory, n, reading, sample)
     if memory[0] == 0.0:
         for i in range(3 * n):
@@ -270,7 +256,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     _differentiate_joint_angles(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
     if constants.encoders_only != 0.0:
-        copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
+        copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:
         _convert_and_fuse_accelerometer(
             constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample
@@ -284,17 +270,17 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
 
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
-    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
+    n = sample.shape[0] - regressor.SAMPLE_JOINT_POSITION.start
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     _align_signal_paths(constants, memory, n, reading, sample)
-    copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
+    copy_into(motion, 3, sample, regressor.SAMPLE_JOINT_POSITION.start, 3)
     _convert_and_fuse_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
 def _align_signal_paths(constants, memory, n, reading, sample):
-    sections, angles = constants.angle_low_passes, sample[SAMPLE_JOINT_POSITION]
+    sections, angles = constants.angle_low_passes, sample[regressor.SAMPLE_JOINT_POSITION]
     filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
@@ -304,30 +290,26 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
-    for i in range(12):
-        line[i] = reading[i]
-    for i in range(n):
-        line[12 + i] = angles[i]
+    copy_into(line, 0, reading, 0, 12)
+    copy_into(line, 12, angles, 0, n)
     if memory[0] == 0.0:
         for k in range(1, rows):
             copy_into(line, k * width, line, 0, width)
     wrench = int(constants.wait_samples[0]) * width
     acceleration = int(constants.wait_samples[1]) * width
-    waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
-    for i in range(6):
-        waited[i] = line[wrench + i]
-        read[i] = line[acceleration + 6 + i]
+    copy_into(sample, regressor.SAMPLE_WRENCH.start, line, wrench, 6)
+    copy_into(sample, regressor.SAMPLE_MOTION.start, line, acceleration + 6, 6)
     wait = int(constants.wait_samples[2])
     older = constants.wait_samples[2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    flagged = (
-        float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
-    )
+    flagged = memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
+    if reading[READ_SATURATED] != 0.0:
+        flagged = float(rows)
     memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
-    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAGGED_SAMPLES_LEFT_INDEX] > 0.0 else 0.0
+    sample[regressor.SATURATION_FLAG_INDEX] = 1.0 if flagged > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -344,13 +326,12 @@ def _differentiate_joint_angles(constants, joints, angles):
 @njit(cache=True)
 def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
     period, fused, starts = constants.period, constants.fused != 0.0, memory[0] == 0.0
-    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
+    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
     R_SA, R = matrix_as_tuple(constants.R_SA), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
-    for i in range(3):
-        omega[i] = motion[3 + i]
+    copy_into(omega, 0, motion, 3, 3)
 
     angular = memory[_ANGULAR_FUSION_FILTER_START:_LINEAR_FUSION_FILTER_START]
     linear = memory[_LINEAR_FUSION_FILTER_START:_KINEMATICS_SCRATCH_START]

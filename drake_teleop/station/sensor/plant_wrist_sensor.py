@@ -68,16 +68,13 @@ from drake_teleop.station.sensor.sensor_chain import (
 )
 
 _NAME_IN_ERRORS = "AddWristSensor"
-#: Default sampling period for continuous plants [s].
-_DEFAULT_SAMPLING_PERIOD_S = 1e-3
-#: Tolerance of whole multiples of the plant's time step, in steps.
-_STEP_RATIO_TOLERANCE = 1e-6
+_DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
 _SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
 _WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
 _GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
-# Configuration: R_WB, angular velocity of B in W, joint positions.
+# Configuration: R_WB (9), angular velocity of B in W (3), joint positions.
 _BODY_ROTATION_AND_RATE_SIZE = 12
 
 
@@ -107,9 +104,8 @@ def AddWristSensor(
             tool without mass, or an unsuitable period.
     """
     _check_plant(builder, plant)
-    sensor = PlantWristSensor(
-        plant, joint_or_frame, config or WristSensorConfig(ideal=True), period, model_instance
-    )
+    config = config or WristSensorConfig(ideal=True)
+    sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
     for port, source in {
@@ -121,9 +117,8 @@ def AddWristSensor(
     }.items():
         builder.Connect(source, sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
-        noise = RandomSource(
-            RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, SAMPLES_PER_NOISE_BLOCK * sensor.period
-        )
+        block_s = SAMPLES_PER_NOISE_BLOCK * sensor.period
+        noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem(f"{name}_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     return sensor
@@ -162,8 +157,8 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         plant: MultibodyPlant,
         joint_or_frame: Joint | Frame,
         config: WristSensorConfig,
-        period: float | None = None,
-        model_instance: ModelInstanceIndex | None = None,
+        period: float | None,
+        model_instance: ModelInstanceIndex | None,
     ) -> None:
         super().__init__()
         S, joint = _sensor_frame_and_weld(plant, joint_or_frame)
@@ -176,9 +171,8 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         which = [] if model_instance is None else [model_instance]
         n = self._n = plant.num_positions(*which)
         constants, chain = initialize_sensor_chain(config, 3 + n, self.period)
-        motion, estimator = initialize_motion_estimator(
-            MotionEstimationConfig(), config, 3 + n, self.period
-        )
+        sources = MotionEstimationConfig()
+        motion, estimator = initialize_motion_estimator(sources, config, 3 + n, self.period)
         sample = np.zeros(sample_size(n) + 1)
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
         held = np.full(_BODY_ROTATION_AND_RATE_SIZE + n, np.nan)
@@ -203,7 +197,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._store_body_rotation_rate_and_joints)
+            self.DeclareInitializationDiscreteUpdateEvent(self._store_configuration)
         first = 0
         for name, size in {**signal_sizes_of_sample(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
@@ -223,41 +217,33 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
         self.DeclareVectorOutputPort(name, size, calc_part_of_sample, {self.xd_ticket()})
 
-    def _body_rotation_rate_and_joint_positions(self, context: Context) -> Array:
+    def _configuration(self, context: Context) -> Array:
         _, body, _ = self._weld
         R_WB = self._poses.Eval(context)[body].rotation().matrix()
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _store_body_rotation_rate_and_joints(
-        self, context: Context, discrete_state: DiscreteValues
-    ) -> None:
-        discrete_state.get_mutable_value(0)[self._held] = (
-            self._body_rotation_rate_and_joint_positions(context)
-        )
+    def _store_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.get_mutable_value(0)[self._held] = self._configuration(context)
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
-        held = discrete_state.value(0)[self._held].copy()
+        configuration = discrete_state.value(0)[self._held].copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._store_body_rotation_rate_and_joints(context, discrete_state)
-        if step % self._steps_per_sample == 0:
-            configuration = (
-                held if self._pairs_steps else self._body_rotation_rate_and_joint_positions(context)
-            )
-            memory = discrete_state.get_mutable_value(0)
-            self._take_sample(context, configuration, memory)
-
-    def _take_sample(self, context: Context, configuration: Array, memory: Array) -> None:
+            self._store_configuration(context, discrete_state)
+        if step % self._steps_per_sample != 0:
+            return
+        if not self._pairs_steps:
+            configuration = self._configuration(context)
         reaction, body, geometry = self._weld
         acceleration = self._accelerations.Eval(context)[body].get_coeffs()
         force = self._reactions.Eval(context)[reaction].get_coeffs()
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
         truth = np.empty(TRUE_JOINT_ANGLES.start + 3 + self._n)
         _true_values_into(geometry, configuration, acceleration, force, truth)
-        sample = memory[self._sample]
-        filters = memory[self._filters]
+        memory = discrete_state.get_mutable_value(0)
+        sample, filters = memory[self._sample], memory[self._filters]
         _measure_sample_into(self._sensor, truth, noise, filters, sample[:SAMPLE_TIME_INDEX])
         sample[SAMPLE_TIME_INDEX] = context.get_time()
 

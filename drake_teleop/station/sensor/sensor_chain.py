@@ -144,10 +144,10 @@ class WristSensorConfig:
         return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
     def largest_plausible_wrench(self) -> Array:
-        """Return the largest plausible readings (6,) of force and torque [N, N m]."""
-        if self.saturates and not self.ideal:
-            return _PLAUSIBLE_RANGES_SATURATED * self.ranges()[:6]
-        return _PLAUSIBLE_RANGES_UNSATURATED * self.ranges()[:6]
+        """Return the largest plausible absolute readings (6,) of force and torque [N, N m]."""
+        limited = self.saturates and not self.ideal
+        factor = _PLAUSIBLE_RANGES_SATURATED if limited else _PLAUSIBLE_RANGES_UNSATURATED
+        return factor * self.ranges()[:6]
 
     def wrench_std(self) -> Array:
         """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""
@@ -175,9 +175,8 @@ class WristSensorConfig:
         """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
         delays = self.latency_samples(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
-            for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
-                lag = (b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)
-                delays[:2] += lag * period
+            for section in butterworth_sections(self.bandwidth_hz, 1 / period):
+                delays[:2] += group_delay_samples(section) * period
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
@@ -237,6 +236,12 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> Array:
         b0, a1, a2 = warped**2, 2 * (warped**2 - 1), 1 - damping + warped**2
         sections[row] = np.array([b0, 2 * b0, b0, a1, a2]) / a0
     return sections
+
+
+def group_delay_samples(section: Array) -> float:
+    """Return the delay of a section [b0, b1, b2, a1, a2] at low frequencies, in samples."""
+    b0, b1, b2, a1, a2 = section
+    return float((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2))
 
 
 def calibration_matrices(config: WristSensorConfig) -> tuple[Array, Array, Array]:
@@ -382,10 +387,9 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants.encoder_quantum
-    for i in range(_DELAY_LINE_ROW_SIZE, width):
-        angle = angles[i - _DELAY_LINE_ROW_SIZE]
-        row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
+    quantum, turned = constants.encoder_quantum, row[_DELAY_LINE_ROW_SIZE:]
+    for i in range(angles.shape[0]):
+        turned[i] = quantum * np.rint(angles[i] / quantum) if quantum > 0.0 else angles[i]
 
     if count == 0:
         for k in range(1, rows):
@@ -394,16 +398,13 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     late = constants.latency_samples
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
-    encoders = _DELAY_LINE_START + int(late[2]) * width
-    wrench, moved, turned = reading[READ_WRENCH], reading[READ_ACCELERATION], reading[READ_ANGLES]
-    for i in range(6):
-        wrench[i] = memory[force + i]
-        moved[i] = memory[acceleration + 6 + i]
+    copy_into(reading, READ_WRENCH.start, memory, force, 6)
+    copy_into(reading, READ_ACCELERATION.start, memory, acceleration + 6, 6)
     reading[READ_SATURATED] = max(
         memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
     )
-    for i in range(_DELAY_LINE_ROW_SIZE, width):
-        turned[i - _DELAY_LINE_ROW_SIZE] = memory[encoders + i]
+    encoders = _DELAY_LINE_START + int(late[2]) * width + _DELAY_LINE_ROW_SIZE
+    copy_into(reading, READ_ANGLES.start, memory, encoders, angles.shape[0])
 
 
 @njit(cache=True)

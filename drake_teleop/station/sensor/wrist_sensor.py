@@ -78,10 +78,7 @@ from drake_teleop.station.slave.plant_dynamics import (
 )
 from drake_teleop.station.wiring import connect_matching_inputs
 
-#: Tolerance of equal instants, in periods.
-_EQUAL_TIME_TOLERANCE_PERIODS = 1e-6
-#: Largest number of queued steps.
-_MAX_QUEUED_PLANT_STEPS = 16
+_EQUAL_TIME_TOLERANCE_PERIODS, _MAX_QUEUED_PLANT_STEPS = 1e-6, 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
@@ -328,14 +325,14 @@ class WristSensor(LeafSystem):
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
-        # No reference to the plant: it would be a cycle with the Diagram that owns this block.
-        self._watched, self._plant_size = contact.monitored_pairs, contact.plant_state_size
+        self._monitored_pairs = contact.monitored_pairs
         #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
         moving = contact.moving_bodies
         self.moving_bodies_sentence = ", ".join(moving) + " can move" * bool(moving)
+        # No reference to the plant: it would be a cycle with the Diagram that owns this block.
         copy = partial(ContactPlantCopy, slave.config, slave.environment, slave.start)
-        self._twin = cache(copy)  # made at its first use
-        self._max_twin_wrenches = 2 * self._max_queued_steps + int(hold_time / period) + 4
+        self._plant_copy = cache(copy)  # made at its first use
+        self._max_copy_wrenches = 2 * self._max_queued_steps + int(hold_time / period) + 4
         self._period = period
         self._event_periods = (hold_time, SAMPLES_PER_NOISE_BLOCK * period)
         self._no_noise, self._zero_wrench = np.zeros(NOISE_BLOCK_SIZE), np.zeros(6)
@@ -388,10 +385,10 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
+        """Take the due samples, and store them in the context."""
         seen = self._arm_state_and_surroundings(context)
-        self._take_samples(
-            context, seen, self._tool_proximity(*seen), False, _USE_COMPILED_CONTACT, self._result
-        )
+        near = self._tool_proximity(*seen)
+        self._take_samples(context, seen, near, False, _USE_COMPILED_CONTACT, self._result)
         context.SetDiscreteState(self._result[self._memory_slice])
 
     def reset_queue(self, context: Context) -> None:
@@ -417,18 +414,11 @@ class WristSensor(LeafSystem):
             return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q, sheet, plant = state[: self._n], surroundings[:2], surroundings[2:]
-        return tool_proximity(arm, pairs, self._watched, joints, q, sheet, plant)
+        return tool_proximity(arm, pairs, self._monitored_pairs, joints, q, sheet, plant)
 
     def _plant_contact_wrench_W(self, context: Context) -> Array:
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
-
-    def _plant_contact_wrench_So_W(self, context: Context) -> Array:
-        wrench_W = self._plant_contact_wrench_W(context).copy()
-        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-        forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
-        wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
-        return wrench_W
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
         seen = self._arm_state_and_surroundings(context)
@@ -460,25 +450,25 @@ class WristSensor(LeafSystem):
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
         own = 2 * self._n + 2
-        size = own + self._plant_size
-        told = np.zeros((1 + self._max_twin_wrenches, 2 + size))
-        physics = (*self._physics[:-1], told)
+        size = own + len(self._around) - 2
+        # Row 0: number of wrenches in the other rows, number requested, state of the last request.
+        table = np.zeros((1 + self._max_copy_wrenches, 2 + size))
+        physics = (*self._physics[:-1], table)
         # The state of each requested wrench depends on the previous wrenches.
-        for k in range(self._max_twin_wrenches):
-            told[0, :2] = k, 0.0
+        for k in range(self._max_copy_wrenches):
+            table[0, :2] = k, 0.0
             take_due_samples(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
-            if told[0, 1] <= k:
+            if table[0, 1] <= k:
                 return
-            asked = told[0, 2:]
-            told[1 + k, :6] = self._twin().wrench_W(asked[:own], asked[own:])
+            state = table[0, 2:]
+            table[1 + k, :6] = self._plant_copy().wrench_W(state[:own], state[own:])
 
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(
-            context.get_time()
-        ):
-            seen = self._arm_state_and_surroundings(context)
-            if not self._watched.size or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
-                memory, time = discrete_state.get_mutable_value(0), context.get_time()
+        time = context.get_time()
+        if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(time):
+            seen, monitored = self._arm_state_and_surroundings(context), self._monitored_pairs.size
+            if not monitored or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
+                memory = discrete_state.get_mutable_value(0)
                 if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
@@ -491,17 +481,19 @@ class WristSensor(LeafSystem):
         return abs(time - block * round(time / block)) < margin
 
     def _check_acceleration_for_unknown_forces(self, context: Context) -> EventStatus:
-        n = self._n
+        n, physics = self._n, self._physics
         state, around = self._arm_state_and_surroundings(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
         assemble_plant_state(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)
-        physics = self._physics
         near = self._tool_proximity(state, around)
         if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
-            applied = applied + self._plant_contact_wrench_So_W(context)
+            contact_W, p_WS = self._plant_contact_wrench_W(context).copy(), np.empty(3)
+            forward_kinematics(physics[0], state[:n], np.empty((3, 3)), p_WS)
+            contact_W[3:] -= np.cross(p_WS, contact_W[:3])  # about So instead of the world's origin
+            applied = applied + contact_W
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         contact_and_plant_rates_into(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
@@ -519,10 +511,9 @@ class WristSensor(LeafSystem):
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
-    touching = np.zeros(6)
-    motion = np.zeros(SENSOR_MOTION_SIZE)
+    no_contact, motion = np.zeros(6), np.zeros(SENSOR_MOTION_SIZE)
     truth = sample[regressor.SAMPLE_WRENCH_AND_MOTION]
-    true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
+    true_sample_into(arm.table, arm.phi_load, q, still, still, no_contact, motion, truth)
     sample[regressor.SAMPLE_JOINT_POSITION] = q
     return sample
 
