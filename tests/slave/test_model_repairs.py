@@ -383,7 +383,8 @@ MESHES = {
     "cut.gltf": '{"asset"',
     "shape.dae": "<COLLADA/>",
 }
-SHAPES = ('<ellipsoid a="-1" b="1" c="1"/>', '<box size="1 nan 1"/>', "<cone/>", "")
+SHAPES = ('<ellipsoid a="-1" b="1" c="1"/>', '<box size="1 nan 1"/>', "<cone/>", "",
+          '<mesh filename="flat.stl" scale="1 nan 1"/>')  # fmt: skip
 
 
 def test_damaged_meshes_are_dropped_and_stated_for_an_arm_only(tmp_path):

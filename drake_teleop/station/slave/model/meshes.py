@@ -30,7 +30,7 @@ _NUM_VALUES_OF_SHAPE_SIZES = {
     "mesh": {},
     "plane": {},
 }
-_MIN_HULL_VERTICES_OF_MESH = 3  # of a mesh
+_MIN_HULL_VERTICES_OF_MESH = 3
 _SKELETON_STICK_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -76,13 +76,15 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
     for name, count in sizes.items():
         values = _numbers_in_text(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
-            return f"the {name} of a {kind} is no usable size"
+            return f"the {name} of a {kind} is not between 0 and {MAX_MODEL_VALUE_SI:g} m"
     scale = _numbers_in_text(inner.get("scale") or inner.findtext("scale"))
-    places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
-    texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
-    numbers = [value for text in texts for value in _numbers_in_text(text)]
-    valid = all(scale) and all(abs(value) <= MAX_MODEL_VALUE_SI for value in numbers)
-    return None if valid else "of an invalid place or scale"
+    valid = len(scale) in (0, 1, 3) and all(0.0 < abs(x) <= MAX_MODEL_VALUE_SI for x in scale)
+    for place in (*shape.findall("origin"), *shape.findall("pose")):
+        texts = place.get("xyz", "0 0 0"), place.get("rpy", "0 0 0"), place.text
+        for text, counts in zip(texts, ((3,), (3,), (0, 6, 7)), strict=True):
+            values = _numbers_in_text(text)
+            valid &= len(values) in counts and all(abs(x) <= MAX_MODEL_VALUE_SI for x in values)
+    return None if valid else "a pose or scale is no list of finite numbers"
 
 
 def _numbers_in_text(text: str | None) -> list[float]:
