@@ -178,8 +178,7 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
         _advance_pose_over_joint(table, row, q[row] if row < n else 0.0, x)
     for i in range(3):
         p_WS[i] = x[9 + i]
-        for k in range(3):
-            R_WS[i, k] = x[12 + 3 * i + k]
+        R_WS[i, 0], R_WS[i, 1], R_WS[i, 2] = vector_at(x, 12 + 3 * i)
 
 
 @njit(cache=True)
@@ -378,7 +377,8 @@ def forward_dynamics(
 ) -> None:
     """Write joint accelerations vdot of M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
-    F is the wrench `wrench_W` on the load, about the world's origin [N, N m].
+    tau_friction is joint damping and dry friction, F the wrench `wrench_W` on the load, about the
+    world's origin [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -407,11 +407,8 @@ def pose_into(arm, q, pose):
     """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose`; `arm` is `ArmModel.table`."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm, q, R, p)
-    orientation = quaternion_of_matrix(R)
-    for i in range(4):
-        pose[i] = orientation[i]
-    for i in range(3):
-        pose[4 + i] = p[i]
+    pose[0], pose[1], pose[2], pose[3] = quaternion_of_matrix(R)
+    pose[4], pose[5], pose[6] = vector_at(p, 0)
 
 
 class ForwardKinematics(LeafSystem):

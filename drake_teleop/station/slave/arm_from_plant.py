@@ -52,7 +52,7 @@ def ArmModelFromPlant(
     """Return the arm between the world and the sensor frame of a finalized plant.
 
     A DrakeTeleopError is raised unless all its joints are revolute, prismatic or welds, and no
-    other joint moves on it.
+    other joint moves on its links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -158,8 +158,7 @@ def _table_row_of_body(
     rows: dict[BodyIndex, int],
     sensor_body: RigidBody,
 ) -> int | None:
-    moving = None
-    outermost = body
+    moving, outermost = None, body
     while True:
         if body.index() == sensor_body.index() and outermost.index() != body.index():
             return len(rows)
@@ -187,7 +186,7 @@ def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Arr
 def values_per_joint(
     arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
 ) -> Array:
-    """Return n values from n values or, with a default for none, from one for all joints."""
+    """Return one value per joint (n,) from n values; with a `default`, also from one or none."""
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
@@ -231,12 +230,8 @@ def fill_missing_joint_limits(
     place = f"{where}: acceleration"
     specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
     default = velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
-    reached = np.where(_is_positive_and_finite(specified), specified, default)
-    limits: Any = {
-        "velocity_limit": velocity,
-        "acceleration_limit": reached,
-        "effort_limit": effort,
-    }
+    limit = np.where(_is_positive_and_finite(specified), specified, default)
+    limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
     acceleration_text = (
@@ -270,7 +265,7 @@ def _is_positive_and_finite(limits: Array) -> NDArray[np.bool_]:
     return np.isfinite(limits) & (limits > 0)
 
 
-_MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
+_MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0
 
 
 def check_arm_lengths(arm: ArmModel, where: str) -> None:
@@ -279,10 +274,11 @@ def check_arm_lengths(arm: ArmModel, where: str) -> None:
     remedy = "give lengths in m, and inertias in kg m^2"
     if 0.0 < length < _MIN_ARM_LENGTH_M or length > _MAX_ARM_LENGTH_M:
         what = f"from its first joint to the sensor the arm is {length:.3g} m long"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
+        rule = f"{_MIN_ARM_LENGTH_M:g} to {_MAX_ARM_LENGTH_M:g} m are plausible"
+        raise DrakeTeleopError(f"{what} ({rule})", where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI_COLUMN:], strict=True):
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
         if distance > _MAX_ARM_LENGTH_M:
-            what = f"the mass moved by {name} is {distance:.3g} m away from it"
+            what = f"the mass moved by {name} is {distance:.3g} m away from it (over 50 m)"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

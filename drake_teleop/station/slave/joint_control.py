@@ -184,7 +184,6 @@ class HeldTorque(LeafSystem):
         super().__init__()
         self._limit = arm.effort_limit
         self._request = self.DeclareVectorInputPort("requested_torque", arm.num_joints)
-        self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)

@@ -19,6 +19,7 @@ from drake_teleop.common.vectors import (
     cross,
     dot,
     normalized_quaternion,
+    quaternion_at,
     quaternion_logarithm,
     quaternion_of_matrix,
     quaternion_product,
@@ -66,12 +67,8 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
     """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
-    a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
-    R = np.empty((3, 3))
-    for i in range(3):
-        for k in range(3):
-            R[i, k] = x[12 + 3 * i + k]
-    inverse = conjugate_quaternion(quaternion_of_matrix(R))
+    a = normalized_quaternion(quaternion_at(pose, 0))
+    inverse = conjugate_quaternion(quaternion_of_matrix(x[12:].reshape(3, 3)))
     turn = quaternion_logarithm(quaternion_product(a, inverse))
     squared = 0.0
     for i in range(3):

@@ -89,14 +89,6 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
         now[i], rate[i] = start, (end - start) / (samples * period)
 
 
-@njit(cache=True)
-def _evaluate_torque_line(state, time, torque):
-    """Write the torque (n,) at `time` [s]; `state` is a `line`, then its start time [s]."""
-    n = torque.shape[0]
-    for i in range(n):
-        torque[i] = state[i] + (time - state[-1]) * state[n + i]
-
-
 class SampledServo(LeafSystem):
     """Block that controls joints by computed torque, with several servo samples per event.
 
@@ -123,6 +115,7 @@ class SampledServo(LeafSystem):
         if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, slave.start)
+        # The line that `predict_torque_line` writes, then its start time.
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
@@ -131,8 +124,8 @@ class SampledServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        line = context.get_discrete_state_vector().value()
-        _evaluate_torque_line(line, context.get_time(), output.get_mutable_value())
+        n, line = self._n, context.get_discrete_state_vector().value()
+        output.SetFromVector(line[:n] + (context.get_time() - line[-1]) * line[n : 2 * n])
 
     def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
         n = self._n
