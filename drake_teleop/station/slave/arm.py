@@ -83,9 +83,8 @@ class ArmModel:
         """Middles (n,) of the joint ranges; for open ranges the permitted position nearest 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
         with np.errstate(invalid="ignore"):  # inf - inf
-            return np.where(
-                bounded, (self.lower + self.upper) / 2, np.clip(0.0, self.lower, self.upper)
-            )
+            middle = (self.lower + self.upper) / 2
+        return np.where(bounded, middle, np.clip(0.0, self.lower, self.upper))
 
     @property
     def phi_load(self) -> Array:
@@ -266,11 +265,9 @@ def _project_wrenches_on_joints(table: Array, link: Array, tau: Array) -> None:
         if table[row, IS_PRISMATIC_COLUMN] != 0.0:
             tau[row] = dot(vector_at(x, 0), vector_at(x, 6))
         else:
-            # Moment about the joint's origin.
-            moment = add_cross_product(
-                vector_at(x, 9), scale_vector(-1.0, vector_at(x, 3)), vector_at(x, 6)
-            )
-            tau[row] = dot(vector_at(x, 0), moment)
+            to_Wo = scale_vector(-1.0, vector_at(x, 3))
+            moment_about_Lo = add_cross_product(vector_at(x, 9), to_Wo, vector_at(x, 6))
+            tau[row] = dot(vector_at(x, 0), moment_about_Lo)
 
 
 @njit(cache=True)
@@ -403,10 +400,10 @@ def forward_dynamics(
 
 
 @njit(cache=True)
-def pose_into(arm, q, pose):
-    """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose`; `arm` is `ArmModel.table`."""
+def pose_into(table, q, pose):
+    """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose` (7,)."""
     R, p = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(arm, q, R, p)
+    forward_kinematics(table, q, R, p)
     pose[0], pose[1], pose[2], pose[3] = quaternion_of_matrix(R)
     pose[4], pose[5], pose[6] = vector_at(p, 0)
 

@@ -271,14 +271,14 @@ _MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0
 def check_arm_lengths(arm: ArmModel, where: str) -> None:
     """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum())
-    remedy = "give lengths in m, and inertias in kg m^2"
+    rule = f"{_MIN_ARM_LENGTH_M:g} to {_MAX_ARM_LENGTH_M:g} m are plausible"
+    remedy = f"give lengths in m ({rule}), and inertias in kg m^2"
     if 0.0 < length < _MIN_ARM_LENGTH_M or length > _MAX_ARM_LENGTH_M:
         what = f"from its first joint to the sensor the arm is {length:.3g} m long"
-        rule = f"{_MIN_ARM_LENGTH_M:g} to {_MAX_ARM_LENGTH_M:g} m are plausible"
-        raise DrakeTeleopError(f"{what} ({rule})", where=where, remedy=remedy)
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI_COLUMN:], strict=True):
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
         if distance > _MAX_ARM_LENGTH_M:
-            what = f"the mass moved by {name} is {distance:.3g} m away from it (over 50 m)"
+            what = f"the mass moved by {name} is {distance:.3g} m away from it"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

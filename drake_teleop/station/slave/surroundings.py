@@ -114,8 +114,10 @@ def MakeToolContactModel(
             contact = contact._replace(leaf_parameters=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_body_masses(plant, context, contact)
-    if reason := _reason_for_drake_contact(environment, contact):
-        return contact._replace(drake_contact_reason=reason)
+    if environment.hydroelastic:
+        return contact._replace(drake_contact_reason="contact is hydroelastic")
+    if contact.leaf_instance is not None and len(environment.parts) > 1:
+        return contact._replace(drake_contact_reason="the sheet spring is not the only object")
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
         joints, order = MakeJointTableAndRowBodies(plant, contact.moving_bodies.values())
@@ -158,14 +160,6 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         what = f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
         raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
-
-
-def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
-    if environment.hydroelastic:
-        return "contact is hydroelastic"
-    if contact.leaf_instance is not None and len(environment.parts) > 1:
-        return "the sheet spring is not the only object"
-    return ""
 
 
 def MovingBodiesExceptLeaf(

@@ -121,17 +121,13 @@ def _resolve_mesh_file(
 
 @lru_cache(maxsize=1024)
 def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
-    if path.suffix.lower() in (".gltf", ".vtk"):
-        try:
-            with silent_stderr():
-                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_HULL_VERTICES_OF_MESH
-        except RuntimeError:
-            return False
     try:
-        read_triangles(path)
-    except ValueError:
+        if path.suffix.lower() not in (".gltf", ".vtk"):
+            return len(read_triangles(path).faces) > 0
+        with silent_stderr():
+            return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_HULL_VERTICES_OF_MESH
+    except (RuntimeError, ValueError):
         return False
-    return True
 
 
 @lru_cache(maxsize=1024)

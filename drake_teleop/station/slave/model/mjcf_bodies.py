@@ -54,7 +54,6 @@ class Joint:
     ref: float
 
     def transformed_by(self, X: RigidTransform) -> Joint:
-        """Return a copy whose anchor and axis are transformed by X."""
         return replace(self, anchor=X @ self.anchor, axis=X.rotation() @ self.axis)
 
 
@@ -67,10 +66,6 @@ class Geom:
     size: list[float]
     attributes: Attributes
     mesh: Mesh | None
-
-    @property
-    def takes_part_in_contacts(self) -> bool:
-        return takes_part_in_contacts(self.attributes)
 
     @property
     def is_visible(self) -> bool:
@@ -166,9 +161,8 @@ class BodyReader:
             elif child.tag == "body":
                 body.children.append(self.read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
-                body.joints.append(
-                    self._read_joint(body, attributes, child.tag).transformed_by(X_BF)
-                )
+                joint = self._read_joint(body, attributes, child.tag)
+                body.joints.append(joint.transformed_by(X_BF))
             elif child.tag == "geom":
                 self._add_geom(body, attributes, X_BF)
             elif child.tag == "site":
@@ -189,11 +183,8 @@ class BodyReader:
         limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
         if kind == "hinge":
-            limits = limits and (
-                self._mjcf.angle_in_rad(limits[0]),
-                self._mjcf.angle_in_rad(limits[1]),
-            )
-            ref = self._mjcf.angle_in_rad(ref)
+            in_rad = self._mjcf.angle_in_rad
+            limits, ref = limits and (in_rad(limits[0]), in_rad(limits[1])), in_rad(ref)
         anchor = given.vector("pos", (0.0, 0.0, 0.0))
         return Joint(name, kind, anchor, axis / np.linalg.norm(axis), given, limits, ref)
 
@@ -243,9 +234,8 @@ class BodyReader:
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combine_mass_properties(
-                [self._mass_properties_of_geom(geom) for geom in body.geoms]
-            )
+            parts = [self._mass_properties_of_geom(geom) for geom in body.geoms]
+            given = combine_mass_properties(parts)
         mass, centre, inertia = given or ZERO_MASS_PROPERTIES
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:

@@ -61,9 +61,8 @@ def repair_inertia_and_detect_missing(
             report.state_repair("an inertia without a mass left out of", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, report)
         link.remove(inertial)
-        _add_inertial_element(
-            link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
-        )
+        pose = inertial.find("pose" if is_sdf else "origin")
+        _add_inertial_element(link, pose, mass, nearest, is_sdf=is_sdf)
     return not at_rest and not inertia.any()
 
 
@@ -81,10 +80,8 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
 def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) -> Array:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if (
-        0.0 < change <= _INERTIA_ROUNDING_SHARE
-        or 0.0 < change * np.abs(inertia).max() <= _INERTIA_ROUNDING_KG_M2
-    ):
+    largest_change = change * np.abs(inertia).max()
+    if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"

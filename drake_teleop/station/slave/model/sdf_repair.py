@@ -25,7 +25,6 @@ from drake_teleop.station.slave.model.urdf_repair import (
 )
 
 _MODEL_CONFIG_NAME, _URDF_SUFFIX, _SDF_SUFFIX = "model.config", ".urdf", ".sdf"
-_INCLUDE_URI_XPATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
 _CHILD_TAGS_READ_BY_DRAKE = {
     "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
@@ -53,11 +52,10 @@ def repair_sdf(
     report.raise_faults(file)
     inner = [
         _repair_included_file(uri, file, files, purpose, folder)
-        for uri in root.iterfind(_INCLUDE_URI_XPATH)
+        for uri in root.iterfind(".//include/uri")
     ]
-    own = convert_meshes_and_write_text(
-        root, file, files, report, folder if purpose.plant_has_shapes else None
-    )
+    mesh_folder = folder if purpose.plant_has_shapes else None
+    own = convert_meshes_and_write_text(root, file, files, report, mesh_folder)
     return merge_repaired_models(own.text, [own, *filter(None, inner)])
 
 
@@ -98,9 +96,8 @@ def _keep_model_with_sensor(
     root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
 ) -> None:
     worlds = root.findall("world")
-    models = [
-        each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")
-    ]
+    children = [child for scope in (root, *worlds) for child in scope]
+    models = [child for child in children if child.tag in ("model", "include")]
     if not worlds and len(models) <= 1:
         return
     with_sensor = [each for each in models if _has_sensor_frame(each, file, files, sensor)]

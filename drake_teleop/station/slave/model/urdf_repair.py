@@ -70,9 +70,8 @@ def repair_urdf(
     repair_links_and_joints(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
         _remove_references_to_missing_parts(root, report)
-    return convert_meshes_and_write_text(
-        root, file, files, report, folder if purpose.plant_has_shapes else None
-    )
+    mesh_folder = folder if purpose.plant_has_shapes else None
+    return convert_meshes_and_write_text(root, file, files, report, mesh_folder)
 
 
 def repair_links_and_joints(
@@ -87,15 +86,14 @@ def repair_links_and_joints(
     in_chain_ids = set(map(id, chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
-        for joint in list_joints(scope):
+        joints = list_joints(scope)
+        for joint in joints:
             if joint.get("name") in purpose.held_positions:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
             in_chain = id(joint) in in_chain_ids and joint.get("name") not in purpose.held_positions
             repair_joint(joint, links, report, in_chain=in_chain)
-        moving = {
-            joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
-        }
+        moving = {joint_end(each, "child") for each in joints if each.get("type") != "fixed"}
         for link in scope.findall("link"):
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
