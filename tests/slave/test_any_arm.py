@@ -336,7 +336,9 @@ def test_tip_is_on_a_tilted_ball(folder, scenario):
         "</link>", f"<collision>{ball}</geometry></collision></link>"
     )
     text = (folder / "arm.urdf").read_text()
-    text = text.replace("</robot>", tool + odd_arms.joint("to_ball", "fixed", "ft", "ball"))
+    text = text.replace(
+        "</robot>", tool + odd_arms.joint("to_ball", "fixed", "ft", "ball", "0 0 0")
+    )
     (folder / "ball.urdf").write_text(text + "</robot>")
     slave = dataclasses.replace(scenario.slave, model=str(folder / "ball.urdf"))
     np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.0, 0.22], atol=2e-4)

@@ -11,7 +11,7 @@ import pytest
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import Scenario, ScenarioFromData, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.station.slave.joint_control import MakeJointControl, servo_parameters_at_tool
+from drake_teleop.station.slave.joint_control import MakeJointControl, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.position_servo import POSITION_INTERFACES, PositionInterface
 
@@ -146,4 +146,4 @@ def test_scenario_overrides_single_interface_fields():
 def test_servo_at_tool_rejects_position_servo(arm):
     config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
     with pytest.raises(DrakeTeleopError, match="choose computed_torque"):
-        servo_parameters_at_tool(arm, HOME, config)
+        servo_at_tool(arm, HOME, config)

@@ -42,8 +42,7 @@ _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismat
 _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
 _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4
-# Default time to full speed [s].
-_DEFAULT_TIME_TO_SPEED_LIMIT_S = 0.4
+_DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
 
 
 def ArmModelFromPlant(
@@ -61,9 +60,8 @@ def ArmModelFromPlant(
             remedy="name the frame or link at which the sensor measures",
         )
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
-    inboard_joints = {
-        joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
-    }
+    all_joints = map(plant.get_joint, plant.GetJointIndices())
+    inboard_joints = {joint.child_body().index(): joint for joint in all_joints}
     joints = _moving_joints_to_sensor(inboard_joints, frame_S)
     actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
@@ -229,14 +227,12 @@ def fill_missing_joint_limits(
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     place = f"{where}: acceleration"
     specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
-    default = velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
+    default = velocity / _DEFAULT_TIME_TO_SPEED_S
     limit = np.where(_is_positive_and_finite(specified), specified, default)
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
-    acceleration_text = (
-        f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_LIMIT_S:g} s{hint}"
-    )
+    rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
         (unlimited, "turns without end", f"a range of +-{reach:g} m"),
         (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
@@ -245,7 +241,7 @@ def fill_missing_joint_limits(
             f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s",
             f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s",
         ),
-        (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
+        (~_is_positive_and_finite(specified), rate_text, rate_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
         (
             ~plausible,

@@ -45,12 +45,11 @@ def positions_with_tool_down(
 
 def home_posture(arm: ArmModel, position: list[float]) -> Array:
     q, status = positions_with_tool_down(arm, np.array(position))
-    if has_closed_form(arm):
-        remedy = "move it nearer to (0.55, 0, 0.45)"
-    else:
-        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
     if status != IkStatus.OK:
         what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
+        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
+        if has_closed_form(arm):
+            remedy = "move it nearer to (0.55, 0, 0.45)"
         raise DrakeTeleopError(what, where="slave.position", remedy=remedy)
     return q
 

@@ -228,7 +228,7 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
     return np.linalg.inv(J @ mobility @ J.T)
 
 
-def servo_parameters_at_tool(
+def servo_at_tool(
     arm: ArmModel, q: Array, config: JointControlConfig
 ) -> tuple[list[float], list[float], list[float]]:
     """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.

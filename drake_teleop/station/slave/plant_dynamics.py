@@ -175,17 +175,13 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
-    sheet, plant = x[half - 1 : 2 * half : half], x[2 * half :]
+    sheet, rest = x[half - 1 : 2 * half : half], x[2 * half :]
     if not _take_or_request_given_wrench(given, x, wrench_W):
-        environment_wrench_about_Wo_into(
-            arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W
-        )
+        environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, rest, wrench_W)
     else:
-        applied = np.empty(6)
-        environment_wrench_about_Wo_into(
-            arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied
-        )
-        wrench_W += applied
+        added, none = np.empty(6), pairs[:0]
+        environment_wrench_about_Wo_into(arm, none, joints, applied_W, q, v, sheet, rest, added)
+        wrench_W += added
     plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot)
 
 

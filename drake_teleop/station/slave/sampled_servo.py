@@ -58,6 +58,7 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
         line: (3 n,) output: torque now [N m], its rate [N m/s], torque of the last sample [N m].
     """
     n = command.shape[0]
+    kp, kv, speed_limit, effort_limit = servo
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
     predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
@@ -68,7 +69,7 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
         copy_into(predicted, 0, x, 0, n)
         copy_into(predicted, n, x, n + 1, n)
         computed_torque_into(
-            arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
+            arm, command, predicted, kp, kv, speed_limit, effort_limit, scratch, torque
         )
         for i in range(n):
             now[i] += torque[i]
@@ -84,8 +85,8 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
     for i in range(n):
         # `away` is half the rise of the line; both ends are clipped to the torque limits.
         mean, away = now[i] / samples, 6.0 * rate[i] / samples**2
-        start = min(max(mean - away, -servo[3][i]), servo[3][i])
-        end = min(max(mean + away, -servo[3][i]), servo[3][i])
+        start = min(max(mean - away, -effort_limit[i]), effort_limit[i])
+        end = min(max(mean + away, -effort_limit[i]), effort_limit[i])
         now[i], rate[i] = start, (end - start) / (samples * period)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations_with_replacement
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -12,10 +11,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_INERTIA_ENTRIES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-_PLACE_OF_INERTIA_ENTRY = dict(
-    zip(_INERTIA_ENTRIES, combinations_with_replacement(range(3), 2), strict=True)
-)
+# ixx: (0, 0), ixy: (0, 1) and so on.
+_PLACE_OF_INERTIA_ENTRY = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding

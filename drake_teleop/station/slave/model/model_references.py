@@ -171,19 +171,16 @@ class ModelFiles:
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
-                found = {
-                    file for each in named for file in _existing_raw_and_normalized_paths(each)
-                }
-                yield from (each for each in found if each != path.parent)
+                found = set[Path]().union(*map(_existing_raw_and_normalized_paths, named))
+                yield from found - {path.parent}
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
     def _addresses_in_file(self, path: Path) -> Iterator[str]:
         kind = path.suffix.lower()
         if path.is_dir():  # Gazebo model folder
-            yield from (
-                name for name in ("model.config", "manifest.xml") if (path / name).is_file()
-            )
+            names = "model.config", "manifest.xml"
+            yield from (name for name in names if (path / name).is_file())
         elif kind in (*_XML_SUFFIXES, ".config"):
             root = read_xml(path)
             self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDER_ATTRIBUTES}

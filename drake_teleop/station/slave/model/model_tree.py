@@ -63,7 +63,6 @@ def reduce_to_chain(
 
 
 def make_joint_fixed(joint: Element, report: RepairReport) -> None:
-    """Change a moving joint to a fixed one, at its default position."""
     if joint.get("type") == "fixed":
         return
     report.state_assumption("held:", joint.get("name", ""))
