@@ -125,12 +125,8 @@ def servo_gains_and_limits(
     arm: ArmModel, config: JointControlConfig
 ) -> tuple[float, float, Array, Array]:
     """Return position and velocity gain [1/s] and (n,) limits of joint speed and torque."""
-    return (
-        2 * np.pi * config.position_bandwidth_hz,
-        2 * np.pi * config.velocity_bandwidth_hz,
-        arm.velocity_limit,
-        arm.effort_limit,
-    )
+    kp, kv = 2 * np.pi * config.position_bandwidth_hz, 2 * np.pi * config.velocity_bandwidth_hz
+    return kp, kv, arm.velocity_limit, arm.effort_limit
 
 
 class JointControl(LeafSystem):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import GeometryId, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -121,11 +121,12 @@ def MakeToolContactModel(
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
         joints, order = MakeJointTableAndRowBodies(plant, contact.moving_bodies.values())
-    from_S = {
-        shape: _X_SBody(plant, context, sensor_frame, index)
-        for index, own in shapes.items()
-        for shape in own
-    }
+    from_S = dict[GeometryId, RigidTransform]()
+    for index, own in shapes.items():
+        frame = plant.get_body(index).body_frame()
+        X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
+        is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE)
+        from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
         found = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
@@ -141,14 +142,6 @@ def MakeToolContactModel(
         joint_table=joints,
         plant_state_size=size,
     )
-
-
-def _X_SBody(
-    plant: MultibodyPlant, context: Context, sensor_frame: Frame, index: BodyIndex
-) -> RigidTransform:
-    frame = plant.get_body(index).body_frame()
-    X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-    return RigidTransform() if X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE) else X_SBody
 
 
 def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:

@@ -179,7 +179,6 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site:
 
 
 def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
-
     def pair_with_moving_body(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
         carrier = body.name if id(body) in chain and body.joints else carrier
         yield body.name, carrier
