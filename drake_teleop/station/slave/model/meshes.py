@@ -18,8 +18,6 @@ from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, p
 from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
-# Suffixes of meshes that Drake accepts as collision shapes.
-_COLLISION_MESH_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Numbers of each dimension of a shape.
 _NUM_VALUES_OF_SHAPE_SIZES = {
     "box": {"size": 3},
@@ -30,7 +28,6 @@ _NUM_VALUES_OF_SHAPE_SIZES = {
     "mesh": {},
     "plane": {},
 }
-_MIN_HULL_VERTICES_OF_MESH = 3
 _SKELETON_STICK_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -104,7 +101,7 @@ def _resolve_mesh_file(
     if fault := files.file_access_fault(file, "meshes"):
         return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
-    if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
+    if suffix not in (".stl", ".obj", ".gltf", ".vtk"):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
     if (suffix == ".stl" or shape.tag == "collision") and not _is_mesh_readable(file, written):
         return f"{Path(address).suffix} meshes are empty or damaged"
@@ -125,7 +122,7 @@ def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file i
         if path.suffix.lower() not in (".gltf", ".vtk"):
             return len(read_triangles(path).faces) > 0
         with silent_stderr():
-            return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_HULL_VERTICES_OF_MESH
+            return Mesh(str(path)).GetConvexHull().num_vertices() >= 3
     except (RuntimeError, ValueError):
         return False
 

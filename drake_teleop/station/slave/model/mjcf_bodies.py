@@ -34,7 +34,6 @@ from drake_teleop.station.slave.model.model_numbers import (
 # Elements that generate bodies or joints.
 _BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
-_UNSUPPORTED_SHAPES = ("hfield", "sdf")
 # Numbers in size.
 _NUM_SIZE_VALUES_OF_SHAPE = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 _ROUND_ROD_SHAPES = ("capsule", "cylinder")
@@ -199,7 +198,7 @@ class BodyReader:
             size = [size[0], half, 0.0] if kind in _ROUND_ROD_SHAPES else [size[0], size[0], half]
         found = self.meshes.find(name) if name else None
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
-        if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
+        if kind in ("hfield", "sdf") or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
         elif not name and min(size[: _NUM_SIZE_VALUES_OF_SHAPE.get(kind, 0)], default=1.0) <= 0.0:
             fault = "shapes need a size above 0"

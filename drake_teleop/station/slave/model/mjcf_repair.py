@@ -37,7 +37,6 @@ from drake_teleop.station.slave.model.repair_report import (
 )
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
-_LOOP_EQUALITY_TAGS = ("connect", "weld", "distance")
 # Dynamics whose output has no range.
 _UNBOUNDED_ACTUATOR_DYNAMICS = ("integrator", "muscle", "user", "dcmotor")
 
@@ -107,7 +106,7 @@ def check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjc
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             report.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in _LOOP_EQUALITY_TAGS and _equality_closes_loop(given, carriers):
+        elif element.tag in ("connect", "weld", "distance") and _closes_loop(given, carriers):
             report.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
@@ -188,7 +187,7 @@ def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
     return dict(pair_with_moving_body(arm, "world"))
 
 
-def _equality_closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
+def _closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm

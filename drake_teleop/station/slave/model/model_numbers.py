@@ -129,7 +129,6 @@ _NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "spec
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
 _QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _QUANTITY_TAGS |= {"radius", "radii", "length", "scale", "drake:rotor_inertia", "drake:gear_ratio"}
-_MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 
 
 def parse_number(text: str | None) -> float:
@@ -195,7 +194,7 @@ def repair_joint(joint: Element, links: set[str], report: RepairReport, *, in_ch
 
 def _check_joint_type_mimic_and_axis(joint: Element, where: str, report: RepairReport) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
-    if kind not in _MOVING_JOINT_TYPES:
+    if kind not in ("revolute", "continuous", "prismatic"):
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
         report.add_fault(
             f"{name} is a {kind} joint{between}; up to the sensor, use joints that turn about one"

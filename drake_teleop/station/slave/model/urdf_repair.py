@@ -32,7 +32,6 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel, Repair
 
 _URDF_TAGS_READ_BY_DRAKE = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_TAGS_READ_BY_DRAKE |= {"drake:collision_filter_group"}
-_NUM_RGBA_VALUES = 4  # red, green, blue, opacity
 _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
@@ -196,7 +195,7 @@ def _has_valid_colour(material: Element) -> bool:
     colour = material.find("color")
     words = [] if colour is None else colour.get("rgba", "").split()
     values = [parse_number(word) for word in words]
-    return len(values) == _NUM_RGBA_VALUES and all(0.0 <= value <= 1.0 for value in values)
+    return len(values) == 4 and all(0.0 <= value <= 1.0 for value in values)
 
 
 def _remove_references_to_missing_parts(root: Element, report: RepairReport) -> None:
