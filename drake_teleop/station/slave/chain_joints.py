@@ -41,11 +41,9 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
     for joint in map(plant.get_joint, plant.GetJointIndices()):
         child = joint.child_body()
         if child.index() in parents or child.index() == world:
-            other = parents.get(child.index())
-            parents_text = joint.name()
-            if other is not None:
-                parents_text = f"two joints, {other.name()} and {joint.name()}"
-            what = f"link {child.name()} is the child of {parents_text}"
+            other, name = parents.get(child.index()), joint.name()
+            parent = name if other is None else f"two joints, {other.name()} and {name}"
+            what = f"link {child.name()} is the child of {parent}"
             remedy = "an arm is a tree: make each link the child of one joint, the world of none"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         parents[child.index()] = joint

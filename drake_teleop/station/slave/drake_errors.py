@@ -34,9 +34,8 @@ def translate_drake_errors(
         raise
     # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
-        reason = _PLACE_IN_REPAIRED_TEXT_PATTERN.sub(
-            "", _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
-        )
+        reason = _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
+        reason = _PLACE_IN_REPAIRED_TEXT_PATTERN.sub("", reason)
         if folder:
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {expected[0]}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -218,8 +218,7 @@ def AddSlavePlant(
     return SlavePlant(*parts, texts, slave, environment)
 
 
-@dataclass(frozen=True)
-class ParsedSlave:
+class ParsedSlave(NamedTuple):
     """Arm and tool in a plant that is not finalized; attributes as in `SlavePlant`."""
 
     slave: Slave

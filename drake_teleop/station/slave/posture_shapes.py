@@ -180,9 +180,6 @@ class PostureShapes:
         def bodies_of_link(body: RigidBody) -> set[BodyIndex]:
             return {each.index() for each in plant.GetBodiesWeldedTo(body)} - self.surroundings
 
-        def shapes_of_bodies(bodies: Collection[BodyIndex]) -> GeometrySet:
-            return GeometrySet([shape for each in bodies for shape in self.contact_shapes_of(each)])
-
         context, together = plant.CreateDefaultContext(), [self.surroundings]
         telescopes = list[tuple[Array, set[BodyIndex]]]()
         for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -201,7 +198,8 @@ class PostureShapes:
                 telescopes.append((axis, joined))
             together.append(joined)
         for bodies in together:
-            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes_of_bodies(bodies)))
+            shapes = [shape for each in bodies for shape in self.contact_shapes_of(each)]
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(shapes)))
 
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()

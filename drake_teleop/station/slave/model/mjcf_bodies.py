@@ -31,8 +31,6 @@ from drake_teleop.station.slave.model.model_numbers import (
     nearest_possible_inertia,
 )
 
-# Elements that generate bodies or joints.
-_BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 # Numbers in size.
 _NUM_SIZE_VALUES_OF_SHAPE = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
@@ -168,7 +166,7 @@ class BodyReader:
                 body.sites[child.get("name", "")] = X_BF @ self._mjcf.read_pose(attributes)
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
-            elif child.tag in _BODY_GENERATOR_TAGS:
+            elif child.tag in ("replicate", "attach", "composite", "flexcomp"):
                 body.generator_tags.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:

@@ -194,9 +194,8 @@ class ModelFiles:
         elif kind in (".gltf", ".glb"):
             yield from _addresses_in_gltf(path)
         elif kind in (".obj", ".mtl"):
-            for line in (
-                _OBJ_REFERENCE_PATTERN if kind == ".obj" else _MTL_REFERENCE_PATTERN
-            ).findall(path.read_bytes()):
+            pattern = _OBJ_REFERENCE_PATTERN if kind == ".obj" else _MTL_REFERENCE_PATTERN
+            for line in pattern.findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
 
