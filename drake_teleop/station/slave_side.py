@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.math import RollPitchYaw
@@ -38,7 +38,7 @@ from drake_teleop.station.wiring import connect_matching_inputs, connect_ports, 
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 SLAVE_MONITOR_PERIOD_S = 0.01
-# See `_check_friction_time_step`.
+# Stability limit of explicit steps for a decay, such as of speed by friction: rate times step.
 _MAX_FRICTION_RATE_TIMES_STEP = 2.0
 
 
@@ -87,18 +87,18 @@ def MakeSlaveSide(
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    led, torques = scenario.master.is_joint_leader, _is_torque_controller(controller, scenario)
-    body = _add_slave_blocks(
-        builder, scenario, load_estimate, load_covariance, custom_torque=torques
-    )
+    torques = _is_torque_controller(controller, scenario)
+    initial = load_estimate, load_covariance
+    body = _add_slave_blocks(builder, scenario, *initial, custom_torque=torques)
     arm = body.slave.arm
     if controller is not None:
         builder.AddNamedSystem("controller", controller)
-    setpoint = "leader_joints" if led else "pose_command"
+    follows_leader = scenario.master.is_joint_leader
+    setpoint = "leader_joints" if follows_leader else "pose_command"
     if torques:
         connect_ports(builder, controller, "joint_torque", body.joint_control, "requested_torque")
     else:
-        ik = _add_inverse_kinematics(builder, scenario, body, led)
+        ik = _add_inverse_kinematics(builder, scenario, body, follows_leader)
         if controller is None:
             builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
         else:
@@ -147,24 +147,25 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
     if controller is None:
         return False
     expect_type(System, controller, "controller", "make a Drake system: docs/station.md")
-    torques = controller.HasOutputPort("joint_torque")
-    for has, port in (
-        (controller.HasInputPort("pose_command"), "input port 'pose_command'"),
-        (torques or controller.HasOutputPort("pose_command"), "output port 'joint_torque'"),
-    ):
-        if not has:
-            remedy = "docs/station.md lists its ports"
-            raise DrakeTeleopError(f"the block has no {port}", where="controller", remedy=remedy)
+    torques: bool = controller.HasOutputPort("joint_torque")
+    missing = ""
+    if not controller.HasInputPort("pose_command"):
+        missing = "input port 'pose_command'"
+    elif not (torques or controller.HasOutputPort("pose_command")):
+        missing = "output port 'joint_torque' or 'pose_command'"
+    if missing:
+        remedy = "docs/station.md lists its ports"
+        raise DrakeTeleopError(f"the block has no {missing}", where="controller", remedy=remedy)
     scenario.master.check_pose_mode("a custom controller")
-    return bool(torques)
+    return torques
 
 
 def _add_inverse_kinematics(
     builder: DiagramBuilder, scenario: Scenario, body: _SlaveBlocks, follows_leader_joints: bool
 ) -> LeafSystem:
     arm = body.slave.arm
-    make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
-    make_ik = LeaderJointFollower if follows_leader_joints else make_ik
+    name = ik_method_name(scenario.slave.inverse_kinematics, arm)
+    make_ik = LeaderJointFollower if follows_leader_joints else IK_METHODS[name]
     ik = make_ik(arm, body.slave.start, body.command_period_s)
     builder.AddNamedSystem("inverse_kinematics", ik)
     if not follows_leader_joints:
@@ -192,8 +193,7 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     return builder.Build()
 
 
-@dataclass(frozen=True)
-class _SlaveBlocks:
+class _SlaveBlocks(NamedTuple):
     slave: SlavePlant
     joint_control: LeafSystem
     monitor: LeafSystem

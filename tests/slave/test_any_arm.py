@@ -330,6 +330,20 @@ def test_tip_is_between_fingers_of_gripper(folder, scenario):
     np.testing.assert_allclose(NominalSlave(slave).tip, [0.006, 0.02, 0.15], atol=1e-9)
 
 
+def test_tip_is_on_a_tilted_ball(folder, scenario):
+    ball = '<origin xyz="0 0 0.2" rpy="0.7853981633974483 0 0"/><geometry><sphere radius="0.02"/>'
+    tool = odd_arms.link("ball").replace(
+        "</link>", f"<collision>{ball}</geometry></collision></link>"
+    )
+    text = (folder / "arm.urdf").read_text()
+    text = text.replace(
+        "</robot>", tool + odd_arms.joint("to_ball", "fixed", "ft", "ball", "0 0 0")
+    )
+    (folder / "ball.urdf").write_text(text + "</robot>")
+    slave = dataclasses.replace(scenario.slave, model=str(folder / "ball.urdf"))
+    np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.0, 0.22], atol=2e-4)
+
+
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_joint_may_overshoot_limit_by_1_percent(scenario, beyond, stops, side):

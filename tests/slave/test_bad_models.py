@@ -257,6 +257,11 @@ ASSUMED = {
                       ('"0.01"', '"0"')), "an inertia corrected for rounding of l3"),
     "a mesh missing": (shaped('<mesh filename="package://none/a.stl"/>'),
                        "shapes are missing of l3: meshes were not found .--package-path"),
+    "a mesh with a scale of two numbers": (shaped('<mesh filename="arm.urdf" scale="1 1"/>'),
+                                           "missing of l3: a pose or scale is no list of finite"),
+    "a shape with a pose of two numbers": (
+        shaped('<sphere radius="1"/></geometry><origin xyz="0 0"/><geometry>'),
+        "missing of l3: a pose or scale is no list of finite numbers"),
     "a mesh of no kind": (shaped('<mesh filename="arm.urdf"/>'), ".urdf meshes cannot be read"),
     "a finger": (arm(beyond=FINGER), "held: j9"),
     "a motor of another joint": (arm(beyond=ROTOR.format("").replace("j3", "j33")),

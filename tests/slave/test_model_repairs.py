@@ -204,7 +204,7 @@ def test_hold_frees_chain_from_coupled_joint_and_opens_gripper(tmp_path):
             {"torso": 0.1},
             r"slave\.hold: the model has no moving joint 'torso'; name one of j1, j2, j3",
         ),
-        ({"j3": 2.6}, r"slave\.hold: j3 at 2\.6 is outside -2\.5 to 2\.5"),
+        ({"j3": 2.6}, r"slave\.hold: j3 at 2\.6 is outside its limits, -2\.5 to 2\.5"),
         ({"j3": float("nan")}, r"Slave\.hold\.j3: nan rad, m is outside -10000 to 10000"),
     ],
 )
@@ -383,7 +383,8 @@ MESHES = {
     "cut.gltf": '{"asset"',
     "shape.dae": "<COLLADA/>",
 }
-SHAPES = ('<ellipsoid a="-1" b="1" c="1"/>', '<box size="1 nan 1"/>', "<cone/>", "")
+SHAPES = ('<ellipsoid a="-1" b="1" c="1"/>', '<box size="1 nan 1"/>', "<cone/>", "",
+          '<mesh filename="flat.stl" scale="1 nan 1"/>')  # fmt: skip
 
 
 def test_damaged_meshes_are_dropped_and_stated_for_an_arm_only(tmp_path):

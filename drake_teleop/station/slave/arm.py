@@ -83,9 +83,8 @@ class ArmModel:
         """Middles (n,) of the joint ranges; for open ranges the permitted position nearest 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
         with np.errstate(invalid="ignore"):  # inf - inf
-            return np.where(
-                bounded, (self.lower + self.upper) / 2, np.clip(0.0, self.lower, self.upper)
-            )
+            middle = (self.lower + self.upper) / 2
+        return np.where(bounded, middle, np.clip(0.0, self.lower, self.upper))
 
     @property
     def phi_load(self) -> Array:
@@ -178,8 +177,7 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
         _advance_pose_over_joint(table, row, q[row] if row < n else 0.0, x)
     for i in range(3):
         p_WS[i] = x[9 + i]
-        for k in range(3):
-            R_WS[i, k] = x[12 + 3 * i + k]
+        R_WS[i, 0], R_WS[i, 1], R_WS[i, 2] = vector_at(x, 12 + 3 * i)
 
 
 @njit(cache=True)
@@ -267,11 +265,9 @@ def _project_wrenches_on_joints(table: Array, link: Array, tau: Array) -> None:
         if table[row, IS_PRISMATIC_COLUMN] != 0.0:
             tau[row] = dot(vector_at(x, 0), vector_at(x, 6))
         else:
-            # Moment about the joint's origin.
-            moment = add_cross_product(
-                vector_at(x, 9), scale_vector(-1.0, vector_at(x, 3)), vector_at(x, 6)
-            )
-            tau[row] = dot(vector_at(x, 0), moment)
+            to_Wo = scale_vector(-1.0, vector_at(x, 3))
+            moment_about_Lo = add_cross_product(vector_at(x, 9), to_Wo, vector_at(x, 6))
+            tau[row] = dot(vector_at(x, 0), moment_about_Lo)
 
 
 @njit(cache=True)
@@ -378,7 +374,8 @@ def forward_dynamics(
 ) -> None:
     """Write joint accelerations vdot of M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
-    F is the wrench `wrench_W` on the load, about the world's origin [N, N m].
+    tau_friction is joint damping and dry friction, F the wrench `wrench_W` on the load, about the
+    world's origin [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -403,15 +400,12 @@ def forward_dynamics(
 
 
 @njit(cache=True)
-def pose_into(arm, q, pose):
-    """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose`; `arm` is `ArmModel.table`."""
+def pose_into(table, q, pose):
+    """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose` (7,)."""
     R, p = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(arm, q, R, p)
-    orientation = quaternion_of_matrix(R)
-    for i in range(4):
-        pose[i] = orientation[i]
-    for i in range(3):
-        pose[4 + i] = p[i]
+    forward_kinematics(table, q, R, p)
+    pose[0], pose[1], pose[2], pose[3] = quaternion_of_matrix(R)
+    pose[4], pose[5], pose[6] = vector_at(p, 0)
 
 
 class ForwardKinematics(LeafSystem):

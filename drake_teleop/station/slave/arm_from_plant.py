@@ -42,8 +42,7 @@ _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismat
 _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
 _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4
-# Default time to full speed [s].
-_DEFAULT_TIME_TO_SPEED_LIMIT_S = 0.4
+_DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
 
 
 def ArmModelFromPlant(
@@ -52,7 +51,7 @@ def ArmModelFromPlant(
     """Return the arm between the world and the sensor frame of a finalized plant.
 
     A DrakeTeleopError is raised unless all its joints are revolute, prismatic or welds, and no
-    other joint moves on it.
+    other joint moves on its links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -61,9 +60,8 @@ def ArmModelFromPlant(
             remedy="name the frame or link at which the sensor measures",
         )
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
-    inboard_joints = {
-        joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
-    }
+    all_joints = map(plant.get_joint, plant.GetJointIndices())
+    inboard_joints = {joint.child_body().index(): joint for joint in all_joints}
     joints = _moving_joints_to_sensor(inboard_joints, frame_S)
     actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
@@ -158,8 +156,7 @@ def _table_row_of_body(
     rows: dict[BodyIndex, int],
     sensor_body: RigidBody,
 ) -> int | None:
-    moving = None
-    outermost = body
+    moving, outermost = None, body
     while True:
         if body.index() == sensor_body.index() and outermost.index() != body.index():
             return len(rows)
@@ -187,7 +184,7 @@ def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Arr
 def values_per_joint(
     arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
 ) -> Array:
-    """Return n values from n values or, with a default for none, from one for all joints."""
+    """Return one value per joint (n,) from n values; with a `default`, also from one or none."""
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
@@ -230,18 +227,12 @@ def fill_missing_joint_limits(
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     place = f"{where}: acceleration"
     specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
-    default = velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
-    reached = np.where(_is_positive_and_finite(specified), specified, default)
-    limits: Any = {
-        "velocity_limit": velocity,
-        "acceleration_limit": reached,
-        "effort_limit": effort,
-    }
+    default = velocity / _DEFAULT_TIME_TO_SPEED_S
+    limit = np.where(_is_positive_and_finite(specified), specified, default)
+    limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
-    acceleration_text = (
-        f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_LIMIT_S:g} s{hint}"
-    )
+    rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
         (unlimited, "turns without end", f"a range of +-{reach:g} m"),
         (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
@@ -250,7 +241,7 @@ def fill_missing_joint_limits(
             f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s",
             f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s",
         ),
-        (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
+        (~_is_positive_and_finite(specified), rate_text, rate_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
         (
             ~plausible,
@@ -270,13 +261,14 @@ def _is_positive_and_finite(limits: Array) -> NDArray[np.bool_]:
     return np.isfinite(limits) & (limits > 0)
 
 
-_MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
+_MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0
 
 
 def check_arm_lengths(arm: ArmModel, where: str) -> None:
     """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum())
-    remedy = "give lengths in m, and inertias in kg m^2"
+    rule = f"{_MIN_ARM_LENGTH_M:g} to {_MAX_ARM_LENGTH_M:g} m are plausible"
+    remedy = f"give lengths in m ({rule}), and inertias in kg m^2"
     if 0.0 < length < _MIN_ARM_LENGTH_M or length > _MAX_ARM_LENGTH_M:
         what = f"from its first joint to the sensor the arm is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)

@@ -41,11 +41,9 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
     for joint in map(plant.get_joint, plant.GetJointIndices()):
         child = joint.child_body()
         if child.index() in parents or child.index() == world:
-            other = parents.get(child.index())
-            parents_text = joint.name()
-            if other is not None:
-                parents_text = f"two joints, {other.name()} and {joint.name()}"
-            what = f"link {child.name()} is the child of {parents_text}"
+            other, name = parents.get(child.index()), joint.name()
+            parent = name if other is None else f"two joints, {other.name()} and {name}"
+            what = f"link {child.name()} is the child of {parent}"
             remedy = "an arm is a tree: make each link the child of one joint, the world of none"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         parents[child.index()] = joint
@@ -90,9 +88,8 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
     for body in free:
         plant.WeldFrames(plant.world_frame(), body.body_frame())
     names = [body.name() for body in free if body.name() != WORLD_NAME]
-    return (
-        [f"not connected to the arm and welded to the world: {join_names(names)}"] if names else []
-    )
+    note = f"not connected to the arm and welded to the world: {join_names(names)}"
+    return [note] if names else []
 
 
 def check_chain(
@@ -116,9 +113,8 @@ def weld_held_joints(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
     """Weld the joints named in `hold` at its positions [rad, m]; return notes for the user."""
-    known = {
-        plant.get_joint(k).name(): plant.get_joint(k) for k in joints if is_joint_moving(plant, k)
-    }
+    moving = [plant.get_joint(k) for k in joints if is_joint_moving(plant, k)]
+    known = {joint.name(): joint for joint in moving}
     for name, position in hold.items():
         joint = known.get(name)
         if joint is None:
@@ -130,7 +126,7 @@ def weld_held_joints(
             raise DrakeTeleopError(what, where="slave.hold", remedy="leave it out")
         lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         if lower < upper and not lower <= position <= upper:
-            what = f"{name} at {position:g} is outside {lower:g} to {upper:g}"
+            what = f"{name} at {position:g} is outside its limits, {lower:g} to {upper:g}"
             raise DrakeTeleopError(what, where="slave.hold", remedy="check the value and its unit")
         joint.set_default_positions(np.array([position]))
         _replace_joint_by_weld(plant, joint)
@@ -217,7 +213,7 @@ def assume_rotor_inertias(
 ) -> list[str]:
     """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
 
-    Beyond one of `auxiliary_bodies`, absent from the model, the next joint's links count too.
+    Links beyond the next joint count too if only `auxiliary_bodies`, not of the model, are between.
     """
     joints = [plant.get_joint(index) for index in chain]
     inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(joints, frame) ** 2

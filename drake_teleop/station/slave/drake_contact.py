@@ -78,11 +78,8 @@ class ContactPlantCopy:
         half = len(x) // 2
         if len(state):
             plant.SetPositionsAndVelocities(context, state)
-        parts = {
-            self._slave.instance: slice(half - 1),
-            contact.leaf_instance: slice(half - 1, half),
-        }
-        for instance, own in parts.items():
+        leaf = contact.leaf_instance, slice(half - 1, half)
+        for instance, own in ((self._slave.instance, slice(half - 1)), leaf):
             if instance is not None:
                 plant.SetPositions(context, instance, x[:half][own])
                 plant.SetVelocities(context, instance, x[half:][own])

@@ -29,7 +29,7 @@ _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def positions_with_tool_down(
     arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[Array, IkStatus]:
-    """Return joint positions (n,) [rad] for S at `position` (W) [m] and `R_WS`, and `IkStatus`."""
+    """Return joints (n,) [rad, m] for p_WS = `position` [m] and `R_WS`, and the `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _ELBOW_UP_POSTURE_RAD, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
@@ -45,12 +45,11 @@ def positions_with_tool_down(
 
 def home_posture(arm: ArmModel, position: list[float]) -> Array:
     q, status = positions_with_tool_down(arm, np.array(position))
-    if has_closed_form(arm):
-        remedy = "move it nearer to (0.55, 0, 0.45)"
-    else:
-        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
     if status != IkStatus.OK:
         what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
+        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
+        if has_closed_form(arm):
+            remedy = "move it nearer to (0.55, 0, 0.45)"
         raise DrakeTeleopError(what, where="slave.position", remedy=remedy)
     return q
 

@@ -37,8 +37,8 @@ _JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 class IkStatus(IntEnum):
     """Status of an inverse kinematics, whose search starts at the reference posture.
 
-    The numeric method reports WRIST_SINGULAR if the last three axes are nearly coplanar, and
-    SHOULDER_SINGULAR at other singularities.
+    The numeric method reports a singularity only if it misses the pose: WRIST_SINGULAR if the last
+    three axes are nearly coplanar, otherwise SHOULDER_SINGULAR.
     """
 
     OK = 0

@@ -104,7 +104,10 @@ class ExcitationCommand(LeafSystem):
 
 
 class JointRangeMonitor(LeafSystem):
-    """Block that raises DrakeTeleopError if a joint leaves its range by over 1 % of the range."""
+    """Block that raises DrakeTeleopError if a joint is over 1 % of its range beyond its limit.
+
+    Its output `ik_status` is the input at the last sample.
+    """
 
     __slots__ = ONE_DICT
 
@@ -116,13 +119,9 @@ class JointRangeMonitor(LeafSystem):
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            period, 0.0, self._hold_ik_status_and_check_joint_ranges
-        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _hold_ik_status_and_check_joint_ranges(
-        self, context: Context, discrete_state: DiscreteValues
-    ) -> None:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

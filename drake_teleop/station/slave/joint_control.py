@@ -98,13 +98,12 @@ class JointControlConfig:
 
 
 @njit(cache=True, omits_reference_counting=True)
-def computed_torque_into(
-    arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
-):  # fmt: skip
+def computed_torque_into(table, command, state, kp, kv, speed_limit, effort_limit, scratch, torque):
     """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
 
-    ID is the inverse dynamics, `state` [q; v]; tau is limited. Invalid encoder readings give
-    gravity compensation at the commanded posture; an invalid command keeps the last torque.
+    ID is the inverse dynamics, `state` [q; v]; clip keeps within `speed_limit`, and tau is within
+    `effort_limit`. Invalid encoder readings give gravity compensation at the commanded posture; an
+    invalid command keeps the last torque.
     """
     if not are_finite_and_in_range(command):
         return
@@ -115,10 +114,9 @@ def computed_torque_into(
         copy_into(q, 0, command, 0, n)
         v[:] = 0.0
     for i in range(n):
-        setpoint = position_gain * (command[i] - q[i])
-        setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
-        acceleration[i] = velocity_gain * (setpoint - v[i])
-    inverse_dynamics(arm, q, v, acceleration, torque)
+        setpoint = min(max(kp * (command[i] - q[i]), -speed_limit[i]), speed_limit[i])
+        acceleration[i] = kv * (setpoint - v[i])
+    inverse_dynamics(table, q, v, acceleration, torque)
     for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
@@ -127,12 +125,8 @@ def servo_gains_and_limits(
     arm: ArmModel, config: JointControlConfig
 ) -> tuple[float, float, Array, Array]:
     """Return position and velocity gain [1/s] and (n,) limits of joint speed and torque."""
-    return (
-        2 * np.pi * config.position_bandwidth_hz,
-        2 * np.pi * config.velocity_bandwidth_hz,
-        arm.velocity_limit,
-        arm.effort_limit,
-    )
+    kp, kv = 2 * np.pi * config.position_bandwidth_hz, 2 * np.pi * config.velocity_bandwidth_hz
+    return kp, kv, arm.velocity_limit, arm.effort_limit
 
 
 class JointControl(LeafSystem):
@@ -184,7 +178,6 @@ class HeldTorque(LeafSystem):
         super().__init__()
         self._limit = arm.effort_limit
         self._request = self.DeclareVectorInputPort("requested_torque", arm.num_joints)
-        self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import weakref
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import (
@@ -136,8 +136,7 @@ def _repair_file(
     return _REPAIR_FUNCTION_OF_SUFFIX[kind](root, path, files, purpose, folder)
 
 
-@dataclass(frozen=True)
-class ParsedArm:
+class ParsedArm(NamedTuple):
     """Arm that was parsed into a plant."""
 
     instance: ModelInstanceIndex

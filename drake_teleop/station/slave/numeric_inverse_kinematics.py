@@ -19,6 +19,7 @@ from drake_teleop.common.vectors import (
     cross,
     dot,
     normalized_quaternion,
+    quaternion_at,
     quaternion_logarithm,
     quaternion_of_matrix,
     quaternion_product,
@@ -66,12 +67,8 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
     """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
-    a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
-    R = np.empty((3, 3))
-    for i in range(3):
-        for k in range(3):
-            R[i, k] = x[12 + 3 * i + k]
-    inverse = conjugate_quaternion(quaternion_of_matrix(R))
+    a = normalized_quaternion(quaternion_at(pose, 0))
+    inverse = conjugate_quaternion(quaternion_of_matrix(x[12:].reshape(3, 3)))
     turn = quaternion_logarithm(quaternion_product(a, inverse))
     squared = 0.0
     for i in range(3):
@@ -200,8 +197,8 @@ def follow_pose(
         low[i], high[i] = max(q[i] - max_step[i], lower[i]), min(q[i] + max_step[i], upper[i])
     length = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3]
     if not (are_finite_and_in_range(reference) and are_finite_and_in_range(pose) and length > 0.0):
-        for i in range(n):
-            q[i] = q[i] if are_finite_and_in_range(reference) else np.nan
+        if not are_finite_and_in_range(reference):
+            q[:] = np.nan
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
@@ -226,11 +223,8 @@ def follow_pose(
         copy_into(anchor, 0, q, 0, n)
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
         for _ in range(steps):
-            if (
-                squared < _POSE_ROUNDING_ERROR_M * _POSE_ROUNDING_ERROR_M
-                or stalled_steps > 3
-                or relative_damping > 1e9
-            ):
+            is_met = squared < _POSE_ROUNDING_ERROR_M * _POSE_ROUNDING_ERROR_M
+            if is_met or stalled_steps > 3 or relative_damping > 1e9:
                 break
             if better:
                 _smaller_gram_matrix_into(J, H)
@@ -239,10 +233,8 @@ def follow_pose(
                     for k in range(6):
                         g[i] += J[k, i] * e[k]
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
-            if (
-                _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
-                < _POSE_ROUNDING_ERROR_M
-            ):
+            largest = _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
+            if largest < _POSE_ROUNDING_ERROR_M:
                 break
             found = _jacobian_and_pose_error(table, L, pose, trial, x, J, e)
             total = found
@@ -285,10 +277,8 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if (
-            min_singular_value > 0.0
-            and free > _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared
-        ):
+        zero_gradient = _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared
+        if min_singular_value > 0.0 and free > zero_gradient:
             return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
@@ -401,9 +391,8 @@ class NumericInverseKinematics(LeafSystem):
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)
         self.DeclareDiscreteState(np.append(posture, 0.0))  # last command and its time
-        self._command = self.DeclareVectorOutputPort(
-            "joint_command", n, weak_callback(self._calc_command)
-        )
+        calc_command = weak_callback(self._calc_command)
+        self._command = self.DeclareVectorOutputPort("joint_command", n, calc_command)
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

@@ -7,11 +7,23 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import Role, SceneGraph
+from pydrake.geometry import (
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    HalfSpace,
+    Mesh,
+    Role,
+    SceneGraph,
+    SceneGraphInspector,
+    Sphere,
+)
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
@@ -46,6 +58,7 @@ from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
 _SHARED_TIP_DISTANCE_M = 1e-3
+_NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
 
@@ -163,7 +176,7 @@ def AddSlavePlant(
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the start of `slave`.
 
-    A DrakeTeleopError is raised if the arm cannot reach the start or hold its load.
+    A DrakeTeleopError is raised if the arm cannot reach that default start or hold its load there.
     """
     if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
@@ -205,8 +218,7 @@ def AddSlavePlant(
     return SlavePlant(*parts, texts, slave, environment)
 
 
-@dataclass(frozen=True)
-class ParsedSlave:
+class ParsedSlave(NamedTuple):
     """Arm and tool in a plant that is not finalized; attributes as in `SlavePlant`."""
 
     slave: Slave
@@ -234,19 +246,17 @@ class ParsedSlave:
 def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave:
     """Parse arm, tool and payload into a plant; rename the arm's model instance to "arm"."""
     slave = Slave() if slave is None else slave
-    model = ParseModel(
-        plant, slave.path, slave.sensor_frame, slave.package_folders, slave.X_WBase, slave.hold
-    )
+    packages, X_WBase = slave.package_folders, slave.X_WBase
+    model = ParseModel(plant, slave.path, slave.sensor_frame, packages, X_WBase, slave.hold)
     if plant.HasModelInstanceNamed(ARM_INSTANCE_NAME):
-        plant.RenameModelInstance(
-            plant.GetModelInstanceByName(ARM_INSTANCE_NAME), f"{ARM_INSTANCE_NAME}_of_model"
-        )
+        other = plant.GetModelInstanceByName(ARM_INSTANCE_NAME)
+        plant.RenameModelInstance(other, f"{ARM_INSTANCE_NAME}_of_model")
     plant.RenameModelInstance(model.instance, ARM_INSTANCE_NAME)
     set_torque_limits(plant, model.instance, slave.torque_limits)
     frame, model_bodies = model.sensor_frame, bodies_carried_by(plant, model.sensor_frame.body())
     assumptions = [*model.assumptions]
     if slave.tool is not None:
-        on_sensor, assumed = AddTool(plant, slave.tool, frame, slave.package_folders)
+        on_sensor, assumed = AddTool(plant, slave.tool, frame, packages)
         assumptions += assumed
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
@@ -292,25 +302,57 @@ def _remove_arm_collisions(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hull_corners_of_carried_shapes_S(slave: Slave) -> list[Array]:
+def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_without_limit_warnings(plant)
-    context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
-    hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
+    context, inspector, hulls = plant.CreateDefaultContext(), scene_graph.model_inspector(), []
     for body in bodies_carried_by(plant, parsed.sensor_frame.body()):
         X_SBody = plant.CalcRelativeTransform(context, parsed.sensor_frame, body.body_frame())
         for shape in plant.GetCollisionGeometriesForBody(body):
-            X_SShape = X_SBody @ inspector.GetPoseInFrame(shape)
-            mesh, box = inspector.GetConvexHull(shape), inspector.GetObbInGeometryFrame(shape)
-            if mesh is not None:
-                corners = np.array([mesh.vertex(k) for k in range(mesh.num_vertices())])
-            elif box is not None:  # a half space has none
-                corners = (box.pose() @ (signs * box.half_width()).T).T
-            else:
-                continue
-            hulls.append((X_SShape @ corners.T).T)
+            points = hull_points_of(inspector, shape)
+            if len(points):
+                hulls.append((X_SBody @ points.T).T)
     return hulls
+
+
+def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+    """Return points (k, 3) on the convex hull of a shape, in its body's frame [m].
+
+    A half space has none, a round shape those of a polyhedron in it.
+    """
+    shape = inspector.GetShape(geometry)
+    if isinstance(shape, (Mesh, Convex)):
+        hull = shape.GetConvexHull()
+        points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
+    elif isinstance(shape, Sphere):
+        points = shape.radius() * _unit_sphere_points()
+    elif isinstance(shape, Ellipsoid):
+        points = _unit_sphere_points() * [shape.a(), shape.b(), shape.c()]
+    elif isinstance(shape, Capsule):
+        end = [0.0, 0.0, shape.length() / 2]
+        ball = shape.radius() * _unit_sphere_points()
+        points = np.vstack([ball - end, ball + end])
+    elif isinstance(shape, Cylinder):
+        rim = _unit_sphere_points()[_NUM_CIRCLE_POINTS : 2 * _NUM_CIRCLE_POINTS] * [1.0, 1.0, 0.0]
+        rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
+        end = [0.0, 0.0, shape.length() / 2]
+        points = np.vstack([rim - end, rim + end])
+    elif isinstance(shape, HalfSpace):
+        return np.zeros((0, 3))
+    else:
+        box = inspector.GetObbInGeometryFrame(geometry)
+        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+        points = (box.pose() @ (corners * box.half_width()).T).T
+    return (inspector.GetPoseInFrame(geometry) @ points.T).T
+
+
+def _unit_sphere_points() -> Array:
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_CIRCLE_POINTS // 2 + 1)
+    longitude = 2 * np.pi * np.arange(_NUM_CIRCLE_POINTS) / _NUM_CIRCLE_POINTS
+    latitudes, longitudes = np.meshgrid(latitude, longitude, indexing="ij")
+    x, y = np.cos(latitudes) * np.cos(longitudes), np.cos(latitudes) * np.sin(longitudes)
+    return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)
 
 
 def _farthest_hull_point_along_z(hulls: list[Array]) -> Array:
@@ -331,7 +373,7 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
         context = plant.CreateDefaultContext()
         return tip.CalcPose(context, parsed.sensor_frame).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hull_corners_of_carried_shapes_S(slave)):
+    if slave.tool is None and (hulls := _hulls_of_carried_shapes_S(slave)):
         return _farthest_hull_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 

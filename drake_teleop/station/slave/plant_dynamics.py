@@ -94,9 +94,8 @@ def _place_box_at_body(pair, bodies, placed):
     for i in range(3):
         column = rotate_vector(turn, (pair[4 + i], pair[7 + i], pair[10 + i]))
         placed[4 + i], placed[7 + i], placed[10 + i] = column
-    placed[13], placed[14], placed[15] = plus(
-        vector_at(body, 4), rotate_vector(turn, vector_at(pair, 13))
-    )
+    centre = rotate_vector(turn, vector_at(pair, 13))
+    placed[13], placed[14], placed[15] = plus(vector_at(body, 4), centre)
     return placed
 
 
@@ -109,10 +108,8 @@ def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in monitored_pairs:
         box = _place_box_at_body(pair, bodies, placed)
-        if (
-            lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
-            < _NEAR_MONITORED_DISTANCE_M
-        ):
+        distance = lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
+        if distance < _NEAR_MONITORED_DISTANCE_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed)
@@ -155,9 +152,8 @@ class ToolContact(LeafSystem):
         q, v = state[: self._n], state[self._n :]
         sheet = self._nothing if self._sheet is None else self._sheet.Eval(context)
         plant = self._nothing if self._plant is None else self._plant.Eval(context)
-        environment_wrench_about_Wo_into(
-            *self._contact, q, v, sheet, plant, output.get_mutable_value()
-        )
+        wrench_W = output.get_mutable_value()
+        environment_wrench_about_Wo_into(*self._contact, q, v, sheet, plant, wrench_W)
 
 
 @njit(cache=True)
@@ -179,17 +175,13 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
-    sheet, plant = x[half - 1 : 2 * half : half], x[2 * half :]
+    sheet, rest = x[half - 1 : 2 * half : half], x[2 * half :]
     if not _take_or_request_given_wrench(given, x, wrench_W):
-        environment_wrench_about_Wo_into(
-            arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W
-        )
+        environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, rest, wrench_W)
     else:
-        applied = np.empty(6)
-        environment_wrench_about_Wo_into(
-            arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied
-        )
-        wrench_W += applied
+        added, none = np.empty(6), pairs[:0]
+        environment_wrench_about_Wo_into(arm, none, joints, applied_W, q, v, sheet, rest, added)
+        wrench_W += added
     plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot)
 
 

@@ -60,8 +60,8 @@ class PositionInterface:
         damping = self.acceleration_per_error * self.lookahead / rate
         if damping + 0.5 * self.acceleration_per_error / rate**2 > 1.5:  # unstable from 2
             raise DrakeTeleopError(
-                f"{self.acceleration_per_error:g} 1/s^2 is too high for control steps of"
-                f" {1e3 / rate:g} ms",
+                f"{self.acceleration_per_error:g} 1/s^2 is too high for a lookahead of"
+                f" {self.lookahead:g} s and control steps of {1e3 / rate:g} ms",
                 where=f"{where}.acceleration_per_error",
                 remedy="lower it or lookahead, or raise rates.joint_control_hz",
             )
@@ -127,7 +127,7 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
 
 @njit(cache=True)
 def position_servo_torque_into(
-    arm, command, state, interface, limits, effort_limit, scratch, memory, torque
+    table, command, state, interface, limits, effort_limit, scratch, memory, torque
 ):  # fmt: skip
     """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
 
@@ -147,7 +147,7 @@ def position_servo_torque_into(
         copy_into(q, 0, scratch[0], 0, n)
         v[:] = 0.0
         wanted[:] = 0.0
-    inverse_dynamics(arm, q, v, wanted, torque)
+    inverse_dynamics(table, q, v, wanted, torque)
     for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 

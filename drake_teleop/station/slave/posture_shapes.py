@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 from functools import lru_cache
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -22,13 +21,9 @@ from pydrake.geometry import (
     Ellipsoid,
     GeometryId,
     GeometrySet,
-    HalfSpace,
-    Mesh,
     ProximityProperties,
     Role,
     SceneGraph,
-    SceneGraphInspector,
-    Sphere,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
@@ -46,6 +41,7 @@ from drake_teleop.station.slave.plant import (
     ParseSlave,
     bodies_carried_by,
     finalize_without_limit_warnings,
+    hull_points_of,
 )
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
@@ -56,7 +52,6 @@ _MAX_COLLISION_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or 
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
 _MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
-_NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 
 
 class Overlap(NamedTuple):
@@ -109,10 +104,8 @@ class PostureShapes:
         self._by_design = self._body_pairs_overlapping_by_design()
         names = [" and ".join(self.plant.get_body(k).name() for k in p) for p in self._by_design]
         if names:
-            pairs = join_names(sorted(names))
-            self.assumptions.append(
-                f"overlaps left out, as they are in nearly all postures: {pairs}"
-            )
+            what = "overlaps left out, as they are in nearly all postures:"
+            self.assumptions.append(f"{what} {join_names(sorted(names))}")
 
     def contact_shapes_of(self, body: BodyIndex) -> list[GeometryId]:
         inspector = self._scene_graph.model_inspector()
@@ -145,9 +138,8 @@ class PostureShapes:
         ]
 
     def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
-        return np.vstack(
-            [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hull_points_W(body))]
-        )
+        hulls = [hull for body in bodies for hull in self.hull_points_W(body)]
+        return np.vstack([np.zeros((0, 3)), *hulls])
 
     def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
         """Return, for each shape of a body, points (k, 3) on its convex hull in W [m]."""
@@ -188,9 +180,6 @@ class PostureShapes:
         def bodies_of_link(body: RigidBody) -> set[BodyIndex]:
             return {each.index() for each in plant.GetBodiesWeldedTo(body)} - self.surroundings
 
-        def shapes_of_bodies(bodies: Collection[BodyIndex]) -> GeometrySet:
-            return GeometrySet([shape for each in bodies for shape in self.contact_shapes_of(each)])
-
         context, together = plant.CreateDefaultContext(), [self.surroundings]
         telescopes = list[tuple[Array, set[BodyIndex]]]()
         for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -209,7 +198,8 @@ class PostureShapes:
                 telescopes.append((axis, joined))
             together.append(joined)
         for bodies in together:
-            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes_of_bodies(bodies)))
+            shapes = [shape for each in bodies for shape in self.contact_shapes_of(each)]
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(shapes)))
 
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
@@ -224,7 +214,7 @@ class PostureShapes:
 
 
 def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return lower and upper ends (n,) of random joint positions: limits, at most one turn wide."""
+    """Return joint limits (n,); +-pi replaces infinite ones, and both of a range beyond both."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -287,39 +277,3 @@ def _complete_and_bound_collision_shapes(plant: MultibodyPlant, scene_graph: Sce
                 scene_graph.RemoveRole(source, geometry, Role.kProximity)
     for each in added:
         plant.RegisterCollisionGeometry(*each, ProximityProperties())
-
-
-def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
-    """Return points (k, 3) on the convex hull of a shape, in its body's frame [m]."""
-    shape = inspector.GetShape(geometry)
-    if isinstance(shape, (Mesh, Convex)):
-        hull = shape.GetConvexHull()
-        points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
-    elif isinstance(shape, Sphere):
-        points = shape.radius() * _unit_sphere_points()
-    elif isinstance(shape, Ellipsoid):
-        points = _unit_sphere_points() * [shape.a(), shape.b(), shape.c()]
-    elif isinstance(shape, Capsule):
-        end = [0.0, 0.0, shape.length() / 2]
-        ball = shape.radius() * _unit_sphere_points()
-        points = np.vstack([ball - end, ball + end])
-    elif isinstance(shape, Cylinder):
-        rim = _unit_sphere_points()[_NUM_CIRCLE_POINTS : 2 * _NUM_CIRCLE_POINTS] * [1.0, 1.0, 0.0]
-        rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
-        end = [0.0, 0.0, shape.length() / 2]
-        points = np.vstack([rim - end, rim + end])
-    elif isinstance(shape, HalfSpace):
-        return np.zeros((0, 3))
-    else:
-        box = inspector.GetObbInGeometryFrame(geometry)
-        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
-        points = (box.pose() @ (corners * box.half_width()).T).T
-    return (inspector.GetPoseInFrame(geometry) @ points.T).T
-
-
-def _unit_sphere_points() -> Array:
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_CIRCLE_POINTS // 2 + 1)
-    longitude = 2 * np.pi * np.arange(_NUM_CIRCLE_POINTS) / _NUM_CIRCLE_POINTS
-    latitudes, longitudes = np.meshgrid(latitude, longitude, indexing="ij")
-    x, y = np.cos(latitudes) * np.cos(longitudes), np.cos(latitudes) * np.sin(longitudes)
-    return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)

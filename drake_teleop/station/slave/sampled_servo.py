@@ -58,6 +58,7 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
         line: (3 n,) output: torque now [N m], its rate [N m/s], torque of the last sample [N m].
     """
     n = command.shape[0]
+    kp, kv, speed_limit, effort_limit = servo
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
     predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
@@ -68,7 +69,7 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
         copy_into(predicted, 0, x, 0, n)
         copy_into(predicted, n, x, n + 1, n)
         computed_torque_into(
-            arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
+            arm, command, predicted, kp, kv, speed_limit, effort_limit, scratch, torque
         )
         for i in range(n):
             now[i] += torque[i]
@@ -84,17 +85,9 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
     for i in range(n):
         # `away` is half the rise of the line; both ends are clipped to the torque limits.
         mean, away = now[i] / samples, 6.0 * rate[i] / samples**2
-        start = min(max(mean - away, -servo[3][i]), servo[3][i])
-        end = min(max(mean + away, -servo[3][i]), servo[3][i])
+        start = min(max(mean - away, -effort_limit[i]), effort_limit[i])
+        end = min(max(mean + away, -effort_limit[i]), effort_limit[i])
         now[i], rate[i] = start, (end - start) / (samples * period)
-
-
-@njit(cache=True)
-def _evaluate_torque_line(state, time, torque):
-    """Write the torque (n,) at `time` [s]; `state` is a `line`, then its start time [s]."""
-    n = torque.shape[0]
-    for i in range(n):
-        torque[i] = state[i] + (time - state[-1]) * state[n + i]
 
 
 class SampledServo(LeafSystem):
@@ -123,6 +116,7 @@ class SampledServo(LeafSystem):
         if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, slave.start)
+        # The line that `predict_torque_line` writes, then its start time.
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
@@ -131,8 +125,8 @@ class SampledServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        line = context.get_discrete_state_vector().value()
-        _evaluate_torque_line(line, context.get_time(), output.get_mutable_value())
+        n, line = self._n, context.get_discrete_state_vector().value()
+        output.SetFromVector(line[:n] + (context.get_time() - line[-1]) * line[n : 2 * n])
 
     def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
         n = self._n

@@ -85,9 +85,8 @@ class Scene(Environment):
         inspector = scene_graph.model_inspector()
         own = [shape for each in ToolShapes(plant, scene_graph, tool).values() for shape in each]
         others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
-        if not any(
-            has_hydroelastic_properties(inspector.GetProximityProperties(shape)) for shape in others
-        ):
+        materials = map(inspector.GetProximityProperties, others)
+        if not any(map(has_hydroelastic_properties, materials)):
             raise DrakeTeleopError(
                 "contact is hydroelastic, but no shape in the file is",
                 where=str(self.path),
@@ -95,14 +94,11 @@ class Scene(Environment):
                 " drake:proximity_properties, or set contact: point",
             )
         for shape in own:
-            properties = ProximityProperties(inspector.GetProximityProperties(shape))
-            if not has_hydroelastic_properties(properties):
-                AddCompliantHydroelasticProperties(
-                    _TOOL_BALL_MESH_EDGE_M, self.tool_modulus, properties
-                )
-                scene_graph.AssignRole(
-                    plant.get_source_id(), shape, properties, RoleAssign.kReplace
-                )
+            material = ProximityProperties(inspector.GetProximityProperties(shape))
+            if not has_hydroelastic_properties(material):
+                mesh_edge = _TOOL_BALL_MESH_EDGE_M
+                AddCompliantHydroelasticProperties(mesh_edge, self.tool_modulus, material)
+                scene_graph.AssignRole(plant.get_source_id(), shape, material, RoleAssign.kReplace)
 
 
 def has_hydroelastic_properties(properties: ProximityProperties) -> bool:

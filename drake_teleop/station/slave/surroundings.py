@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import GeometryId, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -114,16 +114,19 @@ def MakeToolContactModel(
             contact = contact._replace(leaf_parameters=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_body_masses(plant, context, contact)
-    if reason := _reason_for_drake_contact(environment, contact):
-        return contact._replace(drake_contact_reason=reason)
+    if environment.hydroelastic:
+        return contact._replace(drake_contact_reason="contact is hydroelastic")
+    if contact.leaf_instance is not None and len(environment.parts) > 1:
+        return contact._replace(drake_contact_reason="the sheet spring is not the only object")
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
         joints, order = MakeJointTableAndRowBodies(plant, contact.moving_bodies.values())
-    from_S = {
-        shape: _X_SBody(plant, context, sensor_frame, index)
-        for index, own in shapes.items()
-        for shape in own
-    }
+    from_S = dict[GeometryId, RigidTransform]()
+    for index, own in shapes.items():
+        frame = plant.get_body(index).body_frame()
+        X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
+        is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE)
+        from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
         found = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
@@ -141,14 +144,6 @@ def MakeToolContactModel(
     )
 
 
-def _X_SBody(
-    plant: MultibodyPlant, context: Context, sensor_frame: Frame, index: BodyIndex
-) -> RigidTransform:
-    frame = plant.get_body(index).body_frame()
-    X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-    return RigidTransform() if X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE) else X_SBody
-
-
 def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
     if not contact.moving_bodies:
         return
@@ -158,14 +153,6 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         what = f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
         raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
-
-
-def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
-    if environment.hydroelastic:
-        return "contact is hydroelastic"
-    if contact.leaf_instance is not None and len(environment.parts) > 1:
-        return "the sheet spring is not the only object"
-    return ""
 
 
 def MovingBodiesExceptLeaf(

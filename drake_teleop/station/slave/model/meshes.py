@@ -18,8 +18,6 @@ from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, p
 from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
-# Suffixes of meshes that Drake accepts as collision shapes.
-_COLLISION_MESH_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Numbers of each dimension of a shape.
 _NUM_VALUES_OF_SHAPE_SIZES = {
     "box": {"size": 3},
@@ -30,7 +28,6 @@ _NUM_VALUES_OF_SHAPE_SIZES = {
     "mesh": {},
     "plane": {},
 }
-_MIN_HULL_VERTICES_OF_MESH = 3  # of a mesh
 _SKELETON_STICK_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -76,13 +73,15 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
     for name, count in sizes.items():
         values = _numbers_in_text(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
-            return f"the {name} of a {kind} is no usable size"
+            return f"the {name} of a {kind} is not between 0 and {MAX_MODEL_VALUE_SI:g} m"
     scale = _numbers_in_text(inner.get("scale") or inner.findtext("scale"))
-    places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
-    texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
-    numbers = [value for text in texts for value in _numbers_in_text(text)]
-    valid = all(scale) and all(abs(value) <= MAX_MODEL_VALUE_SI for value in numbers)
-    return None if valid else "of an invalid place or scale"
+    valid = len(scale) in (0, 1, 3) and all(0.0 < abs(x) <= MAX_MODEL_VALUE_SI for x in scale)
+    for place in (*shape.findall("origin"), *shape.findall("pose")):
+        texts = place.get("xyz", "0 0 0"), place.get("rpy", "0 0 0"), place.text
+        for text, counts in zip(texts, ((3,), (3,), (0, 6, 7)), strict=True):
+            values = _numbers_in_text(text)
+            valid &= len(values) in counts and all(abs(x) <= MAX_MODEL_VALUE_SI for x in values)
+    return None if valid else "a pose or scale is no list of finite numbers"
 
 
 def _numbers_in_text(text: str | None) -> list[float]:
@@ -102,7 +101,7 @@ def _resolve_mesh_file(
     if fault := files.file_access_fault(file, "meshes"):
         return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
-    if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
+    if suffix not in (".stl", ".obj", ".gltf", ".vtk"):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
     if (suffix == ".stl" or shape.tag == "collision") and not _is_mesh_readable(file, written):
         return f"{Path(address).suffix} meshes are empty or damaged"
@@ -119,17 +118,13 @@ def _resolve_mesh_file(
 
 @lru_cache(maxsize=1024)
 def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
-    if path.suffix.lower() in (".gltf", ".vtk"):
-        try:
-            with silent_stderr():
-                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_HULL_VERTICES_OF_MESH
-        except RuntimeError:
-            return False
     try:
-        read_triangles(path)
-    except ValueError:
+        if path.suffix.lower() not in (".gltf", ".vtk"):
+            return len(read_triangles(path).faces) > 0
+        with silent_stderr():
+            return Mesh(str(path)).GetConvexHull().num_vertices() >= 3
+    except (RuntimeError, ValueError):
         return False
-    return True
 
 
 @lru_cache(maxsize=1024)

@@ -31,10 +31,7 @@ from drake_teleop.station.slave.model.model_numbers import (
     nearest_possible_inertia,
 )
 
-# Elements that generate bodies or joints.
-_BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
-_UNSUPPORTED_SHAPES = ("hfield", "sdf")
 # Numbers in size.
 _NUM_SIZE_VALUES_OF_SHAPE = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 _ROUND_ROD_SHAPES = ("capsule", "cylinder")
@@ -54,7 +51,6 @@ class Joint:
     ref: float
 
     def transformed_by(self, X: RigidTransform) -> Joint:
-        """Return a copy whose anchor and axis are transformed by X."""
         return replace(self, anchor=X @ self.anchor, axis=X.rotation() @ self.axis)
 
 
@@ -67,10 +63,6 @@ class Geom:
     size: list[float]
     attributes: Attributes
     mesh: Mesh | None
-
-    @property
-    def takes_part_in_contacts(self) -> bool:
-        return takes_part_in_contacts(self.attributes)
 
     @property
     def is_visible(self) -> bool:
@@ -166,16 +158,15 @@ class BodyReader:
             elif child.tag == "body":
                 body.children.append(self.read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
-                body.joints.append(
-                    self._read_joint(body, attributes, child.tag).transformed_by(X_BF)
-                )
+                joint = self._read_joint(body, attributes, child.tag)
+                body.joints.append(joint.transformed_by(X_BF))
             elif child.tag == "geom":
                 self._add_geom(body, attributes, X_BF)
             elif child.tag == "site":
                 body.sites[child.get("name", "")] = X_BF @ self._mjcf.read_pose(attributes)
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
-            elif child.tag in _BODY_GENERATOR_TAGS:
+            elif child.tag in ("replicate", "attach", "composite", "flexcomp"):
                 body.generator_tags.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
@@ -189,11 +180,8 @@ class BodyReader:
         limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
         if kind == "hinge":
-            limits = limits and (
-                self._mjcf.angle_in_rad(limits[0]),
-                self._mjcf.angle_in_rad(limits[1]),
-            )
-            ref = self._mjcf.angle_in_rad(ref)
+            in_rad = self._mjcf.angle_in_rad
+            limits, ref = limits and (in_rad(limits[0]), in_rad(limits[1])), in_rad(ref)
         anchor = given.vector("pos", (0.0, 0.0, 0.0))
         return Joint(name, kind, anchor, axis / np.linalg.norm(axis), given, limits, ref)
 
@@ -208,7 +196,7 @@ class BodyReader:
             size = [size[0], half, 0.0] if kind in _ROUND_ROD_SHAPES else [size[0], size[0], half]
         found = self.meshes.find(name) if name else None
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
-        if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
+        if kind in ("hfield", "sdf") or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
         elif not name and min(size[: _NUM_SIZE_VALUES_OF_SHAPE.get(kind, 0)], default=1.0) <= 0.0:
             fault = "shapes need a size above 0"
@@ -243,9 +231,8 @@ class BodyReader:
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combine_mass_properties(
-                [self._mass_properties_of_geom(geom) for geom in body.geoms]
-            )
+            parts = [self._mass_properties_of_geom(geom) for geom in body.geoms]
+            given = combine_mass_properties(parts)
         mass, centre, inertia = given or ZERO_MASS_PROPERTIES
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:

@@ -54,10 +54,8 @@ class Attributes(dict[str, str]):
     def vector(self, name: str, default: tuple[float, ...]) -> Array:
         """Return the numbers in attribute `name`, or `default`; their number must be equal."""
         count, values = len(default), self.numbers(name, default)
-        if (
-            len(self.get(name, "").split()) not in (0, count)
-            or max(map(abs, values)) > MAX_MODEL_VALUE_SI
-        ):
+        has_wrong_count = len(self.get(name, "").split()) not in (0, count)
+        if has_wrong_count or max(map(abs, values)) > MAX_MODEL_VALUE_SI:
             what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_MODEL_VALUE_SI:g}"
             self._report.add_fault(f"{self.label}: {what}")
             return np.array(default)
@@ -94,7 +92,8 @@ class Mjcf:
         for element in self.root.findall("compiler"):
             self.compiler.update(element.attrib)
         if self.compiler.get("coordinate", "local") != "local":
-            self.report.add_fault("coordinate='global', which MuJoCo no longer reads either")
+            what = "coordinate='global', which MuJoCo no longer reads either"
+            self.report.add_fault(f"{what}; give local coordinates")
         self.autolimits = self.compiler.get("autolimits", "true") == "true"
         self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN_DEFAULT_CLASS: {}}
         for element in self.root.findall("default"):
@@ -127,9 +126,8 @@ class Mjcf:
 
     def read_pose(self, attributes: Attributes) -> RigidTransform:
         """Return the pose of an element in its parent, from `pos` and its orientation."""
-        return RigidTransform(
-            self._rotation_of_element(attributes), attributes.vector("pos", (0.0,) * 3)
-        )
+        rotation = self._rotation_of_element(attributes)
+        return RigidTransform(rotation, attributes.vector("pos", (0.0,) * 3))
 
     def _rotation_of_element(self, given: Attributes) -> RotationMatrix:
         if "quat" in given:
@@ -143,9 +141,8 @@ class Mjcf:
             rotation = RotationMatrix()
             sequence = self.compiler.get("eulerseq", "xyz")
             for letter, angle in zip(sequence, given.vector("euler", (0.0,) * 3), strict=False):
-                turn = _rotation_about_axis(
-                    np.eye(3)["xyz".find(letter.lower())], self.angle_in_rad(angle)
-                )
+                axis = np.eye(3)["xyz".find(letter.lower())]
+                turn = _rotation_about_axis(axis, self.angle_in_rad(angle))
                 rotation = rotation @ turn if letter.islower() else turn @ rotation
             return rotation
         if "xyaxes" in given:
@@ -218,6 +215,5 @@ def smallest_rotation_of_z_to(z: Array) -> RotationMatrix:
     """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))
-    return _rotation_about_axis(
-        axis if sine else np.array([1.0, 0.0, 0.0]), math.atan2(sine, float(z[2]))
-    )
+    axis = axis if sine else np.array([1.0, 0.0, 0.0])
+    return _rotation_about_axis(axis, math.atan2(sine, float(z[2])))

@@ -162,13 +162,11 @@ class Mesh:
 
     @property
     def is_readable_by_drake(self) -> bool:
-        """Whether Drake reads the file without conversion."""
         unmoved = self._X_FM.IsExactlyIdentity() and bool((self._scale == 1.0).all())
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
     @cached_property
     def triangles(self) -> Triangles:
-        """The triangles with scale and reference pose applied."""
         if self.file is not None:
             vertices, faces = read_triangles(self.file)
         else:

@@ -22,7 +22,7 @@ from drake_teleop.station.slave.model.mjcf_bodies import (
     takes_part_in_contacts,
 )
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
+from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES, MassProperties
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_numbers import (
     correct_impossible_inertia,
@@ -37,7 +37,6 @@ from drake_teleop.station.slave.model.repair_report import (
 )
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
-_LOOP_EQUALITY_TAGS = ("connect", "weld", "distance")
 # Dynamics whose output has no range.
 _UNBOUNDED_ACTUATOR_DYNAMICS = ("integrator", "muscle", "user", "dcmotor")
 
@@ -55,10 +54,9 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
             mjcf.report.add_fault(fault)
         mjcf.report.raise_faults(mjcf.path)
     world = reader.read_world()
-    others = [
-        top.get("name") or "a body without name" for top, *_ in tops if top not in carriers[0]
-    ]
-    for name in (*others, *world.generator_tags):
+    others = [top for top, *_ in tops if top not in carriers[0]]
+    names_of_others = [other.get("name") or "a body without name" for other in others]
+    for name in (*names_of_others, *world.generator_tags):
         mjcf.report.state_assumption("left out, because the arm does not carry it:", name)
     world.generator_tags.clear()
     arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
@@ -78,23 +76,19 @@ def weld_other_joints_and_list_moving(
 
     The joints of `hold` remain in the file, because they are welded after the parsing.
     """
-    moving = list[tuple[Body, Joint]]()
+    report, moving = mjcf.report, list[tuple[Body, Joint]]()
     for body in world.with_descendants():
         joints, body.joints = body.joints, []
         for joint in joints:
             if joint.kind == "free":
                 if chain:  # a tool is welded to the sensor
-                    mjcf.report.state_assumption(
-                        "welded to the world, where it may float:", body.name
-                    )
+                    report.state_assumption("welded to the world, where it may float:", body.name)
             elif joint.name in hold:
                 body.joints.append(joint)
             elif body not in chain:
-                mjcf.report.state_assumption("held:", joint.name)
+                report.state_assumption("held:", joint.name)
             elif joint.kind not in ("hinge", "slide"):
-                mjcf.report.add_fault(
-                    f"{joint.name} is a {joint.kind} joint; use hinges and slides"
-                )
+                report.add_fault(f"{joint.name} is a {joint.kind} joint; use hinges and slides")
             else:
                 body.joints.append(joint)
                 moving.append((body, joint))
@@ -112,7 +106,7 @@ def check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjc
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             report.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in _LOOP_EQUALITY_TAGS and _equality_closes_loop(given, carriers):
+        elif element.tag in ("connect", "weld", "distance") and _closes_loop(given, carriers):
             report.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
@@ -184,7 +178,6 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site:
 
 
 def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
-
     def pair_with_moving_body(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
         carrier = body.name if id(body) in chain and body.joints else carrier
         yield body.name, carrier
@@ -194,7 +187,7 @@ def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
     return dict(pair_with_moving_body(arm, "world"))
 
 
-def _equality_closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
+def _closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm
@@ -212,14 +205,12 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
         given = mjcf.attributes_of(element, "", f"actuator {element.get('name', '')}")
         name = given.get("joint") or given.get("jointinparent")
         if name:
-            by_joint[name] = by_joint.get(name, 0.0) + _effort_limit_of_actuator(
-                mjcf, given, element.tag
-            )
+            limit = _effort_limit_of_actuator(mjcf, given, element.tag)
+            by_joint[name] = by_joint.get(name, 0.0) + limit
     limits = {}
     for joint in joints:
-        own = joint.attributes.read_range(
-            "actuatorfrcrange", "actuatorfrclimited", automatic=mjcf.autolimits
-        )
+        names = "actuatorfrcrange", "actuatorfrclimited"
+        own = joint.attributes.read_range(*names, automatic=mjcf.autolimits)
         limit = min(by_joint.get(joint.name, float("inf")), _effort_limit_in_both_directions(own))
         if 0.0 < limit < float("inf"):
             limits[joint.name] = limit
@@ -290,9 +281,8 @@ def repair_mjcf(
         check_joint_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
-        report.state_assumption(
-            "left out, because the tool does not carry them: shapes of", "the world"
-        )
+        what = "left out, because the tool does not carry them: shapes of"
+        report.state_assumption(what, "the world")
     joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
     _check_names_and_generators(world, report)
     _set_body_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
@@ -320,14 +310,16 @@ def _check_names_and_generators(world: Body, report: RepairReport) -> None:
 
 
 def _set_body_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
-    total = mjcf.compiler.number("settotalmass", -1.0)
+    report, total = mjcf.report, mjcf.compiler.number("settotalmass", -1.0)
     factor = total / _sum_of_masses_in_file(mjcf) if total > 0.0 else 1.0
 
     def set_masses_of_subtree(body: Body, is_moved: bool) -> None:
         is_moved |= id(body) in moving
-        _set_mass_of_body(body, reader, factor, mjcf.report, is_moved=is_moved)
-        if id(body) in moving and body.inertial is ZERO_MASS_PROPERTIES and not body.is_auxiliary:
-            mjcf.report.state_assumption("no inertia of", body.name)
+        if not body.is_auxiliary:
+            given = reader.mass_properties_of_body(body)
+            body.inertial = _valid_properties(given, factor, body.name, report, is_moved=is_moved)
+            if id(body) in moving and body.inertial is ZERO_MASS_PROPERTIES:
+                report.state_assumption("no inertia of", body.name)
         for child in body.children:
             set_masses_of_subtree(child, is_moved)
 
@@ -335,22 +327,18 @@ def _set_body_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mj
         set_masses_of_subtree(body, is_moved=False)
 
 
-def _set_mass_of_body(
-    body: Body, reader: BodyReader, factor: float, report: RepairReport, *, is_moved: bool
-) -> None:
-    if body.is_auxiliary:
-        return
-    properties = reader.mass_properties_of_body(body)
-    if properties.mass <= 0.0:
-        if is_moved and properties.inertia.any():
-            report.state_repair("an inertia without a mass left out of", body.name)
-        body.inertial = ZERO_MASS_PROPERTIES
-        return
-    properties = properties.with_mass(factor * properties.mass)
-    inertia = nearest_possible_inertia(properties.inertia)[0]
+def _valid_properties(
+    given: MassProperties, factor: float, name: str, report: RepairReport, *, is_moved: bool
+) -> MassProperties:
+    if given.mass <= 0.0:
+        if is_moved and given.inertia.any():
+            report.state_repair("an inertia without a mass left out of", name)
+        return ZERO_MASS_PROPERTIES
+    scaled = given.with_mass(factor * given.mass)
+    inertia = nearest_possible_inertia(scaled.inertia)[0]
     if is_moved:
-        inertia = correct_impossible_inertia(properties.inertia, body.name, report)
-    body.inertial = properties._replace(inertia=inertia)
+        inertia = correct_impossible_inertia(scaled.inertia, name, report)
+    return scaled._replace(inertia=inertia)
 
 
 def _sum_of_masses_in_file(mjcf: Mjcf) -> float:

@@ -9,7 +9,12 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_teleop.station.slave.model.mjcf_bodies import Body, Geom, Joint
+from drake_teleop.station.slave.model.mjcf_bodies import (
+    Body,
+    Geom,
+    Joint,
+    takes_part_in_contacts,
+)
 from drake_teleop.station.slave.model.mjcf_elements import Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
@@ -54,7 +59,7 @@ class MjcfText:
         for joint in body.joints:
             self._write_joint(element, joint)
         for geom in body.geoms if self._purpose.plant_has_shapes else ():
-            if geom.takes_part_in_contacts or geom.is_visible:
+            if takes_part_in_contacts(geom.attributes) or geom.is_visible:
                 self._write_geom(element, geom, body)
         for child in body.children:
             inner = SubElement(element, "body", {"name": child.name, **_format_pose(child.X_PB)})
@@ -77,9 +82,8 @@ class MjcfText:
             values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            self._mjcf.report.state_assumption(
-                "no damping, instead of a negative one, of", joint.name
-            )
+            what = "no damping, instead of a negative one, of"
+            self._mjcf.report.state_assumption(what, joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
@@ -91,9 +95,9 @@ class MjcfText:
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
         seen, felt = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
-        if geom.mesh is None or self._purpose.is_scene or not geom.takes_part_in_contacts:
-            values |= {} if geom.takes_part_in_contacts else seen
-            values |= {} if geom.is_visible else felt
+        has_contact = takes_part_in_contacts(given)
+        if geom.mesh is None or self._purpose.is_scene or not has_contact:
+            values |= ({} if has_contact else seen) | ({} if geom.is_visible else felt)
             size = {"size": _format_numbers(geom.size)}
             shape = size if geom.mesh is None else self._add_mesh_asset(geom.mesh)
             SubElement(element, "geom", {**values, **shape})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations_with_replacement
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -12,10 +11,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_INERTIA_ENTRIES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-_PLACE_OF_INERTIA_ENTRY = dict(
-    zip(_INERTIA_ENTRIES, combinations_with_replacement(range(3), 2), strict=True)
-)
+# ixx: (0, 0), ixy: (0, 1) and so on.
+_PLACE_OF_INERTIA_ENTRY = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
@@ -61,9 +58,8 @@ def repair_inertia_and_detect_missing(
             report.state_repair("an inertia without a mass left out of", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, report)
         link.remove(inertial)
-        _add_inertial_element(
-            link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
-        )
+        pose = inertial.find("pose" if is_sdf else "origin")
+        _add_inertial_element(link, pose, mass, nearest, is_sdf=is_sdf)
     return not at_rest and not inertia.any()
 
 
@@ -81,10 +77,8 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
 def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) -> Array:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if (
-        0.0 < change <= _INERTIA_ROUNDING_SHARE
-        or 0.0 < change * np.abs(inertia).max() <= _INERTIA_ROUNDING_KG_M2
-    ):
+    largest_change = change * np.abs(inertia).max()
+    if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
@@ -135,7 +129,6 @@ _NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "spec
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
 _QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _QUANTITY_TAGS |= {"radius", "radii", "length", "scale", "drake:rotor_inertia", "drake:gear_ratio"}
-_MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 
 
 def parse_number(text: str | None) -> float:
@@ -201,7 +194,7 @@ def repair_joint(joint: Element, links: set[str], report: RepairReport, *, in_ch
 
 def _check_joint_type_mimic_and_axis(joint: Element, where: str, report: RepairReport) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
-    if kind not in _MOVING_JOINT_TYPES:
+    if kind not in ("revolute", "continuous", "prismatic"):
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
         report.add_fault(
             f"{name} is a {kind} joint{between}; up to the sensor, use joints that turn about one"

@@ -1,9 +1,8 @@
 """Files that a robot model references, and access rules, because models may be untrusted.
 
-Only files inside the model's folder and its packages are read, after
-resolving symbolic links. Packages are `package_paths`, ROS packages (package.xml) around the model
-and the installed Python package around it. Include cycles are errors; number and size of files are
-limited.
+Only files inside the model's folder and its packages are read, after resolving symbolic links.
+Packages are `package_paths`, ROS packages (package.xml) around the model and the installed Python
+package around it. Include cycles are errors; number and size of files are limited.
 """
 
 from __future__ import annotations
@@ -34,9 +33,7 @@ _BINARY_SUFFIXES = set(
 PACKAGE_FOLDER_SETTINGS = "--package-path, or package_paths in slave or master.leader"
 """Places where users name the folders of packages, for messages."""
 _PACKAGE_FILE_NAME = "package.xml"
-_FILE_ATTRIBUTE_NAME_PATTERN = re.compile(
-    r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z"
-)
+_FILE_ATTRIBUTE_REGEX = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
 _FILE_ELEMENT_TAG_PATTERN = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
 _FOLDER_ATTRIBUTES = ("meshdir", "texturedir", "assetdir")  # search folders of MJCF
 _MTL_REFERENCE_PATTERN = re.compile(
@@ -141,9 +138,8 @@ class ModelFiles:
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         if real in including or len(including) > _MAX_INCLUDE_DEPTH:
             what = "includes itself" if real in including else "is nested too deeply"
-            raise DrakeTeleopError(
-                f"{what} through {path.name}", where=where, remedy="remove this reference"
-            )
+            what = f"{what} through {path.name}"
+            raise DrakeTeleopError(what, where=where, remedy="remove this reference")
         if real not in self.sizes:
             if not (real.is_file() or real.is_dir()):
                 what = f"references {path}, which does not exist"
@@ -158,7 +154,7 @@ class ModelFiles:
         return self.sizes[real]
 
     def mesh_files(self) -> Iterator[Path]:
-        """Yield the readable files of all links after `check_referenced_files(model)`."""
+        """Yield readable meshes of all links with their files, after `check_referenced_files`."""
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
         for mesh in [mesh for path in texts for mesh in self._referenced_files(path, meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):
@@ -175,36 +171,31 @@ class ModelFiles:
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
-                found = {
-                    file for each in named for file in _existing_raw_and_normalized_paths(each)
-                }
-                yield from (each for each in found if each != path.parent)
+                found = set[Path]().union(*map(_existing_raw_and_normalized_paths, named))
+                yield from found - {path.parent}
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
     def _addresses_in_file(self, path: Path) -> Iterator[str]:
         kind = path.suffix.lower()
         if path.is_dir():  # Gazebo model folder
-            yield from (
-                name for name in ("model.config", "manifest.xml") if (path / name).is_file()
-            )
+            names = "model.config", "manifest.xml"
+            yield from (name for name in names if (path / name).is_file())
         elif kind in (*_XML_SUFFIXES, ".config"):
             root = read_xml(path)
             self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDER_ATTRIBUTES}
             if self._model.suffix.lower() == ".xml":  # `MeshLibrary` checks the assets
                 yield from (e.get("file", "") for e in root.iter("include"))
                 return
-            yield from _addresses_in_xml(
-                root, meshes=path != self._model.resolve() or kind == ".xml"
-            )
+            meshes = path != self._model.resolve() or kind == ".xml"
+            yield from _addresses_in_xml(root, meshes=meshes)
         elif kind in (".yaml", ".yml"):
             yield from addresses_in_directives(read_yaml(path, tagged=True))
         elif kind in (".gltf", ".glb"):
             yield from _addresses_in_gltf(path)
         elif kind in (".obj", ".mtl"):
-            for line in (
-                _OBJ_REFERENCE_PATTERN if kind == ".obj" else _MTL_REFERENCE_PATTERN
-            ).findall(path.read_bytes()):
+            pattern = _OBJ_REFERENCE_PATTERN if kind == ".obj" else _MTL_REFERENCE_PATTERN
+            for line in pattern.findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
 
@@ -242,9 +233,8 @@ def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
     most = _MAX_TEXT_FILE_BYTES if is_text else _MAX_MODEL_BYTES
     if files > _MAX_MODEL_FILES or size > most:
         what = f"{_MAX_MODEL_FILES} files" if files > _MAX_MODEL_FILES else f"{most // 10**6} MB"
-        raise DrakeTeleopError(
-            f"exceeds the limit of {what}", where=str(path), remedy="remove or simplify parts"
-        )
+        remedy = "remove or simplify parts"
+        raise DrakeTeleopError(f"exceeds the limit of {what}", where=str(path), remedy=remedy)
 
 
 def read_xml(path: Path) -> Element:
@@ -264,7 +254,7 @@ def read_xml(path: Path) -> Element:
         parser.Parse(path.read_bytes().lstrip(), True)
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
-        remedy = "give a URDF or SDF that other readers of XML take too"
+        remedy = "give a model of well-formed XML"
         raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
@@ -278,9 +268,7 @@ def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
         if element.tag in ("plugin", "script"):
             continue
         if element.tag != "mesh" or meshes:
-            yield from (
-                x for name, x in element.items() if _FILE_ATTRIBUTE_NAME_PATTERN.match(name) and x
-            )
+            yield from (x for n, x in element.items() if _FILE_ATTRIBUTE_REGEX.match(n) and x)
             texts = (e.text for e in element if _FILE_ELEMENT_TAG_PATTERN.match(e.tag))
             yield from (text.strip() for text in texts if text and text.strip())
 

@@ -7,15 +7,12 @@ from xml.etree.ElementTree import Element
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
 WORLD_NAME = "world"  # name in URDF and SDF
-JOINT_TAGS = ("joint", "drake:joint")
 _CONSTRAINT_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
-_NUM_NAMES_IN_LOOP_CONSTRAINT = 2  # names of bodies or frames in such a constraint
-_FREE_BASE_JOINT_TYPES = ("floating", "planar")
 
 
 def list_joints(scope: Element) -> list[Element]:
     """Return the joints of a robot or model element, without those of nested models."""
-    return [child for child in scope if child.tag in JOINT_TAGS]
+    return [child for child in scope if child.tag in ("joint", "drake:joint")]
 
 
 def joint_end(joint: Element, name: str) -> str:
@@ -63,7 +60,6 @@ def reduce_to_chain(
 
 
 def make_joint_fixed(joint: Element, report: RepairReport) -> None:
-    """Change a moving joint to a fixed one, at its default position."""
     if joint.get("type") == "fixed":
         return
     report.state_assumption("held:", joint.get("name", ""))
@@ -98,7 +94,7 @@ def _joint_chain_to_link(scope: Element, link: str, report: RepairReport) -> lis
 
 def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
     moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
-    if not moving or chain[moving[0]].get("type") not in _FREE_BASE_JOINT_TYPES:
+    if not moving or chain[moving[0]].get("type") not in ("floating", "planar"):
         return chain
     free = chain[moving[0]]
     report.state_assumption("welded to the world, where it may float:", joint_end(free, "child"))
@@ -150,7 +146,7 @@ def _remove_loop_constraints(
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
-        if len(names) < _NUM_NAMES_IN_LOOP_CONSTRAINT or len(groups) > 1:
+        if len(names) < 2 or len(groups) > 1:
             report.add_fault(
                 f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
             )

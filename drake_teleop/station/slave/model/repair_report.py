@@ -91,14 +91,14 @@ class RepairReport:
 
 
 def describe_frame_fault(count: int, name: str, known: set[str]) -> tuple[str, str]:
-    """Return fault and remedy for a sensor frame `name` that `count` frames have, if not one."""
+    """Return fault and remedy if `count` frames, not one, have the sensor frame's `name`."""
     near = get_close_matches(name, sorted(known), n=_MAX_JOINED_NAMES, cutoff=0.0)
     remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
     return f"{count or 'no'} frames are named {name!r}", remedy
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Return a list of names as text; of many only the first twelve, and how many more."""
+    """Return the names as text, of more than twelve the first twelve and the number of others."""
     each = list(names)
     more = [f"and {len(each) - _MAX_JOINED_NAMES} more"] if len(each) > _MAX_JOINED_NAMES else []
     return ", ".join(each[:_MAX_JOINED_NAMES] + more)

@@ -24,8 +24,6 @@ from drake_teleop.station.slave.model.urdf_repair import (
     repair_urdf,
 )
 
-_MODEL_CONFIG_NAME, _URDF_SUFFIX, _SDF_SUFFIX = "model.config", ".urdf", ".sdf"
-_INCLUDE_URI_XPATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
 _CHILD_TAGS_READ_BY_DRAKE = {
     "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
@@ -53,11 +51,10 @@ def repair_sdf(
     report.raise_faults(file)
     inner = [
         _repair_included_file(uri, file, files, purpose, folder)
-        for uri in root.iterfind(_INCLUDE_URI_XPATH)
+        for uri in root.iterfind(".//include/uri")
     ]
-    own = convert_meshes_and_write_text(
-        root, file, files, report, folder if purpose.plant_has_shapes else None
-    )
+    mesh_folder = folder if purpose.plant_has_shapes else None
+    own = convert_meshes_and_write_text(root, file, files, report, mesh_folder)
     return merge_repaired_models(own.text, [own, *filter(None, inner)])
 
 
@@ -74,7 +71,7 @@ def _repair_included_file(
             remedy=f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}",
         )
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
-    repair = {_URDF_SUFFIX: repair_urdf, _SDF_SUFFIX: repair_sdf}.get(included.suffix.lower())
+    repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():
         return None
     part = purpose._replace(is_in_directives=True)
@@ -87,8 +84,8 @@ def _repair_included_file(
 
 def _find_included_model_file(address: str, file: Path, files: ModelFiles) -> Path | None:
     found = files.find_file(address, file.resolve().parent) or files.find_file(address)
-    if found is not None and (found / _MODEL_CONFIG_NAME).is_file():
-        named = read_xml(found / _MODEL_CONFIG_NAME).findall("sdf")
+    if found is not None and (found / "model.config").is_file():
+        named = read_xml(found / "model.config").findall("sdf")
         inner = files.find_file((named[0].text or "").strip(), found) if len(named) == 1 else None
         return inner or found
     return found
@@ -98,9 +95,8 @@ def _keep_model_with_sensor(
     root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
 ) -> None:
     worlds = root.findall("world")
-    models = [
-        each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")
-    ]
+    children = [child for scope in (root, *worlds) for child in scope]
+    models = [child for child in children if child.tag in ("model", "include")]
     if not worlds and len(models) <= 1:
         return
     with_sensor = [each for each in models if _has_sensor_frame(each, file, files, sensor)]
@@ -125,7 +121,7 @@ def _has_sensor_frame(model: Element, file: Path, files: ModelFiles, sensor: str
         inner = [each for each in model.iter() if each.tag == "model"]
         return any(link_of_frame(scope, sensor) for scope in inner)
     included = _find_included_model_file((model.findtext("uri") or "").strip(), file, files)
-    if included is None or included.suffix.lower() not in (_URDF_SUFFIX, _SDF_SUFFIX):
+    if included is None or included.suffix.lower() not in (".urdf", ".sdf"):
         return False
     scopes = [each for each in read_xml(included).iter() if each.tag in ("robot", "model")]
     return any(link_of_frame(scope, sensor) for scope in scopes)

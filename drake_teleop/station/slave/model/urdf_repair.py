@@ -32,7 +32,6 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel, Repair
 
 _URDF_TAGS_READ_BY_DRAKE = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_TAGS_READ_BY_DRAKE |= {"drake:collision_filter_group"}
-_NUM_RGBA_VALUES = 4  # red, green, blue, opacity
 _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
@@ -70,9 +69,8 @@ def repair_urdf(
     repair_links_and_joints(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
         _remove_references_to_missing_parts(root, report)
-    return convert_meshes_and_write_text(
-        root, file, files, report, folder if purpose.plant_has_shapes else None
-    )
+    mesh_folder = folder if purpose.plant_has_shapes else None
+    return convert_meshes_and_write_text(root, file, files, report, mesh_folder)
 
 
 def repair_links_and_joints(
@@ -87,15 +85,14 @@ def repair_links_and_joints(
     in_chain_ids = set(map(id, chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
-        for joint in list_joints(scope):
+        joints = list_joints(scope)
+        for joint in joints:
             if joint.get("name") in purpose.held_positions:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
             in_chain = id(joint) in in_chain_ids and joint.get("name") not in purpose.held_positions
             repair_joint(joint, links, report, in_chain=in_chain)
-        moving = {
-            joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
-        }
+        moving = {joint_end(each, "child") for each in joints if each.get("type") != "fixed"}
         for link in scope.findall("link"):
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
@@ -198,7 +195,7 @@ def _has_valid_colour(material: Element) -> bool:
     colour = material.find("color")
     words = [] if colour is None else colour.get("rgba", "").split()
     values = [parse_number(word) for word in words]
-    return len(values) == _NUM_RGBA_VALUES and all(0.0 <= value <= 1.0 for value in values)
+    return len(values) == 4 and all(0.0 <= value <= 1.0 for value in values)
 
 
 def _remove_references_to_missing_parts(root: Element, report: RepairReport) -> None:
