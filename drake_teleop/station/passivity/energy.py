@@ -86,8 +86,5 @@ def energy_balance(memory: Array) -> EnergyBalance:
             where="memory",
             remedy="give the memory of one channel end",
         )
-    stored, received, sent, lost = (
-        memory[..., places].copy()
-        for places in (STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY)
-    )
-    return EnergyBalance(stored, received, sent, lost)
+    parts = STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY
+    return EnergyBalance(*(memory[..., part].copy() for part in parts))

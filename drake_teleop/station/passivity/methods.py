@@ -61,7 +61,7 @@ from drake_teleop.station.passivity.packet import (
     PACKET_SIZE,
     POSE,
     SENDER_INPUTS_FINITE,
-    is_vector_finite,
+    are_vectors_finite,
 )
 from drake_teleop.station.passivity.pspm import PspmConfig
 from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
@@ -133,7 +133,7 @@ METHODS = Registry(
             speed_limit=ledger.max_slave_speed,
         ),
         "four_channel": PassivityMethod(four_channel.master_step, four_channel.slave_step),
-        "force_limit": PassivityMethod(force_limit.master_step, force_limit.slave_step),
+        "force_limit": PassivityMethod(force_limit.master_step, none.slave_step),
     },
     PassivityMethod,
 )
@@ -228,11 +228,8 @@ class PassivityConfig(MethodConfigs, _CommonMethodConfig):
                     where=f"{where}.registered",
                     remedy="leave them out; a shipped method has its own block of parameters",
                 )
-            return (
-                getattr(self, _CONFIG_FIELD_OF_METHOD[self.method])
-                if self.method in _CONFIG_FIELD_OF_METHOD
-                else None
-            )
+            entry = _CONFIG_FIELD_OF_METHOD.get(self.method)
+            return None if entry is None else getattr(self, entry)
         for name in self.registered:
             check_field_name(schema, name, f"{where}.registered.{name}")
         with unchecked_assignments():
@@ -282,38 +279,25 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     return memory
 
 
-_NUMBA_VECTOR = types.Array(types.float64, 1, "C")
-_MASTER_ARGUMENT_TYPES = (
-    _NUMBA_VECTOR,
-    types.boolean,
-    *[_NUMBA_VECTOR] * 5,
-    types.float64,
-    *[_NUMBA_VECTOR] * 4,
+_VECTOR = types.Array(types.float64, 1, "C")
+_STEP_ARGUMENT_TYPES = (
+    (_VECTOR, types.boolean, *[_VECTOR] * 5, types.float64, *[_VECTOR] * 4),
+    (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4),
+    (_VECTOR,) * 6,
 )
-_SLAVE_ARGUMENT_TYPES = (
-    _NUMBA_VECTOR,
-    types.boolean,
-    *[_NUMBA_VECTOR] * 4,
-    types.float64,
-    *[_NUMBA_VECTOR] * 4,
-)
-_RECORD_ARGUMENT_TYPES = (_NUMBA_VECTOR,) * 6
 _call_master_step, _call_slave_step, _call_record_command = map(
-    make_call_at_address, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES)
+    make_call_at_address, _STEP_ARGUMENT_TYPES
 )
 
 
-def step_addresses(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's compiled functions: master, slave, record."""
+def step_addresses(method: str) -> tuple[int, ...]:
+    """Return the addresses of `master_step`, `slave_step` and `record_command` of a method."""
     return _addresses_of_compiled_steps(*METHODS[method][:3])
 
 
 @cache
-def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, int, int]:
-    master, slave, sent = zip(
-        steps, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES), strict=True
-    )
-    return address_of_function(*master), address_of_function(*slave), address_of_function(*sent)
+def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
+    return tuple(map(address_of_function, steps, _STEP_ARGUMENT_TYPES))
 
 
 @njit(cache=True)
@@ -348,13 +332,7 @@ def master_step(
         packet: (PACKET_SIZE,) written: packet to send.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
-    healthy = (
-        is_vector_finite(received)
-        and is_vector_finite(pose)
-        and is_vector_finite(twist)
-        and is_vector_finite(dx)
-        and is_vector_finite(hand)
-    )
+    healthy = are_vectors_finite((received, pose, twist, dx, hand))
     if not healthy:
         wrench[:] = 0.0
     else:
@@ -378,13 +356,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
             finite, it is the last pose with zero twist.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
-    healthy = (
-        is_vector_finite(received)
-        and is_vector_finite(pose)
-        and is_vector_finite(twist)
-        and is_vector_finite(dx)
-        and is_vector_finite(wrench)
-    )
+    healthy = are_vectors_finite((received, pose, twist, dx, wrench))
     if not healthy:
         memory[COMMAND_TWIST] = 0.0
         copy_into(command, 0, memory, COMMAND.start, 13)

@@ -96,10 +96,11 @@ def limit_group(a, g, max_length):
 
 
 @njit(cache=True)
-def is_vector_finite(a):
+def are_vectors_finite(vectors):
     rest = 0.0
-    for x in a:
-        rest += x - x  # NaN if any x is not finite
+    for vector in vectors:
+        for x in vector:
+            rest += x - x  # NaN if any x is not finite
     return rest == 0.0
 
 
