@@ -157,15 +157,10 @@ class ReplayFile:
         }
         player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        whole = (
-            head.replace("<title>Drake MeshCat<", _VIEWPORT_AND_TITLE_TAGS, 1)
-            + player
-            + body
-            + tail
-        )
-        return whole.replace(
-            "<title>", _SECURITY_POLICY_TAG.format(content_security_policy(whole)) + "<title>", 1
-        )
+        head = head.replace("<title>Drake MeshCat<", _VIEWPORT_AND_TITLE_TAGS, 1)
+        whole = head + player + body + tail
+        policy = _SECURITY_POLICY_TAG.format(content_security_policy(whole))
+        return whole.replace("<title>", f"{policy}<title>", 1)
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
@@ -175,10 +170,8 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
     """
     span = stop - start
     if slow_motion is None:
-        slow_motion = next(
-            (s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_REPLAY_DURATION_S),
-            _SLOW_MOTION_FACTORS[-1],
-        )
+        enough = [s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_REPLAY_DURATION_S]
+        slow_motion = enough[0] if enough else _SLOW_MOTION_FACTORS[-1]
     frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MAX_FRAMES)
     return np.linspace(start, stop, max(frames, 1) + 1), slow_motion
 

@@ -315,7 +315,9 @@ class SimulationResult:
     def __repr__(self) -> str:
         width = max((len(name) for name in self.signals), default=0)
         lines = [f"SimulationResult: {self._time_range_text()}"]
-        lines += [f"  {spec.name:{width}}  {_signal_text(spec)}" for spec in self.specs]
+        for spec in self.specs:
+            text = f"  {spec.name:{width}}  {_components_text(spec)}  {spec.description}"
+            lines.append(text.rstrip())
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -367,11 +369,6 @@ def _components_text(spec: Signal) -> str:
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
-
-
-def _signal_text(spec: Signal) -> str:
-    text = _components_text(spec)
-    return f"{text}  {spec.description}" if spec.description else text
 
 
 def _files_of_log(path: Path) -> list[Path]:

@@ -67,11 +67,8 @@ def MakeTeleopStation(
     master = builder.AddNamedSystem("master_side", master or MakeMasterSide(scenario))
 
     sides = [master, slave]
-    if (
-        channel is None
-        and scenario.has_no_network_or_passivity
-        and scenario.contact_detection is None
-    ):
+    is_direct = scenario.has_no_network_or_passivity and scenario.contact_detection is None
+    if channel is None and is_direct:
         # A Diagram of two wires would cost 3 % of the time.
         setpoint = "leader_joints" if scenario.master.is_joint_leader else "pose_command"
         connect_ports(builder, master, setpoint, slave, setpoint)
@@ -84,13 +81,9 @@ def MakeTeleopStation(
         connect_ports(builder, slave, "wrench_B", channel, "wrench_B")
         connect_ports(builder, channel, "wrench_to_master", master, "wrench_command")
         # Inputs of network methods and of contact detection.
-        for source, name in (
-            (master, "hand_wrench_E"),
-            (slave, "pose_slave"),
-            (slave, "saturated"),
-            (slave, "contact"),
-        ):
+        for name in ("hand_wrench_E", "pose_slave", "saturated", "contact"):
             if channel.HasInputPort(name):
+                source = master if name == "hand_wrench_E" else slave
                 connect_ports(builder, source, name, channel, name)
         # Optional for a custom slave: without this port the whole wrench counts as contact.
         if channel.HasInputPort("load_wrench_B") and slave.HasOutputPort("load_wrench_B"):

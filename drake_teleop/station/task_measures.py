@@ -162,10 +162,10 @@ def _force_and_position_text(
     place = f"the tip {away:.1f} mm from the target"
     if isinstance(task, Reach):
         return place
-    wanted = (
-        f" instead of {_required_contact_force(task):g} N" if _required_contact_force(task) else ""
+    required, force = _required_contact_force(task), true_contact_force_magnitudes(result)[ended]
+    return f"{place}, {force:.1f} N at the tool" + (
+        f" instead of {required:g} N" if required else ""
     )
-    return f"{place}, {true_contact_force_magnitudes(result)[ended]:.1f} N at the tool{wanted}"
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
