@@ -51,10 +51,10 @@ class Canvas(Protocol):
     """Interface for 3D objects with poses and properties: Meshcat or a substitute."""
 
     def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
-        """Set the pose of the object at scene `path`, for a time of the recording [s]."""
+        """Set the pose of the object at scene `path` at a time of the recording [s]."""
 
     def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
-        """Set a property of an object, such as "scale", for a time of the recording [s]."""
+        """Set a property of an object, such as "scale", at a time of the recording [s]."""
 
 
 @dataclass(frozen=True)

@@ -251,10 +251,9 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log that may be larger than the memory: each access to a signal reads the disk.
+        """Open a log of `read_parquet` without its samples: each access to a signal reads the disk.
 
-        Args:
-            path: file or folder of parts, from `write_parquet` or `simulate`.
+        The log may be larger than the memory.
         """
         import polars as pl
 

@@ -208,7 +208,7 @@ def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
 def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    A DrakeTeleopError about "no `kind`", such as "scenario", is raised if neither exists.
+    A DrakeTeleopError that names `kind` is raised if neither exists.
     """
     expect_type((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -339,6 +339,6 @@ def _check_channel(scenario: Scenario, where: str) -> None:
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) < _MIN_KINEMATIC_SCALE_WITH_PASSIVITY:
         least = _MIN_KINEMATIC_SCALE_WITH_PASSIVITY
-        what = f"passivity methods require kinematic scales of {least:g} or more"
+        what = f"passivity methods require kinematic scales >= {least:g}, not {min(scales):g}"
         remedy = "increase both scales of kinematic_scaling, or set method: none"
         raise DrakeTeleopError(what, where=f"{where}:passivity.method", remedy=remedy)

@@ -171,7 +171,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance_without_garbage_collection(simulator: Simulator, time: float) -> None:
-    """Advance the simulator to `time` [s] without garbage collection, which saves time."""
+    """Advance the simulator to `time` [s] without garbage collection."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

@@ -163,9 +163,8 @@ def _force_and_position_text(
     if isinstance(task, Reach):
         return place
     required, force = _required_contact_force(task), true_contact_force_magnitudes(result)[ended]
-    return f"{place}, {force:.1f} N at the tool" + (
-        f" instead of {required:g} N" if required else ""
-    )
+    instead = f" instead of {required:g} N" if required else ""
+    return f"{place}, {force:.1f} N at the tool{instead}"
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:

@@ -62,8 +62,10 @@ class Channel(NetworkConfig):
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
         if self.network == "custom":
             return own, own if self.backward is None else self.backward
-        if own != NetworkConfig() or self.backward is not None:
-            what = f"preset '{self.network}' cannot be combined with other channel fields"
+        odd = [name for name in names if getattr(own, name) != getattr(NetworkConfig(), name)]
+        odd += [] if self.backward is None else ["backward"]
+        if odd:
+            what = f"preset '{self.network}' cannot be combined with {', '.join(odd)}"
             remedy = "remove these fields, or set network: custom"
             raise DrakeTeleopError(what, where=f"{where}.network", remedy=remedy)
         return PRESETS[self.network], PRESETS[self.network]
@@ -110,7 +112,7 @@ _ZERO_LOAD_WRENCH = np.zeros(6)
 def method_parameters_and_frame(
     passivity: PassivityConfig, R_WB: Array, scales: Array, force_scale: float
 ) -> tuple[Array, Array]:
-    """Return the method's parameters, and `frame` of `step_channel`, for a `TeleopChannel`."""
+    """Return the method's parameters, and `frame` of `step_channel`."""
     # A motion scale of zero transfers no energy; any unit is valid.
     scales = np.where(scales > 0.0, scales, 1.0)
     parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))

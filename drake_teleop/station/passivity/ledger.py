@@ -1,6 +1,6 @@
 """Master's end of the passivity method "ledger" (long: one file for steps M1 to M7).
 
-docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
+docs/theory.md, "The energy ledger", has the equations of these steps.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -27,7 +27,6 @@ class SlotAllocator:
         return slice(first, self._next)
 
     def rest(self) -> slice:
-        """Reserve the remaining places and return their slice."""
         return self.vector(self._size - self._next)
 
 

@@ -100,6 +100,10 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
+def _functions_of(method: Any) -> tuple[Any, ...]:
+    return method.master_step, method.slave_step, method.record_command, method.initialize
+
+
 _TDPA_METHOD = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
 METHODS = Registry(
     "passivity method",
@@ -108,20 +112,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(
-            two_layer.master_step,
-            two_layer.slave_step,
-            two_layer.record_command,
-            two_layer.initialize,
-            balance_at_motors=True,
-        ),
-        "pspm": PassivityMethod(
-            pspm.master_step,
-            pspm.slave_step,
-            pspm.record_command,
-            pspm.initialize,
-            balance_at_motors=True,
-        ),
+        "two_layer": PassivityMethod(*_functions_of(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_functions_of(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -210,8 +202,8 @@ class _CommonMethodConfig:
 class PassivityConfig(MethodConfigs, _CommonMethodConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
-    The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
-    `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the slave's mass.
+    The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
+    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
     """
 
     def check(self, where: str) -> None:

@@ -29,7 +29,7 @@ POSE = _layout.vector(7)
 VELOCITY = _layout.vector(6)
 #: Wrench at the sender [f; tau], in W, in the master's power units.
 WRENCH = _layout.vector(6)
-#: Cumulative integral; the method defines it.
+#: Numbers that the method defines, such as a cumulative integral.
 METHOD_INTEGRAL = _layout.vector(6)
 #: Cumulative energy that the receiver may use, by group [J].
 CUMULATIVE_ENERGY = _layout.vector(2)

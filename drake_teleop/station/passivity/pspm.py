@@ -52,7 +52,7 @@ _SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.ve
 @settings
 @dataclass
 class PspmConfig:
-    """Parameters of the passivity method "pspm", passive set-position modulation."""
+    """Parameters of the passive set-position modulation."""
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
