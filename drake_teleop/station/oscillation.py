@@ -68,7 +68,7 @@ def flag_unexplained_oscillation(
     commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_nearest_time_of_each_cause(t[reversal_indices(x, swing)], commanded, window)
+        times = remove_explained_times(t[reversal_indices(x, swing)], commanded, window)
         for series in split_times_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_OSCILLATION_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
@@ -103,7 +103,7 @@ def doubled_quaternions(pose: Array, reference: Array) -> Array:
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_nearest_time_of_each_cause(times: Array, causes: Array, window: float) -> Array:
+def remove_explained_times(times: Array, causes: Array, window: float) -> Array:
     """Remove, for each cause, the nearest event within `window` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
@@ -155,9 +155,8 @@ def find_chatter(t: Array, force: Array, command_reversals: Array) -> list[Chatt
         force: (N,) magnitude of the contact force [N].
         command_reversals: times of the command's reversals [s].
     """
-    touches = remove_nearest_time_of_each_cause(
-        _find_touches(t, force), command_reversals, _MAX_TOUCH_TO_REVERSAL_S
-    )
+    touches = _find_touches(t, force)
+    touches = remove_explained_times(touches, command_reversals, _MAX_TOUCH_TO_REVERSAL_S)
     found = []
     for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:

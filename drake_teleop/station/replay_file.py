@@ -207,13 +207,11 @@ class ForceArrow:
     """Arrow in Meshcat that represents a force, 3 mm long per newton."""
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
-        self._path = f"/forces/{name}"
-        meshcat.SetObject(
-            f"{self._path}/shaft/scaled", Cylinder(_ARROW_RADIUS_M, 1.0), colour_to_rgba(colour)
-        )
+        self._path, rgba = f"/forces/{name}", colour_to_rgba(colour)
+        meshcat.SetObject(f"{self._path}/shaft/scaled", Cylinder(_ARROW_RADIUS_M, 1.0), rgba)
         # The cone's tip is at its origin; its axis is z.
         head = MeshcatCone(_ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M)
-        meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
+        meshcat.SetObject(f"{self._path}/head/scaled", head, rgba)
 
     def show_force(self, canvas: Canvas, replay_time: float, p_W: Array, force: Array) -> None:
         """Show `force` (3,) [N] at the point `p_W` (3,) [m], both in W, at `replay_time` [s]."""

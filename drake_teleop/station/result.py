@@ -133,9 +133,7 @@ class SimulationResult:
     @property
     def units(self) -> dict[str, dict[str, str]]:
         """Unit per signal and component: ``units["measured_wrench_S"]["f_x"] == "N"``."""
-        return {
-            spec.name: dict(zip(spec.components, spec.units, strict=True)) for spec in self.specs
-        }
+        return {s.name: dict(zip(s.components, s.units, strict=True)) for s in self.specs}
 
     @overload
     def __getitem__(self, name: str) -> Array: ...
@@ -251,10 +249,7 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log of `read_parquet` without its samples: each access to a signal reads the disk.
-
-        The log may be larger than the memory.
-        """
+        """Open a log like `read_parquet`, but read a signal from the disk at each access to it."""
         import polars as pl
 
         expect_type((str, Path), path, "result")

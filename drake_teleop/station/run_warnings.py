@@ -116,10 +116,8 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
 
 def _check_faults(result: SimulationResult) -> Warnings:
     t = result.t
-    slave, hand = (
-        result[name][:, 0] if name in result else np.zeros(len(t))
-        for name in ("fault", "fault_at_hand")
-    )
+    names = ("fault", "fault_at_hand")
+    slave, hand = (result[n][:, 0] if n in result else np.zeros(len(t)) for n in names)
     for fault, meaning in FAULT_WARNINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))

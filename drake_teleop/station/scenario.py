@@ -329,9 +329,8 @@ def _check_channel(scenario: Scenario, where: str) -> None:
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
-    if scenario.master.is_joint_leader and not (
-        scenario.has_no_network_or_passivity and scenario.contact_detection is None
-    ):
+    is_direct = scenario.has_no_network_or_passivity and scenario.contact_detection is None
+    if scenario.master.is_joint_leader and not is_direct:
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"
         remedy = "set it to pose, or remove network, passivity and contact_detection"
         raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)

@@ -170,8 +170,7 @@ def _force_and_position_text(
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
     slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(
-        slave.arm.table, result["slave_state"][ended, : slave.arm.num_joints], R_WS, p_WS
-    )
+    joints = result["slave_state"][ended, : slave.arm.num_joints]
+    forward_kinematics(slave.arm.table, joints, R_WS, p_WS)
     off: Array = p_WS + R_WS @ slave.tip - slave.start_tip - np.array(task.translation)
     return off

@@ -82,9 +82,8 @@ class Channel(NetworkConfig):
 
 
 # State of both ends in one array.
-_ENDS_STATE_SIZE = (
-    2 + 2 * (8 + 6 + MEMORY_SIZE) + safe_state.MASTER_MONITOR_SIZE + safe_state.SLAVE_MONITOR_SIZE
-)
+_MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
+_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + sum(_MONITOR_SIZES)
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
@@ -93,8 +92,7 @@ _LAST_FINITE_SLAVE_POSE_AND_FLAG = _layout.vector(8)  # pose of the slave, likew
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
-_MASTER_SILENCE_MONITOR = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
-_SLAVE_SILENCE_MONITOR = _layout.vector(safe_state.SLAVE_MONITOR_SIZE)
+_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _MONITOR_SIZES)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
 _R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)

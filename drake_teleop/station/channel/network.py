@@ -133,9 +133,8 @@ def network_parameters(
     trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
-    longest = math.floor(
-        mean * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter) + 0.5
-    )
+    max_deviation = _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter
+    longest = math.floor(mean * (1 + max_deviation) + 0.5)
     if trace.size:
         longest = max(int(trace.max()), 0)
     longest = max(longest, min_steps)

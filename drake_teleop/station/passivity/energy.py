@@ -76,10 +76,7 @@ class EnergyBalance:
 
 
 def energy_balance(memory: Array) -> EnergyBalance:
-    """Return the energy balance in one end's `memory` (..., MEMORY_SIZE), 0 if a method has none.
-
-    A wrong shape raises a DrakeTeleopError.
-    """
+    """Return the energy balance of one end's `memory` (..., MEMORY_SIZE); zeros without one."""
     if memory.shape[-1] != MEMORY_SIZE:
         raise DrakeTeleopError(
             f"expected shape (..., {MEMORY_SIZE}), found {memory.shape}",

@@ -158,12 +158,10 @@ class LedgerConfig:
     def pack_into(self, p: Array) -> None:
         p[INITIAL_LEDGER_ENERGY] = self.initial
         p[SLAVE_RESERVE], p[MASTER_RESERVE] = self.reserve, self.hand_reserve
-        p[DRAG_WRENCH] = np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION])
-        p[CONTACT_THRESHOLD] = np.divide(self.touch, p[SLAVE_PER_MASTER_MOTION])
-        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[SLAVE_PER_MASTER_MOTION])
-        p[WRENCH_METRIC] = (
-            ANGLE_PER_LENGTH * p[SLAVE_PER_MASTER_MOTION] / p[SLAVE_PER_MASTER_MOTION][0]
-        ) ** 2
+        scales = p[SLAVE_PER_MASTER_MOTION]
+        p[DRAG_WRENCH], p[CONTACT_THRESHOLD] = self.drag / scales, self.touch / scales
+        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], scales)
+        p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * scales / scales[0]) ** 2
 
 
 def initialize(p: Array, memory: Array) -> None:

@@ -108,15 +108,11 @@ _STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
 )
 # Fit of k and b: filtered force; force and speed at the start of the sample; its length and the
 # lag of its filter; length of the fit and its sums.
-_FILTERED_FORCE, _FIT_SAMPLE_START_FORCE, _FIT_SAMPLE_START_SPEED = (
-    _layout.number() for _ in range(3)
-)
+_FILTERED_FORCE, _SAMPLE_START_FORCE, _SAMPLE_START_SPEED = (_layout.number() for _ in range(3))
 _FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = (_layout.number() for _ in range(3))
 _FIT_SUMS = _layout.vector(NUM_CONTACT_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _STEP_PERIOD = (
-    _layout.number() for _ in range(4)
-)
+_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
 _CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = _layout.vector(6), _layout.vector(6)
 # Rendered force along n; last speed into the wall; largest friction.
 _RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
@@ -175,7 +171,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = has_arrived(received)
-    memory[_STEP_PERIOD] = T
+    memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
     kept = 1.0 - T / _LONGEST_DELAY_DECAY_S
@@ -301,9 +297,9 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
         # Start at the first sample in contact, because the step to it was partly outside.
-        memory[_FILTERED_FORCE] = memory[_FIT_SAMPLE_START_FORCE] = memory[_RENDERED_FORCE] = size
+        memory[_FILTERED_FORCE] = memory[_SAMPLE_START_FORCE] = memory[_RENDERED_FORCE] = size
         memory[_DISPLACEMENT_FILTER_LAG] = inward
-        memory[_FIT_SAMPLE_START_SPEED] = memory[_LAST_SPEED_INTO_WALL] = speed
+        memory[_SAMPLE_START_SPEED] = memory[_LAST_SPEED_INTO_WALL] = speed
         memory[_FIT_SAMPLE_LENGTH] = memory[_FIT_SPAN] = 0.0
         memory[_STIFFNESS_SHARE] = memory[_STIFFNESS_SHARE_GOAL] = k_d / max(k, k_d)
     filtered_step = rate * (inward - memory[_DISPLACEMENT_FILTER_LAG])
@@ -316,16 +312,16 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     if length_m > (_MIN_FIT_SAMPLE_LENGTH_M if slow else _MIN_FAST_FIT_SAMPLE_LENGTH_M):
         memory[_FIT_SPAN] = min(memory[_FIT_SPAN] + length_m, _MAX_FIT_SPAN_M)
         keep = max(1.0 - length_m / max(memory[_FIT_SPAN], _MIN_FIT_SPAN_M), 0.0) if slow else 0.5
-        speed_change = speed - memory[_FIT_SAMPLE_START_SPEED]
+        speed_change = speed - memory[_SAMPLE_START_SPEED]
         stretch, damping = memory[_FIT_SAMPLE_LENGTH], memory[_CONTACT_DAMPING]
-        change = memory[_FILTERED_FORCE] - memory[_FIT_SAMPLE_START_FORCE] - damping * speed_change
+        change = memory[_FILTERED_FORCE] - memory[_SAMPLE_START_FORCE] - damping * speed_change
         largest = max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch
         change -= force_change_by_slip(change, largest, max_change)
         change += damping * speed_change
         k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
-        memory[_FIT_SAMPLE_LENGTH], memory[_FIT_SAMPLE_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
-        memory[_FIT_SAMPLE_START_SPEED] = speed
+        memory[_FIT_SAMPLE_LENGTH], memory[_SAMPLE_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
+        memory[_SAMPLE_START_SPEED] = speed
     if k > 1.0:  # N/m
         rate, goal = min(T / _STIFFNESS_SHARE_FILTER_S, 1.0), memory[_STIFFNESS_SHARE_GOAL]
         if abs(k_d / max(k, k_d) - goal) > _STIFFNESS_SHARE_DEADBAND * goal:
@@ -438,7 +434,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
         permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
-    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_STEP_PERIOD] * size / mass)
+    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True

@@ -149,11 +149,7 @@ class MethodConfigs:
     )
 
 
-_CONFIG_FIELD_OF_METHOD = {
-    entry.metadata.get("method", entry.name): entry.name for entry in fields(MethodConfigs)
-}
-
-
+_CONFIG_FIELD_OF_METHOD = {f.metadata.get("method", f.name): f.name for f in fields(MethodConfigs)}
 _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
@@ -248,9 +244,8 @@ def method_parameters(
     p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
     p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
     p[SLAVE_PER_MASTER_MOTION] = motion_scale
-    p[RETREAT_SPEED] = (
-        np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
-    )
+    fades = config.method != "none"
+    p[RETREAT_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf
     own = config.method_config()
     if own is not None:
         own.pack_into(p)
@@ -277,9 +272,7 @@ _STEP_ARGUMENT_TYPES = (
     (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4),
     (_VECTOR,) * 6,
 )
-_call_master_step, _call_slave_step, _call_record_command = map(
-    make_call_at_address, _STEP_ARGUMENT_TYPES
-)
+_call_master, _call_slave, _call_record = map(make_call_at_address, _STEP_ARGUMENT_TYPES)
 
 
 def step_addresses(method: str) -> tuple[int, ...]:
@@ -328,7 +321,7 @@ def master_step(
     if not healthy:
         wrench[:] = 0.0
     else:
-        _call_master_step(
+        _call_master(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         fade_retreat_wrench(twist, T, p, memory, wrench)
@@ -353,7 +346,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         memory[COMMAND_TWIST] = 0.0
         copy_into(command, 0, memory, COMMAND.start, 13)
     else:
-        _call_slave_step(
+        _call_slave(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
     _set_packet_number_and_health(healthy, memory, packet)
@@ -366,4 +359,4 @@ def record_command(steps, requested, command, pose, twist, p, memory):
     `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
     the method may change.
     """
-    _call_record_command(steps[2], requested, command, pose, twist, p, memory)
+    _call_record(steps[2], requested, command, pose, twist, p, memory)

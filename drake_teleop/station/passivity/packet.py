@@ -107,9 +107,8 @@ def are_vectors_finite(vectors):
 @njit(cache=True)
 def pose_difference_into(a, b, e):
     """Write the difference of two poses (7,), [p_a - p_b; log(R_a R_b^T)] in W, into `e` (6,)."""
-    turn = quaternion_logarithm(
-        quaternion_product((a[0], a[1], a[2], a[3]), conjugate_quaternion((b[0], b[1], b[2], b[3])))
-    )
+    inverse = conjugate_quaternion((b[0], b[1], b[2], b[3]))
+    turn = quaternion_logarithm(quaternion_product((a[0], a[1], a[2], a[3]), inverse))
     for i in range(3):
         e[i] = a[4 + i] - b[4 + i]
         e[3 + i] = turn[i]
