@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
-from drake_teleop.common.errors import expect_type
+from drake_teleop.common.errors import DrakeTeleopError, expect_type, suggest_name
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -108,5 +108,8 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 def GetBlock(station: Diagram, name: str) -> System:
     """Return the block `name` ("force_scaling", "slave_plant", ...) of the station."""
     sides = [side for side in station.GetSystems() if isinstance(side, Diagram)]
-    (side,) = (side for side in sides if side.HasSubsystemNamed(name))
-    return side.GetSubsystemByName(name)
+    blocks = {block.get_name(): block for side in sides for block in side.GetSystems()}
+    if name in blocks:
+        return blocks[name]
+    remedy = suggest_name(name, list(blocks), f"choose one of {', '.join(blocks)}")
+    raise DrakeTeleopError(f"the station has no block '{name}'", where="name", remedy=remedy)

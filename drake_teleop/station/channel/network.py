@@ -193,9 +193,9 @@ def _read_delay_trace(path: Path, period: float) -> Array:
         ("delay", delay, (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
     ):
         if bad.any():
-            row = int(np.argmax(bad))
+            first = int(np.argmax(bad))
             raise DrakeTeleopError(
-                f"row {table.line_in_file(row)}, {values[row]:g}, {what}",
+                f"row {table.line_in_file(first)}, {values[first]:g}, {what}",
                 where=f"{path}:{column}",
                 remedy="give seconds, sorted by time; an empty delay is a lost packet",
             )
