@@ -118,7 +118,7 @@ def split_times_at_gaps(times: Array, longest: float) -> list[Array]:
 
 
 def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
-    """Return `signal` (N, k) minus its mean over 0.2 s; `t` (N,) are evenly spaced times [s]."""
+    """Return `signal` (N, k) minus its moving mean over 0.2 s; `t` (N,) is evenly spaced [s]."""
     rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")
 
