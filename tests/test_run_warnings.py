@@ -31,7 +31,7 @@ from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.run_warnings import (
-    find_spans_closing_gaps,
+    find_spans,
     lag_beyond_delay,
     run_warnings,
 )
@@ -245,7 +245,7 @@ def test_ledger_reserve_warning_gives_the_required_energy():
     slower = {"pose_received": (6, -held)}
     found = [x for x in run_warnings(recorded(**slower), scenario, ARM) if "reserve" in x]
     (warning,) = found
-    assert warning.startswith("the ledger's reserve limits the slave to 0.091 m/s, and the hand")
+    assert warning.startswith("the ledger's reserve limits the slave to 0.091 m/s, and the command")
     assert "moves at up to 0.16: " in warning
     # Distance to the nearest command of the last 50 ms.
     far = float(warning.split("command is up to ")[1].split(" mm")[0])
@@ -274,9 +274,9 @@ def test_wrist_motor_limit_uses_the_device_axes():
 
 def test_spans_close_gaps_and_skip_short_spans():
     happened = during(0.5, 0.6) | during(0.62, 1.0) | during(2.0, 2.1)
-    assert find_spans_closing_gaps(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
-    assert find_spans_closing_gaps(T, happened, 0.2) == [(0.5, 1.0)]
-    assert find_spans_closing_gaps(T, 0 * T > 1) == []
+    assert find_spans(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
+    assert find_spans(T, happened, 0.2) == [(0.5, 1.0)]
+    assert find_spans(T, 0 * T > 1) == []
 
 
 def test_further_times_are_counted():

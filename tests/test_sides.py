@@ -222,6 +222,9 @@ def test_blocks_are_found_in_all_sides():
     station = MakeTeleopStation(Scenario())
     for name in ("operator", "master_device", "slave_plant", "force_scaling", "monitor"):
         assert GetBlock(station, name).get_name() == name
+    message = "^name: the station has no block 'slave_plan'; did you mean 'slave_plant'\\?$"
+    with pytest.raises(DrakeTeleopError, match=message):
+        GetBlock(station, "slave_plan")
 
 
 def test_direct_wires_replace_an_ideal_channel():

@@ -52,15 +52,17 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             builder.ExportOutput(wire.get_output_port(), exit_)
         return builder.Build()
     scaling = scenario.kinematic_scaling
-    passivity = _add_device_limits_and_encoder_steps(
-        scenario, passivity_with_arm_mass_and_servo(scenario)
+    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    block = TeleopChannel(
+        scenario.channel,
+        _passivity_with_arm_and_device(scenario),
+        RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
+        scales,
+        _rendered_over_contact_force(scenario),
+        start_pose(scenario.slave),
+        1 / scenario.rates.hand_hz,
+        scenario.simulation.seed,
     )
-    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    motion_scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    scales = motion_scales, _rendered_over_contact_force(scenario)
-    start, period = start_pose(scenario.slave), 1 / scenario.rates.hand_hz
-    seed = scenario.simulation.seed
-    block = TeleopChannel(scenario.channel, passivity, R_WB, *scales, start, period, seed)
     channel = builder.AddNamedSystem("channel", block)
     own = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
     for name in own:
@@ -73,10 +75,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _add_device_limits_and_encoder_steps(
-    scenario: Scenario, passivity: PassivityConfig
-) -> PassivityConfig:
-    device = scenario.master.device(0.0, 0.0)
+def _passivity_with_arm_and_device(scenario: Scenario) -> PassivityConfig:
+    passivity, device = passivity_with_arm_mass(scenario), scenario.master.device(0.0, 0.0)
     ledger = passivity.ledger
     if ledger.encoder_step is None:
         steps = scenario.master.encoder_steps()
@@ -89,7 +89,7 @@ def _add_device_limits_and_encoder_steps(
     )
 
 
-def passivity_with_arm_mass_and_servo(scenario: Scenario) -> PassivityConfig:
+def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     """Return the scenario's passivity settings, with mass and servo of the arm if needed.
 
     An arm with fewer than six joints, whose mass is then unbounded, raises a DrakeTeleopError.
@@ -112,6 +112,7 @@ def passivity_with_arm_mass_and_servo(scenario: Scenario) -> PassivityConfig:
 
 
 def slave_wrench_power_scale(scenario: Scenario) -> Array:
+    """Return factors (2,) from the slave's wrench to the master's power units: force, torque."""
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _rendered_over_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)

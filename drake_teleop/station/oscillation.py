@@ -68,23 +68,21 @@ def flag_unexplained_oscillation(
     commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_nearest_time_of_each_cause(t[reversal_indices(x, swing)], commanded, window)
+        times = remove_explained_times(t[reversal_indices(x, swing)], commanded, window)
         for series in split_times_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_OSCILLATION_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
     return oscillating
 
 
-def flag_unexplained_pose_oscillation(
-    t: Array, command: Array, actual: Array, window: float
+def flag_pose_oscillation(
+    t: Array, command: Array, actual: Array, window: float = MAX_REVERSAL_DELAY_S
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
 
     `window` [s] is that of `flag_unexplained_oscillation`.
     """
-    turned, wanted = (
-        doubled_quaternions_with_reference_sign(pose, command) for pose in (actual, command)
-    )
+    turned, wanted = (doubled_quaternions(pose, command) for pose in (actual, command))
     swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, window)
     return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_SWING_RAD, window)
 
@@ -92,14 +90,11 @@ def flag_unexplained_pose_oscillation(
 def pose_reversal_times(t: Array, pose: Array) -> Array:
     """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
     rows = [reversal_indices(x, _MIN_SWING_M) for x in pose[:, 4:].T]
-    rows += [
-        reversal_indices(x, _MIN_SWING_RAD)
-        for x in doubled_quaternions_with_reference_sign(pose, pose).T
-    ]
+    rows += [reversal_indices(x, _MIN_SWING_RAD) for x in doubled_quaternions(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
-def doubled_quaternions_with_reference_sign(pose: Array, reference: Array) -> Array:
+def doubled_quaternions(pose: Array, reference: Array) -> Array:
     """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
 
     Each quaternion has the sign that is nearer to the first one of `reference` (N, 7).
@@ -108,7 +103,7 @@ def doubled_quaternions_with_reference_sign(pose: Array, reference: Array) -> Ar
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_nearest_time_of_each_cause(times: Array, causes: Array, window: float) -> Array:
+def remove_explained_times(times: Array, causes: Array, window: float) -> Array:
     """Remove, for each cause, the nearest event within `window` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
@@ -123,15 +118,15 @@ def split_times_at_gaps(times: Array, longest: float) -> list[Array]:
 
 
 def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
-    """Return the part of `signal` (N, k) above 5 Hz, for evenly spaced times `t` (N,) [s]."""
+    """Return `signal` (N, k) minus its moving mean over 0.2 s; `t` (N,) is evenly spaced [s]."""
     rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")
 
 
 def dominant_frequency(t: Array, signal: Array) -> tuple[float, float]:
-    """Return the strongest frequency [Hz] of `signal` (N, k), and the share of power within 25 %.
+    """Return the strongest frequency [Hz] of `signal` (N, k) and the power share within 25 % of it.
 
-    `t` are evenly spaced times [s].
+    `t` (N,) are evenly spaced times [s].
     """
     spectrum = np.fft.rfft(signal * np.hanning(len(signal))[:, np.newaxis], axis=0)
     power, k = (np.abs(spectrum) ** 2).sum(axis=1), np.arange(len(spectrum))
@@ -153,16 +148,15 @@ class Chatter(NamedTuple):
 def find_chatter(t: Array, force: Array, command_reversals: Array) -> list[Chatter]:
     """Return each long series of touches, without touches explained by reversals of the command.
 
-    A series has 8 or more touches, at most 0.2 s apart, and lasts 0.3 s or longer.
+    A series has 8 or more touches, at most 0.2 s apart, lasts 0.3 s or longer and reaches 0.5 N.
 
     Args:
         t: (N,) evenly spaced times [s].
         force: (N,) magnitude of the contact force [N].
         command_reversals: times of the command's reversals [s].
     """
-    touches = remove_nearest_time_of_each_cause(
-        _find_touches(t, force), command_reversals, _MAX_TOUCH_TO_REVERSAL_S
-    )
+    touches = _find_touches(t, force)
+    touches = remove_explained_times(touches, command_reversals, _MAX_TOUCH_TO_REVERSAL_S)
     found = []
     for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:

@@ -59,8 +59,6 @@ _TABLE_HEIGHT_M = 0.60
 _MASTER_BASE_P_WB = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
 _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
 _CAMERA_SHIFT_WITHOUT_DEVICE_W = np.array([-0.3, 0.0, 0.0])  # of camera and target
-
-
 _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
 _WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
 _STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
@@ -97,9 +95,8 @@ def replay_command(
             films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
             if not quiet:
                 print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
-        summary = {"films": films}
-        write_json(out / "summary.json", summary)
-    return summary
+        write_json(out / "summary.json", {"films": films})
+    return {"films": films}
 
 
 def write_replay(
@@ -146,23 +143,15 @@ def write_replay(
 
 def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
-    readings = [
-        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, has_arrow=True)
-    ]
+    forces = [("Measured at the wrist", measured, BLUE)]
     if "contact_wrench_S" in signals:
-        contact = _row_norms(signals["contact_wrench_S"][:, :3])
-        readings.append(
-            DisplayedNumber("Contact, calculated", "N", contact, VERMILION, has_arrow=True)
-        )
+        forces.append(("Contact, calculated", signals["contact_wrench_S"][:, :3], VERMILION))
     if "force_to_master" in signals:
-        readings.append(
-            DisplayedNumber("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
-        )
-    return readings
-
-
-def _row_norms(vectors: Array) -> Array:
-    return np.linalg.norm(vectors, axis=1)
+        forces.append(("Shown to the hand", signals["force_to_master"][:, :3], ""))
+    return [
+        DisplayedNumber(name, "N", np.linalg.norm(force, axis=1), colour, has_arrow=colour != "")
+        for name, force, colour in forces
+    ]
 
 
 def _find_logs(run: Path) -> list[Path]:
@@ -327,10 +316,8 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
 
 
 def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
-    def draw_box(
-        name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba
-    ):
-        meshcat.SetObject(f"/room/{name}", Box(*size), colour)
+    def draw_box(name: str, size: tuple[float, ...], centre: tuple[float, ...], colour: Rgba):
+        meshcat.SetObject(f"/room/{name}", Box(size), colour)
         meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))
 
     draw_box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR_COLOUR)

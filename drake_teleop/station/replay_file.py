@@ -51,10 +51,10 @@ class Canvas(Protocol):
     """Interface for 3D objects with poses and properties: Meshcat or a substitute."""
 
     def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
-        """Set the pose of the object at scene `path`, for a time of the recording [s]."""
+        """Set the pose of the object at scene `path` at a time of the recording [s]."""
 
     def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
-        """Set a property of an object, such as "scale", for a time of the recording [s]."""
+        """Set a property of an object, such as "scale", at a time of the recording [s]."""
 
 
 @dataclass(frozen=True)
@@ -157,15 +157,10 @@ class ReplayFile:
         }
         player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        whole = (
-            head.replace("<title>Drake MeshCat<", _VIEWPORT_AND_TITLE_TAGS, 1)
-            + player
-            + body
-            + tail
-        )
-        return whole.replace(
-            "<title>", _SECURITY_POLICY_TAG.format(content_security_policy(whole)) + "<title>", 1
-        )
+        head = head.replace("<title>Drake MeshCat<", _VIEWPORT_AND_TITLE_TAGS, 1)
+        whole = head + player + body + tail
+        policy = _SECURITY_POLICY_TAG.format(content_security_policy(whole))
+        return whole.replace("<title>", f"{policy}<title>", 1)
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
@@ -175,10 +170,8 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
     """
     span = stop - start
     if slow_motion is None:
-        slow_motion = next(
-            (s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_REPLAY_DURATION_S),
-            _SLOW_MOTION_FACTORS[-1],
-        )
+        enough = [s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_REPLAY_DURATION_S]
+        slow_motion = enough[0] if enough else _SLOW_MOTION_FACTORS[-1]
     frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MAX_FRAMES)
     return np.linspace(start, stop, max(frames, 1) + 1), slow_motion
 
@@ -214,13 +207,11 @@ class ForceArrow:
     """Arrow in Meshcat that represents a force, 3 mm long per newton."""
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
-        self._path = f"/forces/{name}"
-        meshcat.SetObject(
-            f"{self._path}/shaft/scaled", Cylinder(_ARROW_RADIUS_M, 1.0), colour_to_rgba(colour)
-        )
+        self._path, rgba = f"/forces/{name}", colour_to_rgba(colour)
+        meshcat.SetObject(f"{self._path}/shaft/scaled", Cylinder(_ARROW_RADIUS_M, 1.0), rgba)
         # The cone's tip is at its origin; its axis is z.
         head = MeshcatCone(_ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M)
-        meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
+        meshcat.SetObject(f"{self._path}/head/scaled", head, rgba)
 
     def show_force(self, canvas: Canvas, replay_time: float, p_W: Array, force: Array) -> None:
         """Show `force` (3,) [N] at the point `p_W` (3,) [m], both in W, at `replay_time` [s]."""

@@ -133,9 +133,7 @@ class SimulationResult:
     @property
     def units(self) -> dict[str, dict[str, str]]:
         """Unit per signal and component: ``units["measured_wrench_S"]["f_x"] == "N"``."""
-        return {
-            spec.name: dict(zip(spec.components, spec.units, strict=True)) for spec in self.specs
-        }
+        return {s.name: dict(zip(s.components, s.units, strict=True)) for s in self.specs}
 
     @overload
     def __getitem__(self, name: str) -> Array: ...
@@ -251,11 +249,7 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log that may be larger than the memory: each access to a signal reads the disk.
-
-        Args:
-            path: file or folder of parts, from `write_parquet` or `simulate`.
-        """
+        """Open a log like `read_parquet`, but read a signal from the disk at each access to it."""
         import polars as pl
 
         expect_type((str, Path), path, "result")
@@ -315,7 +309,9 @@ class SimulationResult:
     def __repr__(self) -> str:
         width = max((len(name) for name in self.signals), default=0)
         lines = [f"SimulationResult: {self._time_range_text()}"]
-        lines += [f"  {spec.name:{width}}  {_signal_text(spec)}" for spec in self.specs]
+        for spec in self.specs:
+            text = f"  {spec.name:{width}}  {_components_text(spec)}  {spec.description}"
+            lines.append(text.rstrip())
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -367,11 +363,6 @@ def _components_text(spec: Signal) -> str:
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
-
-
-def _signal_text(spec: Signal) -> str:
-    text = _components_text(spec)
-    return f"{text}  {spec.description}" if spec.description else text
 
 
 def _files_of_log(path: Path) -> list[Path]:

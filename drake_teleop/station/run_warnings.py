@@ -14,7 +14,7 @@ from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import (
-    passivity_with_arm_mass_and_servo,
+    passivity_with_arm_mass,
     slave_wrench_power_scale,
 )
 from drake_teleop.station.master.dynamics import HapticDevice
@@ -23,10 +23,10 @@ from drake_teleop.station.oscillation import (
     MAX_FORCE_RIPPLE_RMS_AT_REST_N,
     MAX_REVERSAL_DELAY_S,
     dominant_frequency,
-    doubled_quaternions_with_reference_sign,
+    doubled_quaternions,
     find_chatter,
+    flag_pose_oscillation,
     flag_unexplained_oscillation,
-    flag_unexplained_pose_oscillation,
     high_pass_above_5_hz,
     pose_reversal_times,
 )
@@ -89,7 +89,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     ]
 
 
-def find_spans_closing_gaps(t: Array, happened: Flags, min_duration: float = 0.0) -> Spans:
+def find_spans(t: Array, happened: Flags, min_duration: float = 0.0) -> Spans:
     """Return the time spans (start, stop) [s] during which `happened` (N,) is true.
 
     Gaps below 50 ms are closed; then spans shorter than `min_duration` [s] are dropped.
@@ -116,43 +116,33 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
 
 def _check_faults(result: SimulationResult) -> Warnings:
     t = result.t
-    slave = hand = np.zeros(len(t))
-    if "fault" in result:
-        slave = result["fault"][:, 0]
-    if "fault_at_hand" in result:
-        hand = result["fault_at_hand"][:, 0]
+    names = ("fault", "fault_at_hand")
+    slave, hand = (result[n][:, 0] if n in result else np.zeros(len(t)) for n in names)
     for fault, meaning in FAULT_WARNINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))
-            yield f"a fault: {meaning},", find_spans_closing_gaps(t, happened)
+            yield f"a fault: {meaning},", find_spans(t, happened)
 
 
 def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
-    t = result.t
-    flag = result["saturated"][:, 0]
-    yield (
-        "the wrist sensor saturates",
-        find_spans_closing_gaps(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG)),
-    )
+    t, flag = result.t, result["saturated"][:, 0]
+    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
-            yield f"inverse kinematics: {status.name}", find_spans_closing_gaps(t, happened)
+            yield f"inverse kinematics: {status.name}", find_spans(t, happened)
     control = scenario.joint_control
-    asked = control.position_loop_gain_per_s * _joint_tracking_error(result)
-    fastest = arm.velocity_limit
-    if control.position_interface is not None:
-        fastest = np.minimum(fastest, control.position_interface.max_speed)
-    for what, values, limit in (
-        ("speed", asked, fastest),
-        ("torque", result["joint_torque"], arm.effort_limit),
-    ):
+    checked = [("torque", result["joint_torque"], arm.effort_limit)]
+    if "joint_command" in result:
+        command, fastest = result["joint_command"], arm.velocity_limit
+        if control.position_interface is not None:
+            fastest = np.minimum(fastest, control.position_interface.max_speed)
+        error = command - result["slave_state"][:, : command.shape[1]]
+        checked.insert(0, ("speed", control.position_loop_gain_per_s * error, fastest))
+    for what, values, limit in checked:
         clipped = np.abs(values) >= _SHARE_AT_LIMIT * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
-            yield (
-                f"joint {joint + 1} is at its largest {what}",
-                find_spans_closing_gaps(t, clipped[:, joint]),
-            )
+            yield f"joint {joint + 1} is at its largest {what}", find_spans(t, clipped[:, joint])
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
@@ -162,15 +152,15 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
             full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
         elif device.peak_torque.all():
             full |= _is_displayed_torque_at_limit(shown[:, 3:], result["master_state"], device)
-        spans = find_spans_closing_gaps(t, full, _MIN_WARNING_SPAN_S)
+        spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
         yield "the device displays its largest force or torque", spans
         ended = device.is_any_axis_at_end_stop(result["master_state"][:, : device.num_joints])
-        yield "the device is at the end of its workspace", find_spans_closing_gaps(t, ended)
+        yield "the device is at the end of its workspace", find_spans(t, ended)
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
         bent = scenario.first_sheet_spring.max_linear_deflection
         yield (
             f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
-            find_spans_closing_gaps(t, np.abs(result["sheet_state"][:, 0]) > bent),
+            find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),
         )
 
 
@@ -179,9 +169,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
-        spans = find_spans_closing_gaps(
-            t, result[f"ports.{end}_silent"] > timeout, _MIN_WARNING_SPAN_S
-        )
+        spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_WARNING_SPAN_S)
         yield f"the {end}'s end is in its safe state, no packets arrive from the {other},", spans
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
@@ -189,7 +177,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for command, actual, least, unit, scale in _pose_parts_with_lag_limits(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
-        spans = find_spans_closing_gaps(t, lag > least, _MIN_WARNING_SPAN_S)
+        spans = find_spans(t, lag > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, lag, spans)
         yield (
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
@@ -197,10 +185,8 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
             spans,
         )
     yield from _check_reserve_speed_limit(result, scenario)
-    oscillating = flag_unexplained_pose_oscillation(
-        t, sent, received, MAX_REVERSAL_DELAY_S + window
-    )
-    spans = find_spans_closing_gaps(t, oscillating, _MIN_WARNING_SPAN_S)
+    oscillating = flag_pose_oscillation(t, sent, received, MAX_REVERSAL_DELAY_S + window)
+    spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     yield f"the channel ({by}) makes the slave's command oscillate", spans
 
 
@@ -210,12 +196,13 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass_and_servo(scenario).slave_mass)
+    mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
     limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
-    then = t - _newest_packet_ages_s(t, scenario)
-    window = (
-        longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_COMMAND_SETTLING_S
-    )
+    forward, period = scenario.channel.networks_of_directions()[0], 1.0 / scenario.rates.hand_hz
+    step = np.rint((t + scenario.simulation.settle) / period).astype(int)
+    newest = newest_packets(forward, scenario.simulation.seed, FORWARD, step[-1] + 1, period)
+    then = t - (step - newest[step]) * period  # when the newest received packet was sent
+    window = longest_delay(forward) + _LEDGER_COMMAND_SETTLING_S
     parts = _pose_parts_with_lag_limits(sent, received)
     for g, (command, actual, least, unit, scale) in enumerate(parts):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
@@ -229,33 +216,24 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
         enough[g] *= (speed[held].max() / limit[g]) ** 2
         yield (
             f"the {scenario.passivity.method}'s reserve limits the slave to {limit[g]:.2g}"
-            f" {speed_unit}, and the hand moves at up to {speed[held].max():.2g}:"
+            f" {speed_unit}, and the command moves at up to {speed[held].max():.2g}:"
             f" for {100 * held.mean():.0f} % of the time"
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
             " pose (move more slowly, or increase the energy:"
             f" passivity.{scenario.passivity.method}.reserve"
             f" {_format_list(enough)} and initial {_format_list(enough + config.hand_reserve)}),",
-            find_spans_closing_gaps(t, held),
+            find_spans(t, held),
         )
 
 
 def _pose_parts_with_lag_limits(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    wanted, turned = (
-        doubled_quaternions_with_reference_sign(pose, command) for pose in (command, actual)
-    )
+    wanted, turned = (doubled_quaternions(pose, command) for pose in (command, actual))
     return (
         (command[:, 4:], actual[:, 4:], _MIN_COMMAND_LAG_M, "mm", 1e3),
         (wanted, turned, _MIN_COMMAND_LAG_RAD, "degrees", _DEGREES_PER_RAD),
     )
-
-
-def _newest_packet_ages_s(t: Array, scenario: Scenario) -> Array:
-    period = 1.0 / scenario.rates.hand_hz
-    step = np.rint((t + scenario.simulation.settle) / period).astype(int)
-    line, seed = scenario.channel.networks_of_directions()[0], scenario.simulation.seed
-    return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
 
 
 def _format_list(values: Array) -> str:
@@ -274,23 +252,20 @@ def _check_joint_tracking_and_oscillation(
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
-        spans = find_spans_closing_gaps(
-            t, far > (_MIN_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_WARNING_SPAN_S
-        )
+        least = _MIN_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD
+        spans = find_spans(t, far > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
     oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_OSCILLATION_RAD)
-    spans = find_spans_closing_gaps(t, oscillating, _MIN_WARNING_SPAN_S)
+    spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     yield "the slave oscillates while its command does not,", spans
 
 
 def _check_hand_oscillation(result: SimulationResult) -> Warnings:
     if "intent" in result and "pose_master" in result:
-        oscillating = flag_unexplained_pose_oscillation(
-            result.t, result["intent"], result["pose_master"], MAX_REVERSAL_DELAY_S
-        )
-        spans = find_spans_closing_gaps(result.t, oscillating, _MIN_WARNING_SPAN_S)
+        oscillating = flag_pose_oscillation(result.t, result["intent"], result["pose_master"])
+        spans = find_spans(result.t, oscillating, _MIN_WARNING_SPAN_S)
         yield "the hand oscillates while its intent does not,", spans
 
 
@@ -321,9 +296,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans_closing_gaps(
-        t, rests & (rms > MAX_FORCE_RIPPLE_RMS_AT_REST_N), _MIN_WARNING_SPAN_S
-    )
+    spans = find_spans(t, rests & (rms > MAX_FORCE_RIPPLE_RMS_AT_REST_N), _MIN_WARNING_SPAN_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
@@ -343,13 +316,6 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
         f" force_scaling.gamma or force_scale{ledger}),",
         spans,
     )
-
-
-def _joint_tracking_error(result: SimulationResult) -> Array:
-    if "joint_command" not in result:
-        return np.zeros((len(result.t), 1))
-    command = result["joint_command"]
-    return command - result["slave_state"][:, : command.shape[1]]
 
 
 def _is_displayed_torque_at_limit(

@@ -208,7 +208,7 @@ def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
 def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    A DrakeTeleopError about "no `kind`", such as "scenario", is raised if neither exists.
+    A DrakeTeleopError that names `kind` is raised if neither exists.
     """
     expect_type((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -329,9 +329,8 @@ def _check_channel(scenario: Scenario, where: str) -> None:
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
-    if scenario.master.is_joint_leader and not (
-        scenario.has_no_network_or_passivity and scenario.contact_detection is None
-    ):
+    is_direct = scenario.has_no_network_or_passivity and scenario.contact_detection is None
+    if scenario.master.is_joint_leader and not is_direct:
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"
         remedy = "set it to pose, or remove network, passivity and contact_detection"
         raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
@@ -339,6 +338,6 @@ def _check_channel(scenario: Scenario, where: str) -> None:
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) < _MIN_KINEMATIC_SCALE_WITH_PASSIVITY:
         least = _MIN_KINEMATIC_SCALE_WITH_PASSIVITY
-        what = f"passivity methods require kinematic scales of {least:g} or more"
+        what = f"passivity methods require kinematic scales >= {least:g}, not {min(scales):g}"
         remedy = "increase both scales of kinematic_scaling, or set method: none"
         raise DrakeTeleopError(what, where=f"{where}:passivity.method", remedy=remedy)

@@ -92,9 +92,8 @@ def _task_is_over(simulator: Simulator) -> bool:
     station = simulator.get_system()
     if not station.HasOutputPort("task_state"):
         return False
-    return bool(
-        station.GetOutputPort("task_state").Eval(simulator.get_context())[OUTCOME_INDEX] != 0.0
-    )
+    state = station.GetOutputPort("task_state").Eval(simulator.get_context())
+    return bool(state[OUTCOME_INDEX] != 0.0)
 
 
 def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
@@ -150,20 +149,15 @@ class LogOnDisk:
 
     def write_and_clear_rows(self) -> None:
         """Write the rows in memory as the next part and clear them; safe to repeat."""
-        part = self._read_rows()
-        self._write_part(part)
+        rows = self.write_and_keep_rows()
         self._sink.Clear()
-        self._rows += len(part.t)
+        self._rows += rows
 
-    def write_and_keep_rows(self) -> None:
-        """Write the rows in memory but keep them; a later part replaces them."""
-        self._write_part(self._read_rows())
-
-    def _write_part(self, part: SimulationResult) -> None:
+    def write_and_keep_rows(self) -> int:
+        """Write the rows in memory; a later part replaces them; return their number."""
+        part = self._form(read_recorded_signals(self._simulator, self._start))
         part.write_part(self._folder, self._rows)
-
-    def _read_rows(self) -> SimulationResult:
-        return self._form(read_recorded_signals(self._simulator, self._start))
+        return len(part.t)
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
@@ -177,7 +171,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance_without_garbage_collection(simulator: Simulator, time: float) -> None:
-    """Advance the simulator to `time` [s] without garbage collection, which saves time."""
+    """Advance the simulator to `time` [s] without garbage collection."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

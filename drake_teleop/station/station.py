@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
-from drake_teleop.common.errors import expect_type
+from drake_teleop.common.errors import DrakeTeleopError, expect_type, suggest_name
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -67,11 +67,8 @@ def MakeTeleopStation(
     master = builder.AddNamedSystem("master_side", master or MakeMasterSide(scenario))
 
     sides = [master, slave]
-    if (
-        channel is None
-        and scenario.has_no_network_or_passivity
-        and scenario.contact_detection is None
-    ):
+    is_direct = scenario.has_no_network_or_passivity and scenario.contact_detection is None
+    if channel is None and is_direct:
         # A Diagram of two wires would cost 3 % of the time.
         setpoint = "leader_joints" if scenario.master.is_joint_leader else "pose_command"
         connect_ports(builder, master, setpoint, slave, setpoint)
@@ -84,13 +81,9 @@ def MakeTeleopStation(
         connect_ports(builder, slave, "wrench_B", channel, "wrench_B")
         connect_ports(builder, channel, "wrench_to_master", master, "wrench_command")
         # Inputs of network methods and of contact detection.
-        for source, name in (
-            (master, "hand_wrench_E"),
-            (slave, "pose_slave"),
-            (slave, "saturated"),
-            (slave, "contact"),
-        ):
+        for name in ("hand_wrench_E", "pose_slave", "saturated", "contact"):
             if channel.HasInputPort(name):
+                source = master if name == "hand_wrench_E" else slave
                 connect_ports(builder, source, name, channel, name)
         # Optional for a custom slave: without this port the whole wrench counts as contact.
         if channel.HasInputPort("load_wrench_B") and slave.HasOutputPort("load_wrench_B"):
@@ -115,5 +108,8 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 def GetBlock(station: Diagram, name: str) -> System:
     """Return the block `name` ("force_scaling", "slave_plant", ...) of the station."""
     sides = [side for side in station.GetSystems() if isinstance(side, Diagram)]
-    (side,) = (side for side in sides if side.HasSubsystemNamed(name))
-    return side.GetSubsystemByName(name)
+    blocks = {block.get_name(): block for side in sides for block in side.GetSystems()}
+    if name in blocks:
+        return blocks[name]
+    remedy = suggest_name(name, list(blocks), f"choose one of {', '.join(blocks)}")
+    raise DrakeTeleopError(f"the station has no block '{name}'", where="name", remedy=remedy)

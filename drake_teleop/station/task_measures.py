@@ -162,17 +162,15 @@ def _force_and_position_text(
     place = f"the tip {away:.1f} mm from the target"
     if isinstance(task, Reach):
         return place
-    wanted = (
-        f" instead of {_required_contact_force(task):g} N" if _required_contact_force(task) else ""
-    )
-    return f"{place}, {true_contact_force_magnitudes(result)[ended]:.1f} N at the tool{wanted}"
+    required, force = _required_contact_force(task), true_contact_force_magnitudes(result)[ended]
+    instead = f" instead of {required:g} N" if required else ""
+    return f"{place}, {force:.1f} N at the tool{instead}"
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
     slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(
-        slave.arm.table, result["slave_state"][ended, : slave.arm.num_joints], R_WS, p_WS
-    )
+    joints = result["slave_state"][ended, : slave.arm.num_joints]
+    forward_kinematics(slave.arm.table, joints, R_WS, p_WS)
     off: Array = p_WS + R_WS @ slave.tip - slave.start_tip - np.array(task.translation)
     return off

@@ -356,6 +356,26 @@ def test_ends_and_networks_equal_the_channel_of_the_station(method):
     assert np.ptp(expected[:, 4:], axis=0).max() > 1e-5
 
 
+@pytest.mark.parametrize("name", ["pose_command", "pose_slave", "wrench_B"])
+def test_an_end_without_a_required_input_raises(name):
+    block = EXAMPLES["PassivityAtMaster" if name == "pose_command" else "PassivityAtSlave"]()
+    ports = {"pose_command": START, "pose_slave": START, "wrench_B": np.zeros(6)}
+    ports = {"received": np.zeros(PACKET_SIZE + 1)} | ports
+    given = {k: v for k, v in ports.items() if k != name and block.HasInputPort(k)}
+    with pytest.raises(RuntimeError, match=name):
+        output(block, fixed(block, **given), "packet")
+    output(block, fixed(block, **given, **{name: ports[name]}), "packet")
+
+
+def test_scale_0_of_rotation_leaves_finite_numbers_at_both_ends():
+    for end in (blocks.PassivityAtMaster, blocks.PassivityAtSlave):
+        block = end(PassivityConfig(method="wave"), T, START, scales=(1.0, 0.0))
+        ports = {"pose_command": START, "pose_slave": START, "wrench_B": np.ones(6)}
+        ports = {"received": np.zeros(PACKET_SIZE + 1)} | ports
+        context = fixed(block, **{k: v for k, v in ports.items() if block.HasInputPort(k)})
+        assert np.isfinite(output(block, context, "packet")).all()
+
+
 def test_network_delays_by_whole_periods():
     block = blocks.NetworkChannel(2, T, NetworkConfig(delay=0.003))
     rows = [{"packet": [k + 1.0, -k]} for k in range(8)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DiscreteStateIndex
@@ -13,6 +11,7 @@ from drake_teleop.station.channel.channel import (
     MIN_TIMEOUT_S,
     PORTS_SIGNAL_SIZE,
     initial_state_of_ends,
+    method_parameters_and_frame,
     step_master_end,
     step_slave_end,
 )
@@ -20,6 +19,8 @@ from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.stepped_block import SteppedBlock
+
+_OPTIONAL_PORTS = ("hand_wrench_E", "load_wrench_B", "saturated", "contact")
 
 
 class _PassivityEndBlock(SteppedBlock):
@@ -51,27 +52,28 @@ class _PassivityEndBlock(SteppedBlock):
         super().__init__()
         start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
         rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
-        parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
-        frame = np.concatenate([rotation.ravel(), scales])
+        parameters, frame = method_parameters_and_frame(passivity, rotation, scales, force_scale)
         self._method = methods.step_addresses(passivity.method)
         self._constants = period, timeout, frame, parameters
         ends = initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
-        self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUT_PORTS]
+        self._ports = [
+            (self.DeclareVectorInputPort(name, size), name in _OPTIONAL_PORTS)
+            for name, size in self._INPUT_PORTS
+        ]
         self._declare_step(results, 3, period)
         self._declare_output("packet", 4, slice(0, PACKET_SIZE))
         self._declare_end_specific_output()
 
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _inputs_and_packet(self, context: Context) -> tuple[list[Array], Array, bool]:
         packet = self._received.Eval(context)
-        inputs = [
-            port.Eval(context) if port.HasValue(context) else np.zeros(port.size())
-            for port in self._ports
-        ]
-        received, is_fresh = np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5)
-        self._step_passivity_method(inputs, received, is_fresh, *results)
+        inputs = []
+        for port, is_optional in self._ports:
+            is_missing = is_optional and not port.HasValue(context)
+            inputs.append(np.zeros(port.size()) if is_missing else port.Eval(context))
+        return inputs, np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5)
 
 
 class PassivityAtMaster(_PassivityEndBlock):
@@ -97,13 +99,11 @@ class PassivityAtMaster(_PassivityEndBlock):
     def _declare_end_specific_output(self) -> None:
         self._declare_output("wrench_to_master", 3, slice(0, 6))
 
-    def _step_passivity_method(
-        self, inputs: Any, received: Any, fresh: bool, end_states: Any, _: Any,
-        port_energies: Any, wrench: Any, packet: Any,
-    ) -> None:  # fmt: skip
-        work = port_energies[:2]
-        constants = *self._constants, end_states, work, packet, wrench
-        step_master_end(self._method, *inputs, received, fresh, *constants)
+    def _advance(self, context: Context, results: list[Array]) -> None:
+        ends, _, port_energies, wrench, packet = results
+        inputs, *received = self._inputs_and_packet(context)
+        states = *self._constants, ends, port_energies[:2], packet, wrench
+        step_master_end(self._method, *inputs, *received, *states)
 
 
 class PassivityAtSlave(_PassivityEndBlock):
@@ -135,11 +135,9 @@ class PassivityAtSlave(_PassivityEndBlock):
     def _declare_end_specific_output(self) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
-    def _step_passivity_method(
-        self, inputs: Any, received: Any, fresh: bool, end_states: Any, pose: Any,
-        port_energies: Any, _: Any, packet: Any,
-    ) -> None:  # fmt: skip
-        *values, saturated, contact = inputs
+    def _advance(self, context: Context, results: list[Array]) -> None:
+        ends, pose, port_energies, _, packet = results
+        (*values, saturated, contact), *received = self._inputs_and_packet(context)
         flags = bool(saturated[0] > 0.5), float(contact[0])
-        constants = *self._constants, end_states, pose, port_energies, packet
-        step_slave_end(self._method, *values, *flags, received, fresh, *constants)
+        states = *self._constants, ends, pose, port_energies, packet
+        step_slave_end(self._method, *values, *flags, *received, *states)

@@ -20,7 +20,7 @@ from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
 class _SamplePorts:
-    """Input ports for the parts of a sensor sample, instead of one port `sample`."""
+    """Input ports for the parts of a sensor sample."""
 
     def __init__(self, system: LeafSystem) -> None:
         sizes = list(signal_sizes_of_sample(0).items())[:-1]
@@ -131,8 +131,5 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
     ) -> bool:
         gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W
         acceleration = sample[SAMPLE_SPECIFIC_FORCE] + gravity
-        return bool(
-            contact_detection.update_contact_flag_with_sample(
-                memory, sample, estimate, acceleration, self._settings
-            )
-        )
+        update = contact_detection.update_contact_flag_with_sample
+        return bool(update(memory, sample, estimate, acceleration, self._settings))

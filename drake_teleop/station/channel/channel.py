@@ -35,7 +35,6 @@ from drake_teleop.station.passivity.packet import (
 from drake_teleop.station.stepped_block import SteppedBlock
 
 _NETWORK_CHOICES = ("custom", *PRESETS)
-_DIRECTIONS = (network.FORWARD, network.BACKWARD)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
 _TIMEOUT_PER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
@@ -63,8 +62,10 @@ class Channel(NetworkConfig):
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
         if self.network == "custom":
             return own, own if self.backward is None else self.backward
-        if own != NetworkConfig() or self.backward is not None:
-            what = f"preset '{self.network}' cannot be combined with other channel fields"
+        odd = [name for name in names if getattr(own, name) != getattr(NetworkConfig(), name)]
+        odd += [] if self.backward is None else ["backward"]
+        if odd:
+            what = f"preset '{self.network}' cannot be combined with {', '.join(odd)}"
             remedy = "remove these fields, or set network: custom"
             raise DrakeTeleopError(what, where=f"{where}.network", remedy=remedy)
         return PRESETS[self.network], PRESETS[self.network]
@@ -75,15 +76,14 @@ class Channel(NetworkConfig):
             return self.timeout
         longest = [
             network.longest_silence(line, direction, period)
-            for line, direction in zip(self.networks_of_directions(), _DIRECTIONS, strict=True)
+            for direction, line in enumerate(self.networks_of_directions())
         ]
         return min(max(_TIMEOUT_PER_LONGEST_SILENCE * max(longest), MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.
-_ENDS_STATE_SIZE = (
-    2 + 2 * (8 + 6 + MEMORY_SIZE) + safe_state.MASTER_MONITOR_SIZE + safe_state.SLAVE_MONITOR_SIZE
-)
+_MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
+_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + sum(_MONITOR_SIZES)
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
@@ -92,8 +92,7 @@ _LAST_FINITE_SLAVE_POSE_AND_FLAG = _layout.vector(8)  # pose of the slave, likew
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
-_MASTER_SILENCE_MONITOR = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
-_SLAVE_SILENCE_MONITOR = _layout.vector(safe_state.SLAVE_MONITOR_SIZE)
+_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _MONITOR_SIZES)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
 _R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
@@ -105,11 +104,17 @@ _SILENCE_TIMES_OF_ENDS, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(
 # Received values at the master.
 _layout = SlotAllocator(7)
 _RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
-
-# Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
-# takes its step before the slave.
-_MIN_DELAY_STEPS = 1
 _ZERO_LOAD_WRENCH = np.zeros(6)
+
+
+def method_parameters_and_frame(
+    passivity: PassivityConfig, R_WB: Array, scales: Array, force_scale: float
+) -> tuple[Array, Array]:
+    """Return the method's parameters, and `frame` of `step_channel`."""
+    # A motion scale of zero transfers no energy; any unit is valid.
+    scales = np.where(scales > 0.0, scales, 1.0)
+    parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
+    return parameters, np.concatenate([R_WB.ravel(), scales])
 
 
 def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array:
@@ -138,7 +143,7 @@ def step_channel(
             `TeleopChannel`.
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
-        frame: (11,) R_WB by rows, scale of translation and of rotation.
+        frame: (11,) R_WB by rows; motion of the slave over the master: translation, rotation.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
         ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
@@ -252,7 +257,7 @@ def step_slave_end(
 
 @njit(cache=True)
 def _update_pose_and_write_increment(pose, before, dx):
-    """Write the change `dx` (6,), 0 unless both are finite; return whether `pose` is finite."""
+    """Write the change `dx` (6,), 0 unless both are valid; return whether `pose` is valid."""
     valid = are_finite_and_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
@@ -330,16 +335,15 @@ class TeleopChannel(SteppedBlock):
         seed: int,
     ) -> None:
         super().__init__()
-        # A motion scale of zero transfers no energy; any unit is valid.
-        scales = np.where(scales > 0.0, scales, 1.0)
+        # Forward, the slave reads the command one step later. Backward, the master takes its step
+        # before the slave.
         lines = [
-            network.network_parameters(line, seed, direction, period, min_steps=_MIN_DELAY_STEPS)
-            for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
+            network.network_parameters(line, seed, direction, period, min_steps=1)
+            for direction, line in enumerate(channel.networks_of_directions())
         ]
-        parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         self._steps = methods.step_addresses(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
-        frame = np.concatenate([R_WB.ravel(), scales])
+        parameters, frame = method_parameters_and_frame(passivity, R_WB, scales, force_scale)
         self._constants = (period, channel.timeout_s(period), frame, parameters, *lines)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
@@ -350,17 +354,15 @@ class TeleopChannel(SteppedBlock):
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_state_of_ends(passivity.method, parameters, start)
         carried = np.zeros(PACKET_SIZE if self._uses_load else PACKET_LOAD_WRENCH.start)
-        receivers, in_transit = zip(
-            *(network.initial_network_state(p, carried) for p in lines), strict=True
-        )
+        initial = [network.initial_network_state(line, carried) for line in lines]
+        receivers, in_transit = zip(*initial, strict=True)
         results = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7)]
         self._initial_arguments = (passivity.method, parameters)
         self._declare_step(results, len(results) - 1, period)
         # Packets in transit are abstract parameters, which a context clones. Drake would copy a
         # discrete state several times a step: 1.5 MB for `lunar`.
-        self._in_transit = [
-            self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in in_transit
-        ]
+        sent = map(AbstractValue.Make, in_transit)
+        self._in_transit = [self.DeclareAbstractParameter(packets) for packets in sent]
         for name, state in (("pose_received", 3), ("ports", 4)):
             self.DeclareStateOutputPort(name, DiscreteStateIndex(self._states[state]))
         self._declare_output("wrench_received", 5, _RECEIVED_WRENCH)

@@ -133,9 +133,8 @@ def network_parameters(
     trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
-    longest = math.floor(
-        mean * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter) + 0.5
-    )
+    max_deviation = _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter
+    longest = math.floor(mean * (1 + max_deviation) + 0.5)
     if trace.size:
         longest = max(int(trace.max()), 0)
     longest = max(longest, min_steps)
@@ -188,14 +187,15 @@ def _read_delay_trace(path: Path, period: float) -> Array:
         raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
     too_late = f"is more than {MAX_TRACE_DURATION_S:g} s after the first"
-    for column, bad, what in (
-        ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
-        ("time", age > MAX_TRACE_DURATION_S, too_late),
-        ("delay", (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
+    for column, values, bad, what in (
+        ("time", time, np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
+        ("time", time, age > MAX_TRACE_DURATION_S, too_late),
+        ("delay", delay, (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
     ):
         if bad.any():
+            first = int(np.argmax(bad))
             raise DrakeTeleopError(
-                f"row {table.line_in_file(int(np.argmax(bad)))} {what}",
+                f"row {table.line_in_file(first)}, {values[first]:g}, {what}",
                 where=f"{path}:{column}",
                 remedy="give seconds, sorted by time; an empty delay is a lost packet",
             )
@@ -336,7 +336,7 @@ def newest_packets(
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
-    """Return the longest time without a new packet in a simulated minute with a fixed seed [s]."""
+    """Return the longest time without a new packet in a simulated minute [s]; inf without any."""
     steps = math.ceil((_SILENCE_SIMULATION_S + longest_delay(config)) / period)
     newest = newest_packets(config, _SILENCE_SIMULATION_SEED, direction, steps, period)
     fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)

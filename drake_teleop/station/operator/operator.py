@@ -26,7 +26,7 @@ from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into
 from drake_teleop.station.operator.perception import Perception, update_perception_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
-from drake_teleop.station.passivity.packet import is_vector_finite, limit_group
+from drake_teleop.station.passivity.packet import are_vectors_finite, limit_group
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
 _MAX_HAND_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
@@ -182,7 +182,7 @@ def check_motion_and_normalize_pose_into(pose, twist, out):
     square = 0.0
     for k in range(4):
         square += pose[k] * pose[k]
-    if not (is_vector_finite(pose) and is_vector_finite(twist) and 0.0 < square < math.inf):
+    if not (are_vectors_finite((pose, twist)) and 0.0 < square < math.inf):
         return False
     size = math.sqrt(square)
     for k in range(7):

@@ -15,7 +15,7 @@ _DAMPING_RIDGE_SHARE = 0.05
 
 @njit(cache=True)
 def update_contact_fit(sums, force_change, displacement, speed_change, keep):
-    """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m].
+    """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m], >= 0.
 
     `sums` (NUM_CONTACT_FIT_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
     """

@@ -76,18 +76,12 @@ class EnergyBalance:
 
 
 def energy_balance(memory: Array) -> EnergyBalance:
-    """Return the energy balance in one end's `memory` (..., MEMORY_SIZE), 0 if a method has none.
-
-    A wrong shape raises a DrakeTeleopError.
-    """
+    """Return the energy balance of one end's `memory` (..., MEMORY_SIZE); zeros without one."""
     if memory.shape[-1] != MEMORY_SIZE:
         raise DrakeTeleopError(
             f"expected shape (..., {MEMORY_SIZE}), found {memory.shape}",
             where="memory",
             remedy="give the memory of one channel end",
         )
-    stored, received, sent, lost = (
-        memory[..., places].copy()
-        for places in (STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY)
-    )
-    return EnergyBalance(stored, received, sent, lost)
+    parts = STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY
+    return EnergyBalance(*(memory[..., part].copy() for part in parts))

@@ -11,13 +11,8 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import none
-from drake_teleop.station.passivity.memory import (
-    LAST_PORT_WRENCH,
-    SLAVE_PER_MASTER_MOTION,
-    own_parameters,
-)
+from drake_teleop.station.passivity.memory import SLAVE_PER_MASTER_MOTION, own_parameters
 from drake_teleop.station.passivity.packet import limit_group
 
 _HAND_WRENCH_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
@@ -40,9 +35,3 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit_group(wrench, g, p[_HAND_WRENCH_LIMIT][g])
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
-
-
-@njit(cache=True)
-def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)

@@ -88,7 +88,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             wrench[i] += p[_COUPLING_DAMPING][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
         limit_group(wrench, g, limits[g])
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, hand, packet)
 
 

@@ -1,6 +1,6 @@
 """Master's end of the passivity method "ledger" (long: one file for steps M1 to M7).
 
-docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
+docs/theory.md, "The energy ledger", has the equations of these steps.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -13,7 +13,6 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity import ledger_slave
 from drake_teleop.station.passivity.ledger_slave import (
     ANGLE_PER_LENGTH,
     CONTACT_DIRECTION,
@@ -37,7 +36,6 @@ from drake_teleop.station.passivity.ledger_slave import (
     TORQUE_PER_FORCE,
     UNUSED_RESERVE_SHARE,
     WRENCH_METRIC,
-    add_received_energy,
     filter_velocity,
     is_in_contact,
     update_contact_direction,
@@ -60,6 +58,7 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
+    count_newly_received_energy,
     dot_of_group,
     fill_packet,
     has_arrived,
@@ -157,17 +156,12 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: Array) -> None:
-        p[INITIAL_LEDGER_ENERGY], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
-            self.initial,
-            self.reserve,
-            self.hand_reserve,
-        )
-        p[DRAG_WRENCH] = np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION])
-        p[CONTACT_THRESHOLD] = np.divide(self.touch, p[SLAVE_PER_MASTER_MOTION])
-        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[SLAVE_PER_MASTER_MOTION])
-        p[WRENCH_METRIC] = (
-            ANGLE_PER_LENGTH * p[SLAVE_PER_MASTER_MOTION] / p[SLAVE_PER_MASTER_MOTION][0]
-        ) ** 2
+        p[INITIAL_LEDGER_ENERGY] = self.initial
+        p[SLAVE_RESERVE], p[MASTER_RESERVE] = self.reserve, self.hand_reserve
+        scales = p[SLAVE_PER_MASTER_MOTION]
+        p[DRAG_WRENCH], p[CONTACT_THRESHOLD] = self.drag / scales, self.touch / scales
+        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], scales)
+        p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * scales / scales[0]) ** 2
 
 
 def initialize(p: Array, memory: Array) -> None:
@@ -197,7 +191,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
-        add_received_energy(g, received, memory)
+        memory[STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
     if has_arrived(received):
         pose_difference_into(pose, received[POSE], offset_to_slave)
@@ -222,11 +216,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[STORED_ENERGY][g] -= surplus
         _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
-        packet[CUMULATIVE_ENERGY][g], packet[PACKET_LEDGER_LEVEL][g] = (
-            memory[SENT_ENERGY][g],
-            memory[STORED_ENERGY][g],
-        )
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[PACKET_LEDGER_LEVEL][g] = memory[STORED_ENERGY][g]
     fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
         steady[i] = -memory[_LOST_HAND_MOTION][i]
@@ -264,11 +255,8 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal, inward = (
-        received[WRENCH],
-        memory[CONTACT_DIRECTION],
-        memory[_DIRECTION_INTO_WALL],
-    )
+    contact_wrench, normal = received[WRENCH], memory[CONTACT_DIRECTION]
+    inward = memory[_DIRECTION_INTO_WALL]
     k = min(_CONTACT_STIFFNESS_FACTOR * received[PACKET_CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
     if not is_in_contact(contact_wrench, p):
         if memory[IN_CONTACT] > 0.0:
@@ -277,21 +265,18 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         removal_depth = _FORGET_WALL_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
         removal_depth = min(_MAX_FORGET_WALL_DEPTH_M, max(removal_depth, _MIN_FORGET_WALL_DEPTH_M))
         slave_depth = memory[_HAND_WALL_DEPTH] - work_along(inward, offset_to_slave)
-        memory[_MISSING_WALL_IMPULSE] += (
-            T * memory[_WALL_STIFFNESS] * (slave_depth - _MIN_WALL_IMPULSE_DEPTH_M)
-        )
-        if slave_depth <= _MIN_WALL_IMPULSE_DEPTH_M:
+        excess = slave_depth - _MIN_WALL_IMPULSE_DEPTH_M
+        memory[_MISSING_WALL_IMPULSE] += T * memory[_WALL_STIFFNESS] * excess
+        if excess <= 0.0:
             memory[_MISSING_WALL_IMPULSE] = 0.0
         if memory[_WALL_STIFFNESS] > 0.0 and received[PACKET_CONTACT_STIFFNESS] == 0.0:
             memory[_WALL_STIFFNESS] = 0.0
             memory[_IS_WRENCH_CROSS_FADING][:] = memory[_WORK_ON_HAND_SINCE_REST][:] = 0.0
         if slave_depth > removal_depth or memory[_MISSING_WALL_IMPULSE] > _MAX_MISSING_IMPULSE_NS:
             memory[_WALL_STIFFNESS] = 0.0
-        inside = min(
-            memory[_WALL_STIFFNESS] * max(memory[_HAND_WALL_DEPTH], 0.0), _MAX_WALL_FORCE_N
-        )
+        force = memory[_WALL_STIFFNESS] * max(memory[_HAND_WALL_DEPTH], 0.0)
         for i in range(6):
-            wrench[i] = -inside * inward[i]
+            wrench[i] = -min(force, _MAX_WALL_FORCE_N) * inward[i]
         return
     memory[_MISSING_WALL_IMPULSE] = 0.0
     offset, onset = memory[_HAND_OFFSET_AT_CONTACT_ONSET], memory[IN_CONTACT] == 0.0
@@ -310,8 +295,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         else:
             copy_into(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
-        memory[_FRICTION_COEFFICIENT][:] = 0.0
-        memory[_HAND_RETREAT_DISTANCE] = 0.0
+        memory[_FRICTION_COEFFICIENT] = memory[_HAND_RETREAT_DISTANCE] = 0.0
         for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _UNMODELLED_FRICTION):
             memory[friction] = 0.0
         copy_into(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
@@ -403,10 +387,8 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
     last, fading = memory[_LAST_UNLIMITED_WRENCH], memory[_IS_WRENCH_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
-    size, most = (
-        length_of_group(wrench, g),
-        MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g],
-    )
+    size = length_of_group(wrench, g)
+    most = MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g]
     if fading[g] > 0.0 and size > most:
         scale_group(wrench, g, most / size)
     else:
@@ -424,9 +406,8 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _MAX_HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
-    most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(
-        memory[STORED_ENERGY][g] - _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g], 0.0
-    )
+    unused = _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]
+    most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(memory[STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)
     if share * cost > most:
         share = most / cost
@@ -451,9 +432,8 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
     speed = length_of_group(velocity, g)
     own_level = memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.
-    lowest = min(
-        own_level, (received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]
-    )
+    slave_energy = received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
+    lowest = min(own_level, slave_energy / p[SLAVE_RESERVE][g])
     in_contact = memory[IN_CONTACT] > 0.0
     if (in_contact and own_level < _DRAG_OFF_LEVEL) or (not in_contact and lowest < _DRAG_ON_LEVEL):
         active[g] = 1.0
@@ -470,6 +450,3 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
     drag *= _permitted_braking_share(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= drag * velocity[i] / max(speed, _FULL_DRAG_HAND_SPEED * ANGLE_PER_LENGTH[g])
-
-
-slave_step, record_command = ledger_slave.slave_step, ledger_slave.record_command

@@ -72,12 +72,8 @@ _STIFFNESS_SHARE_FILTER_S, _STIFFNESS_SHARE_DEADBAND = 0.02, 0.1
 _MIN_REMOVED_WALL_FORCE_N = 0.3
 _CONTACT_DIRECTION_FILTER_S = 3.0
 _SLIP_FORCE_FADE_S, _FRICTION_DECAY_S = 0.6, 1.0
-_STIFFNESS_GAIN_RISE_S, _MIN_STIFFNESS_GAIN, _MAX_STIFFNESS_GAIN, _STIFFNESS_GAIN_FALL_S = (
-    0.5,
-    0.1,
-    10.0,
-    1.0,
-)
+_STIFFNESS_GAIN_RISE_S, _STIFFNESS_GAIN_FALL_S = 0.5, 1.0
+_MIN_STIFFNESS_GAIN, _MAX_STIFFNESS_GAIN = 0.1, 10.0
 _COMMAND_FILTER_S, _MAX_COMMAND_ACCELERATION, _STOPPING_SPEED_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2
 _MAX_FEEDFORWARD_SILENCE_S = 0.02
 _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS, _MAX_SILENCE_FOR_GAIN_S = 0.5, 0.06
@@ -112,15 +108,11 @@ _STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
 )
 # Fit of k and b: filtered force; force and speed at the start of the sample; its length and the
 # lag of its filter; length of the fit and its sums.
-_FILTERED_FORCE, _FIT_SAMPLE_START_FORCE, _FIT_SAMPLE_START_SPEED = (
-    _layout.number() for _ in range(3)
-)
+_FILTERED_FORCE, _SAMPLE_START_FORCE, _SAMPLE_START_SPEED = (_layout.number() for _ in range(3))
 _FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = (_layout.number() for _ in range(3))
 _FIT_SUMS = _layout.vector(NUM_CONTACT_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _STEP_PERIOD = (
-    _layout.number() for _ in range(4)
-)
+_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
 _CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = _layout.vector(6), _layout.vector(6)
 # Rendered force along n; last speed into the wall; largest friction.
 _RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
@@ -176,18 +168,10 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 
 
 @njit(cache=True)
-def add_received_energy(g, received, memory):
-    """Add newly received energy to this end's balance for group `g`; return it [J]."""
-    new = count_newly_received_energy(g, received, memory)
-    memory[STORED_ENERGY][g] += new
-    return new
-
-
-@njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = has_arrived(received)
-    memory[_STEP_PERIOD] = T
+    memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
     kept = 1.0 - T / _LONGEST_DELAY_DECAY_S
@@ -241,9 +225,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_PORT_WRENCH], dx, g))
-    new = add_received_energy(g, received, memory)
+    new = count_newly_received_energy(g, received, memory)
     ledger, input_energy = memory[STORED_ENERGY], memory[_ENERGY_IN_CONTACT]
     reserve = p[SLAVE_RESERVE][g]
+    ledger[g] += new
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
     speed = length_of_group(twist, g)
@@ -280,10 +265,8 @@ def _max_displayed_stiffness(received, T, p, memory):
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
         level = min(max(received[PACKET_LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
-    max_silence = max(
-        _MAX_FEEDFORWARD_SILENCE_S, _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
-    )
-    max_silence = min(max_silence, _MAX_SILENCE_FOR_GAIN_S)
+    max_silence = _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
+    max_silence = min(max(_MAX_FEEDFORWARD_SILENCE_S, max_silence), _MAX_SILENCE_FOR_GAIN_S)
     goal = _MAX_STIFFNESS_GAIN * fill_level - 1.0
     if memory[_LONGEST_SILENCE] >= max_silence:
         goal = min(goal, 0.0)
@@ -291,9 +274,8 @@ def _max_displayed_stiffness(received, T, p, memory):
         memory[_GAIN_MINUS_ONE] = 0.0
     else:
         change = max(goal, _MIN_STIFFNESS_GAIN - 1.0) - memory[_GAIN_MINUS_ONE]
-        memory[_GAIN_MINUS_ONE] += (
-            T / (_STIFFNESS_GAIN_RISE_S if change > 0.0 else _STIFFNESS_GAIN_FALL_S) * change
-        )
+        time_constant = _STIFFNESS_GAIN_RISE_S if change > 0.0 else _STIFFNESS_GAIN_FALL_S
+        memory[_GAIN_MINUS_ONE] += T / time_constant * change
     gain = 1.0 + memory[_GAIN_MINUS_ONE]
     least = max(_MIN_DISPLAYED_STIFFNESS, base) * min(gain, 1.0)
     return max(least, min(gain * base, _MAX_DISPLAYED_STIFFNESS))
@@ -315,43 +297,36 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
         # Start at the first sample in contact, because the step to it was partly outside.
-        memory[_FILTERED_FORCE] = memory[_FIT_SAMPLE_START_FORCE] = memory[_RENDERED_FORCE] = size
+        memory[_FILTERED_FORCE] = memory[_SAMPLE_START_FORCE] = memory[_RENDERED_FORCE] = size
         memory[_DISPLACEMENT_FILTER_LAG] = inward
-        memory[_FIT_SAMPLE_START_SPEED] = memory[_LAST_SPEED_INTO_WALL] = speed
+        memory[_SAMPLE_START_SPEED] = memory[_LAST_SPEED_INTO_WALL] = speed
         memory[_FIT_SAMPLE_LENGTH] = memory[_FIT_SPAN] = 0.0
         memory[_STIFFNESS_SHARE] = memory[_STIFFNESS_SHARE_GOAL] = k_d / max(k, k_d)
     filtered_step = rate * (inward - memory[_DISPLACEMENT_FILTER_LAG])
     memory[_DISPLACEMENT_FILTER_LAG] += filtered_step - inward
     memory[_FIT_SAMPLE_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
-    fastest = math.hypot(
-        length_of_group(velocity, 0), length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
-    )
-    slow, length_m = fastest < _FAST_FIT_SPEED, abs(memory[_FIT_SAMPLE_LENGTH])
+    tip_speed = length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
+    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _FAST_FIT_SPEED
+    length_m = abs(memory[_FIT_SAMPLE_LENGTH])
     if length_m > (_MIN_FIT_SAMPLE_LENGTH_M if slow else _MIN_FAST_FIT_SAMPLE_LENGTH_M):
         memory[_FIT_SPAN] = min(memory[_FIT_SPAN] + length_m, _MAX_FIT_SPAN_M)
         keep = max(1.0 - length_m / max(memory[_FIT_SPAN], _MIN_FIT_SPAN_M), 0.0) if slow else 0.5
-        speed_change = speed - memory[_FIT_SAMPLE_START_SPEED]
+        speed_change = speed - memory[_SAMPLE_START_SPEED]
         stretch, damping = memory[_FIT_SAMPLE_LENGTH], memory[_CONTACT_DAMPING]
-        change = memory[_FILTERED_FORCE] - memory[_FIT_SAMPLE_START_FORCE] - damping * speed_change
-        change -= force_change_by_slip(
-            change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_change
-        )
+        change = memory[_FILTERED_FORCE] - memory[_SAMPLE_START_FORCE] - damping * speed_change
+        largest = max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch
+        change -= force_change_by_slip(change, largest, max_change)
         change += damping * speed_change
         k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
-        memory[_FIT_SAMPLE_LENGTH], memory[_FIT_SAMPLE_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
-        memory[_FIT_SAMPLE_START_SPEED] = speed
+        memory[_FIT_SAMPLE_LENGTH], memory[_SAMPLE_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
+        memory[_SAMPLE_START_SPEED] = speed
     if k > 1.0:  # N/m
-        rate, goal = min(T / _STIFFNESS_SHARE_FILTER_S, 1.0), k_d / max(k, k_d)
-        if (
-            abs(goal - memory[_STIFFNESS_SHARE_GOAL])
-            > _STIFFNESS_SHARE_DEADBAND * memory[_STIFFNESS_SHARE_GOAL]
-        ):
-            memory[_STIFFNESS_SHARE_GOAL] = goal
-        memory[_STIFFNESS_SHARE] += rate * (
-            memory[_STIFFNESS_SHARE_GOAL] - memory[_STIFFNESS_SHARE]
-        )
+        rate, goal = min(T / _STIFFNESS_SHARE_FILTER_S, 1.0), memory[_STIFFNESS_SHARE_GOAL]
+        if abs(k_d / max(k, k_d) - goal) > _STIFFNESS_SHARE_DEADBAND * goal:
+            goal = memory[_STIFFNESS_SHARE_GOAL] = k_d / max(k, k_d)
+        memory[_STIFFNESS_SHARE] += rate * (goal - memory[_STIFFNESS_SHARE])
         depth = max(size - memory[_CONTACT_DAMPING] * speed, 0.0) / k
         if memory[IN_CONTACT] == 0.0:
             memory[_SLAVE_WALL_DEPTH] = depth
@@ -397,11 +372,8 @@ def _generate_command(received, connected, T, p, memory, error):
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             error[i] += compliance * beyond_wall * p[WRENCH_METRIC][g] * normal[i]
-        distance, acceleration = (
-            length_of_group(error, g),
-            _MAX_COMMAND_ACCELERATION * ANGLE_PER_LENGTH[g],
-        )
-        rate = 1.0 / _COMMAND_FILTER_S
+        acceleration = _MAX_COMMAND_ACCELERATION * ANGLE_PER_LENGTH[g]
+        distance, rate = length_of_group(error, g), 1.0 / _COMMAND_FILTER_S
         if distance > 0.0:
             rate = min(rate, _STOPPING_SPEED_FACTOR * math.sqrt(2.0 * acceleration / distance))
         for i in range(3 * g, 3 * g + 3):
@@ -429,10 +401,8 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
         if _limit_motor_wrench(g, D, twist, p, memory):
             changed = True
             velocity = memory[COMMAND_TWIST]
-            if (
-                length_of_group(velocity, g) > length_of_group(twist, g)
-                or dot_of_group(velocity, twist, g) < 0.0
-            ):
+            is_faster = length_of_group(velocity, g) > length_of_group(twist, g)
+            if is_faster or dot_of_group(velocity, twist, g) < 0.0:
                 for i in range(3 * g, 3 * g + 3):
                     velocity[i] = twist[i]
         for i in range(3 * g, 3 * g + 3):
@@ -450,10 +420,9 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     mass = SLAVE_MASS_FACTOR * p[SLAVE_MASS][g]
     stands = length_of_group(velocity, g) < _SLAVE_STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
     margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_AVAILABLE_MOTOR_ENERGY][g]
+    pushes = dot_of_group(motor_wrench, twist, g) > 0.0
+    pushes = pushes or dot_of_group(motor_wrench, velocity, g) > 0.0
     changed = False
-    pushes = (
-        dot_of_group(motor_wrench, twist, g) > 0.0 or dot_of_group(motor_wrench, velocity, g) > 0.0
-    )
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
         free = _WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
@@ -465,7 +434,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
         permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
-    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_STEP_PERIOD] * size / mass)
+    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True

@@ -21,12 +21,12 @@ class SlotAllocator:
         first, self._next = self._next, self._next + length
         if self._next > self._size:
             raise IndexError(
-                f"vector size {self._size} is below the required {self._next}; raise it"
+                f"SlotAllocator: {self._next} places are required, but the vector has {self._size};"
+                " reserve fewer"
             )
         return slice(first, self._next)
 
     def rest(self) -> slice:
-        """Reserve the remaining places and return their slice."""
         return self.vector(self._size - self._next)
 
 
@@ -70,4 +70,5 @@ def own_memory() -> SlotAllocator:
 
 
 def own_parameters() -> SlotAllocator:
+    """Return an allocator for a method's own part of the parameters."""
     return SlotAllocator(NUM_PARAMETERS, _METHOD_PARAMETER_SLICE.start)

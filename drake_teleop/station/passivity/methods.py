@@ -61,7 +61,7 @@ from drake_teleop.station.passivity.packet import (
     PACKET_SIZE,
     POSE,
     SENDER_INPUTS_FINITE,
-    is_vector_finite,
+    are_vectors_finite,
 )
 from drake_teleop.station.passivity.pspm import PspmConfig
 from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
@@ -100,6 +100,10 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
+def _functions_of(method: Any) -> tuple[Any, ...]:
+    return method.master_step, method.slave_step, method.record_command, method.initialize
+
+
 _TDPA_METHOD = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
 METHODS = Registry(
     "passivity method",
@@ -108,20 +112,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(
-            two_layer.master_step,
-            two_layer.slave_step,
-            two_layer.record_command,
-            two_layer.initialize,
-            balance_at_motors=True,
-        ),
-        "pspm": PassivityMethod(
-            pspm.master_step,
-            pspm.slave_step,
-            pspm.record_command,
-            pspm.initialize,
-            balance_at_motors=True,
-        ),
+        "two_layer": PassivityMethod(*_functions_of(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_functions_of(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -133,7 +125,7 @@ METHODS = Registry(
             speed_limit=ledger.max_slave_speed,
         ),
         "four_channel": PassivityMethod(four_channel.master_step, four_channel.slave_step),
-        "force_limit": PassivityMethod(force_limit.master_step, force_limit.slave_step),
+        "force_limit": PassivityMethod(force_limit.master_step, none.slave_step),
     },
     PassivityMethod,
 )
@@ -157,11 +149,7 @@ class MethodConfigs:
     )
 
 
-_CONFIG_FIELD_OF_METHOD = {
-    entry.metadata.get("method", entry.name): entry.name for entry in fields(MethodConfigs)
-}
-
-
+_CONFIG_FIELD_OF_METHOD = {f.metadata.get("method", f.name): f.name for f in fields(MethodConfigs)}
 _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
@@ -210,8 +198,8 @@ class _CommonMethodConfig:
 class PassivityConfig(MethodConfigs, _CommonMethodConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
-    The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
-    `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the slave's mass.
+    The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
+    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
     """
 
     def check(self, where: str) -> None:
@@ -228,11 +216,8 @@ class PassivityConfig(MethodConfigs, _CommonMethodConfig):
                     where=f"{where}.registered",
                     remedy="leave them out; a shipped method has its own block of parameters",
                 )
-            return (
-                getattr(self, _CONFIG_FIELD_OF_METHOD[self.method])
-                if self.method in _CONFIG_FIELD_OF_METHOD
-                else None
-            )
+            entry = _CONFIG_FIELD_OF_METHOD.get(self.method)
+            return None if entry is None else getattr(self, entry)
         for name in self.registered:
             check_field_name(schema, name, f"{where}.registered.{name}")
         with unchecked_assignments():
@@ -259,9 +244,8 @@ def method_parameters(
     p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
     p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
     p[SLAVE_PER_MASTER_MOTION] = motion_scale
-    p[RETREAT_SPEED] = (
-        np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
-    )
+    fades = config.method != "none"
+    p[RETREAT_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf
     own = config.method_config()
     if own is not None:
         own.pack_into(p)
@@ -282,38 +266,23 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     return memory
 
 
-_NUMBA_VECTOR = types.Array(types.float64, 1, "C")
-_MASTER_ARGUMENT_TYPES = (
-    _NUMBA_VECTOR,
-    types.boolean,
-    *[_NUMBA_VECTOR] * 5,
-    types.float64,
-    *[_NUMBA_VECTOR] * 4,
+_VECTOR = types.Array(types.float64, 1, "C")
+_STEP_ARGUMENT_TYPES = (
+    (_VECTOR, types.boolean, *[_VECTOR] * 5, types.float64, *[_VECTOR] * 4),
+    (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4),
+    (_VECTOR,) * 6,
 )
-_SLAVE_ARGUMENT_TYPES = (
-    _NUMBA_VECTOR,
-    types.boolean,
-    *[_NUMBA_VECTOR] * 4,
-    types.float64,
-    *[_NUMBA_VECTOR] * 4,
-)
-_RECORD_ARGUMENT_TYPES = (_NUMBA_VECTOR,) * 6
-_call_master_step, _call_slave_step, _call_record_command = map(
-    make_call_at_address, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES)
-)
+_call_master, _call_slave, _call_record = map(make_call_at_address, _STEP_ARGUMENT_TYPES)
 
 
-def step_addresses(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's compiled functions: master, slave, record."""
+def step_addresses(method: str) -> tuple[int, ...]:
+    """Return the addresses of `master_step`, `slave_step` and `record_command` of a method."""
     return _addresses_of_compiled_steps(*METHODS[method][:3])
 
 
 @cache
-def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, int, int]:
-    master, slave, sent = zip(
-        steps, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES), strict=True
-    )
-    return address_of_function(*master), address_of_function(*slave), address_of_function(*sent)
+def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
+    return tuple(map(address_of_function, steps, _STEP_ARGUMENT_TYPES))
 
 
 @njit(cache=True)
@@ -348,17 +317,11 @@ def master_step(
         packet: (PACKET_SIZE,) written: packet to send.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
-    healthy = (
-        is_vector_finite(received)
-        and is_vector_finite(pose)
-        and is_vector_finite(twist)
-        and is_vector_finite(dx)
-        and is_vector_finite(hand)
-    )
+    healthy = are_vectors_finite((received, pose, twist, dx, hand))
     if not healthy:
         wrench[:] = 0.0
     else:
-        _call_master_step(
+        _call_master(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         fade_retreat_wrench(twist, T, p, memory, wrench)
@@ -378,18 +341,12 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
             finite, it is the last pose with zero twist.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
-    healthy = (
-        is_vector_finite(received)
-        and is_vector_finite(pose)
-        and is_vector_finite(twist)
-        and is_vector_finite(dx)
-        and is_vector_finite(wrench)
-    )
+    healthy = are_vectors_finite((received, pose, twist, dx, wrench))
     if not healthy:
         memory[COMMAND_TWIST] = 0.0
         copy_into(command, 0, memory, COMMAND.start, 13)
     else:
-        _call_slave_step(
+        _call_slave(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
     _set_packet_number_and_health(healthy, memory, packet)
@@ -402,4 +359,4 @@ def record_command(steps, requested, command, pose, twist, p, memory):
     `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
     the method may change.
     """
-    _call_record_command(steps[2], requested, command, pose, twist, p, memory)
+    _call_record(steps[2], requested, command, pose, twist, p, memory)

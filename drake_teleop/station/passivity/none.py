@@ -22,12 +22,9 @@ from drake_teleop.station.passivity.packet import (
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    requested = received[WRENCH]
-    for i in range(6):
-        wrench[i] = requested[i]
+    copy_into(wrench, 0, received, WRENCH.start, 6)
     for g in range(2):
         limit_group(wrench, g, limits[g])
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 

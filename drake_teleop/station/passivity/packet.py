@@ -29,7 +29,7 @@ POSE = _layout.vector(7)
 VELOCITY = _layout.vector(6)
 #: Wrench at the sender [f; tau], in W, in the master's power units.
 WRENCH = _layout.vector(6)
-#: Cumulative integral; the method defines it.
+#: Numbers that the method defines, such as a cumulative integral.
 METHOD_INTEGRAL = _layout.vector(6)
 #: Cumulative energy that the receiver may use, by group [J].
 CUMULATIVE_ENERGY = _layout.vector(2)
@@ -96,19 +96,19 @@ def limit_group(a, g, max_length):
 
 
 @njit(cache=True)
-def is_vector_finite(a):
+def are_vectors_finite(vectors):
     rest = 0.0
-    for x in a:
-        rest += x - x  # NaN if any x is not finite
+    for vector in vectors:
+        for x in vector:
+            rest += x - x  # NaN if any x is not finite
     return rest == 0.0
 
 
 @njit(cache=True)
 def pose_difference_into(a, b, e):
     """Write the difference of two poses (7,), [p_a - p_b; log(R_a R_b^T)] in W, into `e` (6,)."""
-    turn = quaternion_logarithm(
-        quaternion_product((a[0], a[1], a[2], a[3]), conjugate_quaternion((b[0], b[1], b[2], b[3])))
-    )
+    inverse = conjugate_quaternion((b[0], b[1], b[2], b[3]))
+    turn = quaternion_logarithm(quaternion_product((a[0], a[1], a[2], a[3]), inverse))
     for i in range(3):
         e[i] = a[4 + i] - b[4 + i]
         e[3 + i] = turn[i]

@@ -52,7 +52,7 @@ _SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.ve
 @settings
 @dataclass
 class PspmConfig:
-    """Parameters of the passivity method "pspm", passive set-position modulation."""
+    """Parameters of the passive set-position modulation."""
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
@@ -117,7 +117,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit_group(wrench, g, limits[g])
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 

@@ -145,9 +145,10 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def fade_retreat_wrench(twist, T, p, memory, wrench):
-    """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
+    """Reduce and store a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
-    It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this.
+    It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this, but not
+    below `SLAVE_MASS` times the hand's deceleration.
     """
     velocity, rate = memory[FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):

@@ -65,11 +65,7 @@ _NEWEST_MASTER_PACKET, _PACKET_SLAVE_ENERGY = METHOD_INTEGRAL.start, SECOND_ENER
 
 # Parameters; reserve, drag and stiffness in the master's power units.
 _layout = own_parameters()
-_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = (
-    _layout.number(),
-    _layout.number(),
-    _layout.number(),
-)
+_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = (_layout.number() for _ in range(3))
 _TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))
 _MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
@@ -131,10 +127,8 @@ class TdpaConfig:
     def pack_into(self, p: Array) -> None:
         p[_WRENCH_RELEASE_TIME], p[_LEDGER_DRAIN_RATE] = self.release, self.drain_rate
         p[_COMMAND_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
-        p[_TARGET_RESERVE], p[_DRAG_WRENCH] = (
-            self.reserve,
-            np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION]),
-        )
+        p[_TARGET_RESERVE] = self.reserve
+        p[_DRAG_WRENCH] = np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[SLAVE_PER_MASTER_MOTION]))
 
 
@@ -145,48 +139,34 @@ def charged_tdpa_config() -> TdpaConfig:
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    for g in range(2):
-        memory[STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
     drain = min(T * p[_LEDGER_DRAIN_RATE], 1.0)
     release = T / p[_WRENCH_RELEASE_TIME] if p[_WRENCH_RELEASE_TIME] > 0.0 else 1.0
-    requested = received[WRENCH]
-    for i in range(6):
-        wrench[i] = requested[i]
-    ledger, kept, withheld = (
-        memory[STORED_ENERGY],
-        memory[_MASTER_RESERVED_ENERGY],
-        memory[_WITHHELD_WRENCH_SHARE],
-    )
+    copy_into(wrench, 0, received, WRENCH.start, 6)
+    ledger, kept = memory[STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
+    withheld = memory[_WITHHELD_WRENCH_SHARE]
     for g in range(2):
+        ledger[g] += count_newly_received_energy(g, received, memory)
         limit_group(wrench, g, limits[g])
         share = min(1.0, 1.0 - withheld[g] + release)
         drained = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
-            share = _permitted_wrench_share(
-                g, drained, drain, stored, share, T, p, memory[LAST_PORT_WRENCH], wrench
-            )
+            max_decrease = MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g]
+            least = length_of_group(memory[LAST_PORT_WRENCH], g) - max_decrease
+            share = min(share, max(drain * stored / drained, least / length_of_group(wrench, g)))
+            share = min(share, stored / drained)
         withheld[g] = 1.0 - share
         memory[DISSIPATED_ENERGY][g] += (1.0 - share) * drained
         scale_group(wrench, g, share)
         _add_drag_force(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
         _charge_hand_work_to_ledger(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
-            _send_surplus_energy(g, p, memory)
+            surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
+            ledger[g] -= surplus
+            memory[SENT_ENERGY][g] += surplus
         packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
-
-
-@njit(cache=True)
-def _permitted_wrench_share(g, drained, drain, stored, share, T, p, held, wrench):
-    least, size = (
-        length_of_group(held, g) - MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g],
-        length_of_group(wrench, g),
-    )
-    share = min(share, max(drain * stored / drained, least / size))
-    return min(share, stored / drained)
 
 
 @njit(cache=True)
@@ -197,15 +177,6 @@ def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
         limit_group(wrench, g, limits[g])
-
-
-@njit(cache=True)
-def _send_surplus_energy(g, p, memory):
-    ledger = memory[STORED_ENERGY]
-    surplus = ledger[g] + memory[_MASTER_RESERVED_ENERGY][g] - p[_TARGET_RESERVE][g]
-    surplus = min(max(surplus, 0.0), ledger[g])
-    ledger[g] -= surplus
-    memory[SENT_ENERGY][g] += surplus
 
 
 @njit(cache=True)
@@ -222,10 +193,9 @@ def _charge_hand_work_to_ledger(g, drained, p, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    for g in range(2):
-        memory[STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
     copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
+        count_newly_received_energy(g, received, memory)
         work = dot_of_group(wrench, dx, g)
         memory[_SLAVE_WORK_IN][g] += max(work, 0.0)
         memory[_SLAVE_WORK_OUT][g] += max(-work, 0.0)
@@ -263,10 +233,8 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
             if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
                 memory[_QUICK_ONSET_PACKET][g] = memory[STEP_COUNT]
-            if (
-                lag > _SLOW_WRENCH_ONSET_S
-                and received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET][g]
-            ):
+            awaited = received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET][g]
+            if lag > _SLOW_WRENCH_ONSET_S and awaited:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -285,9 +253,8 @@ def _estimate_contact_stiffness(g, dx, wrench, T, memory):
 
 @njit(cache=True)
 def _energy_available_to_slave(memory, g):
-    return memory[RECEIVED_ENERGY][g] - max(
-        memory[_SLAVE_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g]
-    )
+    used = max(memory[_SLAVE_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g])
+    return memory[RECEIVED_ENERGY][g] - used
 
 
 @njit(cache=True)
@@ -300,10 +267,8 @@ def _advance_command(received, wrench, T, p, memory):
         step[i] -= remaining_share * withheld[i]
     for g in range(2):
         limit_group(step, g, p[_MAX_COMMAND_SPEED][g] * T)
-        pressing, available = (
-            -dot_of_group(wrench, step, g),
-            max(_energy_available_to_slave(memory, g), 0.0),
-        )
+        pressing = -dot_of_group(wrench, step, g)
+        available = max(_energy_available_to_slave(memory, g), 0.0)
         if pressing > available:
             scale_group(step, g, available / pressing)
             memory[DISSIPATED_ENERGY][g] += pressing - available

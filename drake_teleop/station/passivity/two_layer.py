@@ -43,11 +43,7 @@ from drake_teleop.station.passivity.packet import (
 # Parameters; pairs are for translation and rotation.
 _layout = own_parameters()
 _SEND_RATE, _MAX_TANK_DRAIN_RATE = _layout.number(), _layout.number()
-_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (
-    _layout.vector(2),
-    _layout.vector(2),
-    _layout.vector(2),
-)
+_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (_layout.vector(2) for _ in range(3))
 _DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = _layout.vector(2), _layout.vector(2)
 _TANK_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
@@ -84,11 +80,8 @@ class TwoLayerConfig:
 
     def pack_into(self, p: Array) -> None:
         p[_SEND_RATE], p[_MAX_TANK_DRAIN_RATE] = self.send_rate, self.drain_rate
-        p[_INITIAL_TANK_ENERGY], p[_TARGET_TANK_LEVEL], p[_TANK_CAPACITY] = (
-            self.initial,
-            self.level,
-            self.capacity,
-        )
+        p[_INITIAL_TANK_ENERGY], p[_TARGET_TANK_LEVEL] = self.initial, self.level
+        p[_TANK_CAPACITY] = self.capacity
         p[_DAMPING_PER_MISSING_ENERGY], p[MAX_PORT_ACCELERATION] = self.damper, self.acceleration
 
 
@@ -139,7 +132,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if drained > drainable:
             scale_group(wrench, g, drainable / drained)
         _limit_wrench_to_tank(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -157,19 +149,19 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             spring[i] *= K[g]
             brake[i] = -D[g] * twist[i]
             motor_wrench[i] = spring[i] + brake[i]
-        mass = p[SLAVE_MASS][g]
+        mass, own_acceleration = p[SLAVE_MASS][g], p[MAX_PORT_ACCELERATION][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
         available = max(memory[STORED_ENERGY][g] - _TANK_RESERVE_SHARE * p[_TANK_CAPACITY][g], 0.0)
-        acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
+        acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
         if _max_step_work(motor_wrench, dx, g, acceleration, T) > available:
-            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(brake, g) / mass
+            acceleration = own_acceleration + length_of_group(brake, g) / mass
             available -= _max_step_work(brake, dx, g, acceleration, T)
-            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(spring, g) / mass
+            acceleration = own_acceleration + length_of_group(spring, g) / mass
             cost = _max_step_work(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
-            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
+            acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
             _limit_wrench_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
@@ -181,12 +173,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    spring, held, K, D = (
-        memory[_SERVO_SPRING_WRENCH],
-        memory[LAST_PORT_WRENCH],
-        p[SERVO_K],
-        p[SERVO_D],
-    )
+    spring, held = memory[_SERVO_SPRING_WRENCH], memory[LAST_PORT_WRENCH]
+    K, D = p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

@@ -90,9 +90,9 @@ class WaveConfig:
 
 
 @njit(cache=True)
-def _filter_received_wave(received, T, p, memory, wave):
+def _filter_received_wave(received, T, p, memory):
     ledger, played = memory[STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
-    integral = received[METHOD_INTEGRAL]
+    wave, integral = memory[_FILTERED_WAVE], received[METHOD_INTEGRAL]
     for g in range(2):
         ledger[g] += count_newly_received_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
@@ -109,12 +109,8 @@ def _filter_received_wave(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    wave, integral, sent = (
-        memory[_FILTERED_WAVE],
-        memory[_SENT_WAVE_INTEGRAL],
-        packet[METHOD_INTEGRAL],
-    )
-    _filter_received_wave(received, T, p, memory, wave)
+    wave, integral = memory[_FILTERED_WAVE], memory[_SENT_WAVE_INTEGRAL]
+    _filter_received_wave(received, T, p, memory)
     catching_up, newest = memory[_IS_WRENCH_CATCHING_UP], received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET_NUMBER] + 1.0:
         catching_up = 1.0
@@ -125,7 +121,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
             # The integral ignores the wrench limit, so that no momentum is missing on the line.
             integral[i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
-            sent[i] = integral[i]
         limit_group(wrench, g, limits[g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
@@ -136,8 +131,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
         memory[SENT_ENERGY][g] += max(left, 0.0)
-        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+    copy_into(packet, METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
+    copy_into(packet, CUMULATIVE_ENERGY.start, memory, SENT_ENERGY.start, 2)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -184,12 +179,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _reflect_wave(received, wrench, T, p, memory):
-    wave, step, integral = (
-        memory[_FILTERED_WAVE],
-        memory[COMMAND_TWIST],
-        memory[_SENT_WAVE_INTEGRAL],
-    )
-    _filter_received_wave(received, T, p, memory, wave)
+    wave, step = memory[_FILTERED_WAVE], memory[COMMAND_TWIST]
+    integral = memory[_SENT_WAVE_INTEGRAL]
+    _filter_received_wave(received, T, p, memory)
     for g in range(2):
         b, damper = p[WAVE_IMPEDANCE][g], p[_MATCHING_DAMPER_SHARE] * p[WAVE_IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
