@@ -100,7 +100,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _functions_of(method: Any) -> tuple[Any, ...]:
+def _functions_of(method: Any) -> tuple[Any, Any, Any, Any]:
     return method.master_step, method.slave_step, method.record_command, method.initialize
 
 
