@@ -29,15 +29,8 @@ from drake_teleop.logs.pose_motion.estimate import (
     fit_motion_to_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import (
-    choose_delay,
-    is_far_from_gaps,
-    is_near_ends,
-    low_pass,
-    low_pass_log,
-    remove_delay,
-    widen_flags,
-)
+from drake_teleop.logs.read import alignment
+from drake_teleop.logs.read.alignment import choose_delay, is_far_from_gaps, low_pass, low_pass_log
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import note_that_table_needs_description
@@ -95,7 +88,7 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
     A flag is True within two knot distances of an end or gap of the poses.
     """
     assert log.posed is not None
-    moved, splines = remove_delay(log, found.delay_s), found.splines
+    moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
     gravity = splines.gravity(t, gravity_W)
     moved = moved.with_motion(*splines.motion(t, gravity_W), gravity=gravity)
@@ -164,11 +157,11 @@ def read_aligned_log(
     if found is not None:
         motion, source = found
         moved, one_sided = use_spline_motion_and_flag_edges(log, motion)
-        plain = remove_delay(log, motion.delay_s) if differentiate else None
+        plain = alignment.remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
             moved = replace_specific_force_by_acceleration(moved)
             plain = None if plain is None else replace_specific_force_by_acceleration(plain)
-        edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
+        edge = one_sided | alignment.is_near_ends(moved, 0.0, cutoff_hz)
         notes = tuple(_clock_rate_notes(motion))
         candidates = [AlignedLog(moved, motion.delay_s, source, plain, edge, notes)]
         if log.posed is None or log.posed.imu is None:
@@ -179,8 +172,8 @@ def read_aligned_log(
     delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = fallback_delay_s, "load"
-    log = remove_delay(log, delay_s)
-    edge = is_near_ends(log, log.one_sided_s, cutoff_hz)
+    log = alignment.remove_delay(log, delay_s)
+    edge = alignment.is_near_ends(log, log.one_sided_s, cutoff_hz)
     candidates.append(AlignedLog(log, delay_s, source, log, edge))
 
     def summed_logarithms_of_residual_spread(aligned: AlignedLog) -> float:
@@ -267,7 +260,7 @@ def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
         stop = start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
-    bridged = None if log.bridged is None else widen_flags(log.bridged, stride)[::stride]
+    bridged = None if log.bridged is None else alignment.widen_flags(log.bridged, stride)[::stride]
     return replace(few, wrench=wrench, bridged=bridged)
 
 

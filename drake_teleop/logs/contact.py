@@ -10,13 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half_width_and_centre
-from drake_teleop.load.contact.detection import (
-    NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
-    ContactDetector,
-    central_axis_of_wrenches,
-    fit_noise_floor,
-    statistics_of_log,
-)
+from drake_teleop.load.contact import detection
+from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.load.contact.noise_floor import (
     THRESHOLD_OVER_MAX,
     DetectorSamples,
@@ -113,10 +108,10 @@ def detect_contact(
     else:
         train = free[0].select_rows(_rows_far_from_ends_and_edges(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
-        threshold = max(NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(statistic))
+        threshold = max(detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(statistic))
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
-    detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
-    values[inner] = statistics_of_log(floor, *judged)
+    detector = detection.ContactDetector(floor, threshold, statistic=statistic, hold=hold)
+    values[inner] = detection.statistics_of_log(floor, *judged)
     touched[inner] = _remove_hold_after_contact(detector.detect(*judged), hold)
     if free is None:
         _remove_marginal_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
@@ -158,20 +153,20 @@ def _fit_floor_and_threshold_to_log(
         quiet = selected = np.ones(n, bool)
     for _ in range(_QUIET_HALF_ITERATIONS if n >= _MIN_FLOOR_BLOCKS * block else 0):
         floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
-        half = _quieter_half_of_blocks(statistics_of_log(floor, *rows)[:, 0], block)
+        half = _quieter_half_of_blocks(detection.statistics_of_log(floor, *rows)[:, 0], block)
         if (half & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
             break
         quiet = half
     for attempt in range(_NUM_CONTACT_REMOVAL_ROUNDS):
         train = rows.select_rows(quiet & selected)
         floor = fit_noise_floor(*train, covariance, fade=fade)
-        values = statistics_of_log(floor, *train)[:, statistic_index(statistic)]
+        values = detection.statistics_of_log(floor, *train)[:, statistic_index(statistic)]
         reached = _expected_maximum_in_free_motion(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
         reached = max(_MIN_EXPECTED_MAX, reached)
         threshold = THRESHOLD_OVER_MAX * reached
-        detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
+        detector = detection.ContactDetector(floor, threshold, statistic=statistic, hold=hold)
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
         too_few = (selected & without_contact).sum() < MIN_NOISE_FLOOR_SAMPLES
         if too_few or attempt == _NUM_CONTACT_REMOVAL_ROUNDS - 1:
@@ -285,7 +280,7 @@ def summarize_contacts(
     for start, stop in find_runs_of_true(touched):
         wrench = contact[start:stop]
         forces = np.linalg.norm(wrench[:, :3], axis=1)
-        direction, point, _ = central_axis_of_wrenches(wrench[np.argmax(forces)])
+        direction, point, _ = detection.central_axis_of_wrenches(wrench[np.argmax(forces)])
         known = bool(np.isfinite(direction).all())
         row = {
             "start_s": float(t[start]),

@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.load import identification
 from drake_teleop.load.batch.uncertainty import confidence_intervals
-from drake_teleop.load.identification import (
-    PARAMETER_NAMES,
-    SIGNIFICANT_STDS_BELOW_ZERO,
-    Identification,
-    com_standard_deviations,
-    consistency_margin,
-)
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.cause import RecordPartWithLoad
 from drake_teleop.logs.contact import noise_floor, summarize_contacts
@@ -50,7 +45,7 @@ def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
         "mass": mass,
         "mass_std": deviations[0],
         "com": com,
-        "com_std": com_standard_deviations(stretch.phi, stretch.covariance),
+        "com_std": identification.com_standard_deviations(stretch.phi, stretch.covariance),
         "phi": stretch.phi,
         "phi_std": deviations,
     }
@@ -62,7 +57,7 @@ def summarize_load(load: Identification) -> dict[str, Any]:
         "mass": load.mass,
         "mass_std": deviations[6],
         "com": load.com,
-        "com_std": com_standard_deviations(load.phi, load.covariance),
+        "com_std": identification.com_standard_deviations(load.phi, load.covariance),
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
@@ -75,7 +70,7 @@ def summarize_load(load: Identification) -> dict[str, Any]:
 
 
 def summarize_object_alone(alone: Identification) -> dict[str, Any]:
-    margin, deviation = consistency_margin(alone)
+    margin, deviation = identification.consistency_margin(alone)
     figures = summarize_load(alone)
     for name in ("identifiable", "not_identifiable"):
         figures[name] = [entry for entry in figures[name] if entry in PARAMETER_NAMES[6:]]
@@ -84,13 +79,13 @@ def summarize_object_alone(alone: Identification) -> dict[str, Any]:
 
 def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < SIGNIFICANT_STDS_BELOW_ZERO * deviation:
+    if alone.mass < identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
         return [f"no object: the total mass exceeds the gripper's by {excess}"]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
-    margin, deviation = consistency_margin(alone)
-    if margin < -SIGNIFICANT_STDS_BELOW_ZERO * deviation:
+    margin, deviation = identification.consistency_margin(alone)
+    if margin < -identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"

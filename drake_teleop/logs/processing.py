@@ -12,19 +12,15 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread, to_float
+from drake_teleop.load import compensation
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, BatchResult, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
-from drake_teleop.load.compensation import (
-    contact_wrench,
-    scaled_wrench,
-    scales_from_eta,
-    unknown_gravity_error,
-    weight_scales_and_inertia_scales,
-)
+from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales, statistic_index
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs import explained_log
 from drake_teleop.logs.aligned_log import (
     METHODS_WITH_SPLINES,
     fit_load_to_posed_log,
@@ -48,14 +44,6 @@ from drake_teleop.logs.contact import (
     note_on_drift_or_much_contact,
     robust_offsets,
     samples_for_detector,
-)
-from drake_teleop.logs.explained_log import (
-    explain_log,
-    explained_load,
-    implausible_mass_message,
-    removed_weight_note,
-    replace_frame_causes,
-    unexplained_finding,
 )
 from drake_teleop.logs.read.alignment import (
     choose_delay,
@@ -190,7 +178,7 @@ def identify_log(
     else:
         log, fit, delay_s, source = _fit_load_to_motion(raw, method, cutoff_hz, delay)
     possible = _is_explanation_possible(raw, posed is not None)
-    why = explain_log(raw, delay_s, motion) if possible else None
+    why = explained_log.explain_log(raw, delay_s, motion) if possible else None
     names = {x.name for x in why.causes} if why is not None else set()
     if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
@@ -209,11 +197,11 @@ def identify_log(
     if errors:
         why, result = None, result.with_unidentified_load()
     if why is not None:
-        result = explained_load(result, why)
-        causes = replace_frame_causes(why, other[0]) if other else why.causes
+        result = explained_log.explained_load(result, why)
+        causes = explained_log.replace_frame_causes(why, other[0]) if other else why.causes
     note = fit.note if not causes or (why is not None and why.has_several_gains) else ""
     if raw.estimated and why is not None:
-        note = removed_weight_note(why)
+        note = explained_log.removed_weight_note(why)
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
@@ -224,8 +212,8 @@ def identify_log(
         findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
         findings = findings or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
-            findings = (unexplained_finding(why),)
-    mass_message = implausible_mass_message(result.mass, causes, raw)
+            findings = (explained_log.unexplained_finding(why),)
+    mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
@@ -454,12 +442,12 @@ def _read_and_eliminate_log(
     gravity_only = None
     removed = removed or "weight" in log.estimated
     sigmas = {name: value for name, value in scales.items() if name != "gamma"}
-    weights, inertias = weight_scales_and_inertia_scales(**sigmas)
+    weights, inertias = compensation.weight_scales_and_inertia_scales(**sigmas)
     if weights != inertias and removed:
         raise weight_scale_without_effect_error(log.source)
     if weights != inertias and log.gravity is None:
         where = f"{log.source}: gravity in the sensor frame"
-        raise unknown_gravity_error(where, "add an orientation, or use sigma alone")
+        raise compensation.unknown_gravity_error(where, "add an orientation, or use sigma alone")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
@@ -468,7 +456,7 @@ def _read_and_eliminate_log(
         gravity_only = weightless - choose_offsets(weightless)[0]
     parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
-    scaled = scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
+    scaled = compensation.scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
     causal_wrench = None
     if causal is not None and aligned.log_with_differentiated_motion is not None:
         causal_offsets = identification.offsets
@@ -479,7 +467,7 @@ def _read_and_eliminate_log(
             causal_offsets = untouched[rows].mean(axis=0)
         both = (
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
-            scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
+            compensation.scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
         )
         options: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay_s": delay_s, "mode": causal}
         causal_wrench = compute_causal_wrench(*both, log.dt, **options)
@@ -605,7 +593,7 @@ def _checked_scales(
         if sigma != 0 or gamma != 1 or any(other is not None for other in others):
             what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
             raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
-        sigma, kept, gamma = scales_from_eta(eta)
+        sigma, kept, gamma = compensation.scales_from_eta(eta)
     return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
 
 

@@ -13,12 +13,8 @@ from drake_teleop.common.rotations import axis_names_of_rows
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import (
-    drift_amplitudes,
-    estimated_gravity_tilt_deg_and_size_ratio,
-    fits_with_other_torque_units,
-    max_cable_stiffness_n_m,
-)
+from drake_teleop.logs.causes import candidates
+from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
 from drake_teleop.logs.causes.state import FittedModel
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
@@ -119,7 +115,7 @@ def _wrong_axes_cause(Q: Array) -> Cause:
 
 
 def _gravity_direction_cause(state: FittedModel) -> Cause:
-    true, angle, _ = estimated_gravity_tilt_deg_and_size_ratio(state)
+    true, angle, _ = candidates.estimated_gravity_tilt_deg_and_size_ratio(state)
     wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
     return Cause(
         "gravity direction",
@@ -208,7 +204,7 @@ def _sensor_rotation_cause(state: FittedModel) -> Cause:
 
 
 def _drift_cause(state: FittedModel) -> Cause:
-    size = 2.0 * drift_amplitudes(state)
+    size = 2.0 * candidates.drift_amplitudes(state)
     return Cause(
         "drift",
         f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m within the"
@@ -218,7 +214,7 @@ def _drift_cause(state: FittedModel) -> Cause:
 
 
 def _cable_cause(state: FittedModel) -> Cause:
-    stiffness = max_cable_stiffness_n_m(state)
+    stiffness = candidates.max_cable_stiffness_n_m(state)
     return Cause(
         "cable",
         f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.logs.causes import cause, changes
 from drake_teleop.logs.causes.candidates import (
     EXTENSIONS_BY_PLAUSIBILITY,
     Candidate,
@@ -17,18 +18,8 @@ from drake_teleop.logs.causes.candidates import (
     is_plausible,
     start_parameters_of_tilt_fit,
 )
-from drake_teleop.logs.causes.cause import (
-    Cause,
-    RecordPartWithLoad,
-    causes_of_fit,
-    loads_between_changes,
-)
-from drake_teleop.logs.causes.changes import (
-    remove_small_steps,
-    replace_contacts_by_steps,
-    replace_steps_by_contact,
-    shrink_contacts,
-)
+from drake_teleop.logs.causes.cause import Cause, RecordPartWithLoad
+from drake_teleop.logs.causes.changes import remove_small_steps
 from drake_teleop.logs.causes.instants import BlockMeans, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     GOOD_SMOOTH_MISFIT,
@@ -151,11 +142,11 @@ def _search_causes_from(
                 break
             state, delay_s = _apply_fitted_delay(explained, delay_s, with_delay)
             continue
-        larger = replace_steps_by_contact(winner.state)
+        larger = changes.replace_steps_by_contact(winner.state)
         if winner.name == "contact":
-            larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
+            larger = changes.replace_contacts_by_steps(larger) or changes.shrink_contacts(larger)
         elif larger.contact_spans != winner.state.contact_spans:
-            larger = replace_contacts_by_steps(larger) or larger
+            larger = changes.replace_contacts_by_steps(larger) or larger
         # A contact can take all the samples before or after an earlier step.
         state, delay_s = _apply_fitted_delay(remove_small_steps(larger), delay_s, with_delay)
         rejected = [x for x in rejected if x is not winner]
@@ -199,7 +190,7 @@ def _explain_contact_by_steps(state: FittedModel, found: list[Candidate]) -> Fit
     limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
     contacts = (x.state for x in found if x.name == "contact")
     calm = next((x for x in contacts if x.residual_ratio < limit), None)
-    return None if calm is None else replace_contacts_by_steps(calm)
+    return None if calm is None else changes.replace_contacts_by_steps(calm)
 
 
 def _is_misfit_reduced(candidate: Candidate, state: FittedModel) -> bool:
@@ -283,7 +274,7 @@ def explain_misfit(
         blocks = jackknife_load_deviations(state)
         gains = load_covariance_by_gain_errors(state) + load_covariance_by_torque_unit(state)
         covariance = load_covariance(state, rejected, blocks, gains)
-        causes = causes_of_fit(state, always_fitted)
+        causes = cause.causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _no_load_cause(state, covariance)
@@ -295,7 +286,7 @@ def explain_misfit(
             covariance=covariance,
             misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
-            loads=tuple(loads_between_changes(state, covariance)),
+            loads=tuple(cause.loads_between_changes(state, covariance)),
             removed_weight=None if weight is None else state.x[weight],
             state=state,
             always_fitted=always_fitted,

@@ -12,19 +12,12 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
+from drake_teleop.logs.causes import instants
 from drake_teleop.logs.causes.instants import (
-    ALPHA_SIGNALS,
     COLUMNS_REPEATED_BY_STEP,
-    CONSTANT_COLUMN,
-    GRAVITY_SIGNALS,
-    NUM_SIGNALS,
-    OMEGA_PRODUCTS,
     ROTATION_POSITION_PRODUCTS,
     ROTATION_SIGNALS,
-    SPECIFIC_FORCE_SIGNALS,
     TIME_POLYNOMIALS,
-    WRENCH_RATE_SIGNALS,
-    WRENCH_SIGNALS,
 )
 
 OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter vector
@@ -140,16 +133,16 @@ class Model:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, self._num_signals))
-        out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
+        out[..., : instants.NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
                 load = _load_coefficients(x[:, parts[f"step {i}"]])
                 out[..., _columns_of_step(i)] = load @ motion[..., COLUMNS_REPEATED_BY_STEP]
         if "weight" in parts:
             removed = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
-            out[..., GRAVITY_SIGNALS] += removed  # - V(-g) w
+            out[..., instants.GRAVITY_SIGNALS] += removed  # - V(-g) w
         if "cable" in parts:
-            out[..., :NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
+            out[..., : instants.NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
         turned = self._sensor_rotations(x)
         out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
         factor = np.full(len(x), self.torque_factor)
@@ -163,8 +156,8 @@ class Model:
 
     def _add_offsets_delay_and_drift(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
-        out[:, :, CONSTANT_COLUMN] += x[:, :6]
-        out[:, channels, WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
+        out[:, :, instants.CONSTANT_COLUMN] += x[:, :6]
+        out[:, channels, instants.WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
                 out[:, :, _columns_of_step(i).start] += x[:, self.parameter_slices[f"step {i}"]]
@@ -176,17 +169,17 @@ class Model:
     def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.parameter_slices
         varied = "gravity" in parts or "frame" in parts
-        M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
-        M[:, 0:3, SPECIFIC_FORCE_SIGNALS] = M[:, 3:6, ALPHA_SIGNALS] = np.eye(3)
-        M[:, 6:12, OMEGA_PRODUCTS] = np.eye(6)
+        M = np.zeros((len(x) if varied else 1, 12, instants.NUM_SIGNALS))
+        M[:, 0:3, instants.SPECIFIC_FORCE_SIGNALS] = M[:, 3:6, instants.ALPHA_SIGNALS] = np.eye(3)
+        M[:, 6:12, instants.OMEGA_PRODUCTS] = np.eye(6)
         if "gravity" in parts:
             d = x[:, parts["gravity"]]
             for i in range(3):
                 M[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] += d
         if "frame" in parts:
             r = x[:, parts["frame"]]
-            M[:, :3, ALPHA_SIGNALS] -= cross_matrix(r)
-            M[:, :3, OMEGA_PRODUCTS] += centripetal_matrix(r)
+            M[:, :3, instants.ALPHA_SIGNALS] -= cross_matrix(r)
+            M[:, :3, instants.OMEGA_PRODUCTS] += centripetal_matrix(r)
         return M
 
     def _sensor_rotations(self, x: Array) -> Array:
@@ -207,12 +200,12 @@ class Model:
     def residual_coefficients(self, x: Array) -> Array:
         """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
         out = -self.wrench_coefficients(x[None])[0]
-        out[np.arange(6), WRENCH_SIGNALS.start + np.arange(6)] += 1.0
+        out[np.arange(6), instants.WRENCH_SIGNALS.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])
 
 
 def _columns_of_step(i: int) -> slice:
-    start = NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i
+    start = instants.NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i
     return slice(start, start + len(COLUMNS_REPEATED_BY_STEP))
 
 
@@ -221,7 +214,7 @@ def _load_coefficients(phi: Array) -> Array:
 
 
 def _cable_coefficients(x: Array) -> Array:
-    out = np.zeros((len(x), 6, NUM_SIGNALS))
+    out = np.zeros((len(x), 6, instants.NUM_SIGNALS))
     K = x[:, 3:9][:, SYMMETRIC_MATRIX_INDICES].reshape(-1, 9)
     for i in range(3):
         row, products = ROTATION_SIGNALS.start + 3 * i, ROTATION_POSITION_PRODUCTS.start + 9 * i

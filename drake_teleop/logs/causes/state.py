@@ -9,14 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.instants import (
-    MAX_NOISE_LAG,
-    OMEGA_PRODUCTS,
-    ROTATION_POSITION_PRODUCTS,
-    ROTATION_SIGNALS,
-    WRENCH_SIGNALS,
-    BlockMeans,
-)
+from drake_teleop.logs.causes import instants
+from drake_teleop.logs.causes.instants import BlockMeans
 from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, Model
 
 _MIN_ROWS_FOR_AUTOREGRESSION = 50
@@ -46,20 +40,20 @@ class UsedRows:
     def rows_with_predecessors(self) -> NDArray[np.intp]:
         """Indices of rows whose four predecessors are used, too."""
         whole = self.used.copy()
-        whole[:MAX_NOISE_LAG] = False
-        for d in range(1, MAX_NOISE_LAG + 1):
+        whole[: instants.MAX_NOISE_LAG] = False
+        for d in range(1, instants.MAX_NOISE_LAG + 1):
             whole[d:] &= self.used[:-d]
         return np.flatnonzero(whole)
 
     @cached_property
     def _lagged_signals_of_edge_rows(self) -> Array:
-        padded = np.concatenate([self.used, np.zeros(MAX_NOISE_LAG, bool)])
+        padded = np.concatenate([self.used, np.zeros(instants.MAX_NOISE_LAG, bool)])
         near = padded.copy()
-        for d in range(1, MAX_NOISE_LAG + 1):
+        for d in range(1, instants.MAX_NOISE_LAG + 1):
             near[d:] |= padded[:-d]
         near[self.rows_with_predecessors] = False
-        at = np.flatnonzero(near)[:, None] - np.arange(MAX_NOISE_LAG + 1)
-        y = np.vstack([self.y, np.zeros((2 * MAX_NOISE_LAG, self.y.shape[1]))])
+        at = np.flatnonzero(near)[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
+        y = np.vstack([self.y, np.zeros((2 * instants.MAX_NOISE_LAG, self.y.shape[1]))])
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
@@ -76,16 +70,16 @@ class UsedRows:
     ) -> tuple[Array, Array]:
         """Return whitening filters (6, 5) and noise power (6,) >= `floor` (6,) of the residual."""
         e = self.y @ residual_coefficients.T
-        filters = np.zeros((6, MAX_NOISE_LAG + 1))
+        filters = np.zeros((6, instants.MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
         now = self.rows_with_predecessors
-        history = np.stack([e[now - d] for d in range(MAX_NOISE_LAG + 1)], axis=2)
+        history = np.stack([e[now - d] for d in range(instants.MAX_NOISE_LAG + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(now), 1)
         if is_white or len(now) < _MIN_ROWS_FOR_AUTOREGRESSION:
             return filters, np.maximum(products[:, 0, 0], floor)
-        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(MAX_NOISE_LAG)
-        inner += 1e-300 * np.eye(MAX_NOISE_LAG)
+        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(instants.MAX_NOISE_LAG)
+        inner += 1e-300 * np.eye(instants.MAX_NOISE_LAG)
         filters[:, 1:] = -np.linalg.solve(inner, products[:, 1:, :1])[..., 0]
         power = products[:, 0, 0] + (filters[:, 1:] * products[:, 0, 1:]).sum(axis=1)
         return filters, np.maximum(power, floor)
@@ -197,16 +191,16 @@ class FittedModel:
         y = self.data.y
         segments = _NUM_TIME_SEGMENTS_OF_MISFIT_TEST
         part = np.linspace(0.0, segments, len(y), endpoint=False).astype(int)
-        parts = [y[:, : OMEGA_PRODUCTS.stop]]
+        parts = [y[:, : instants.OMEGA_PRODUCTS.stop]]
         if self.data.gravity_W is not None:
-            parts.append(y[:, ROTATION_SIGNALS])
+            parts.append(y[:, instants.ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
+            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_predecessors, self.noise_filters
         gain, freedom = 0.0, 0
-        late = [columns[whole - d] for d in range(MAX_NOISE_LAG + 1)]
+        late = [columns[whole - d] for d in range(instants.MAX_NOISE_LAG + 1)]
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
@@ -233,10 +227,10 @@ def fit_model(
 ) -> FittedModel:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
-    total = (rows.data.y[rows.used][:, WRENCH_SIGNALS] ** 2).sum(axis=0) / count
+    total = (rows.data.y[rows.used][:, instants.WRENCH_SIGNALS] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
     floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
-    white = np.eye(1, MAX_NOISE_LAG + 1).repeat(6, axis=0)
+    white = np.eye(1, instants.MAX_NOISE_LAG + 1).repeat(6, axis=0)
     residual, power = model.residual_coefficients(x), np.maximum(both, floor)
     found = FittedModel(model, rows, x, np.zeros(0), residual, white, power, spans)
     for iteration in range(iterations):

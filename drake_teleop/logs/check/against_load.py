@@ -16,14 +16,8 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.check.corrections import (
-    MIN_LAG_OF_WRONG_CLOCK_S,
-    Finding,
-    call_or_none_if_unreadable,
-    edit_field,
-    edit_with_opposite_wrench_sign,
-    wrench_and_motion_edits,
-)
+from drake_teleop.logs.check import corrections
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
     MAX_SEARCHED_DELAY_S,
@@ -163,7 +157,7 @@ def check_wrench_and_estimate_delay(
     if not (given.is_good and inside):
         edits += _clock_offset_edits(description, thin)
     if not given.is_good:
-        edits = [*wrench_and_motion_edits(description), *edits]
+        edits = [*corrections.wrench_and_motion_edits(description), *edits]
     found = _edits_with_far_better_fit(fit_edited_description, given, edits)
     if not found and not given.is_good and not log.static:  # contact may hide what fits
         without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
@@ -199,15 +193,15 @@ def _edits_with_far_better_fit(
     """
     positive, negative = [], []
     for finding, edited in edits:
-        fit = call_or_none_if_unreadable(fit_description, edited)
+        fit = corrections.call_or_none_if_unreadable(fit_description, edited)
         if fit is None:
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
         elif finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN:
-            negative.append((fit, *edit_with_opposite_wrench_sign(finding, edited)))
+            negative.append((fit, *corrections.edit_with_opposite_wrench_sign(finding, edited)))
         elif finding is None:  # a clock and the sign
-            negative.append((fit, *next(wrench_and_motion_edits(edited))))
+            negative.append((fit, *next(corrections.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid = given.max_unexplained_including_noise(VALID_UNEXPLAINED)
     decisive = given.unexplained / min_unexplained_reduction_by_edit(given)
@@ -298,14 +292,14 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
     best = float(shifts[int(np.argmin([unexplained_at_shift(x) for x in shifts]))])
     if abs(best) < reach - 0.03:
         offset = description.wrench.time.offset + best
-        yield None, edit_field(description, "wrench.time.offset", offset)
+        yield None, corrections.edit_field(description, "wrench.time.offset", offset)
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     if delay is None or abs(delay) <= MIN_REPORTED_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
-    if abs(delay) > MIN_LAG_OF_WRONG_CLOCK_S:
+    if abs(delay) > corrections.MIN_LAG_OF_WRONG_CLOCK_S:
         offset = description.wrench.time.offset + delay
         text = (
             f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong; set"

@@ -12,32 +12,17 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.against_load import (
-    GOOD_UNEXPLAINED,
-    LoadFitQuality,
-    check_wrench_and_estimate_delay,
-    clock_drift_finding_and_correction,
-    fit_load,
-    undetermined_payload_finding,
-    unexplained_share,
-)
-from drake_teleop.logs.check.corrections import (
-    MIN_LAG_OF_WRONG_CLOCK_S,
-    MOTION_FINDINGS,
-    Finding,
-    correct_accelerometer_unit,
-)
+from drake_teleop.logs.check import against_load, corrections
+from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, LoadFitQuality
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
 from drake_teleop.logs.check.log_data import LogData, dead_or_repeated_channel_findings
 from drake_teleop.logs.check.pose_checks import position_unit_or_origin_findings
+from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
-from drake_teleop.logs.read.table_files import (
-    TABLE_READERS,
-    note_that_table_needs_description,
-    read_table,
-)
+from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table
 
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.3, 0.1
@@ -65,7 +50,7 @@ class ConventionCheckResult:
 
 def check_conventions_of_file(path: Path) -> ConventionCheckResult:
     if path.suffix.lower() in TABLE_READERS:
-        table = read_table(path)
+        table = table_files.read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
     return check_conventions(load_description(path), str(path))
 
@@ -86,15 +71,15 @@ def findings_if_load_is_suspicious(
         what = "the wrench is the same in all samples: no load can be identified"
         remedy = "check the sensor's cable; a driver may repeat its last value"
         raise DrakeTeleopError(what, where=log.source, remedy=remedy)
-    unexplained = unexplained_share(log.wrench, log.wrench - predicted)
+    unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    clocks = log.static or (delay is not None and abs(delay) < MIN_LAG_OF_WRONG_CLOCK_S)
+    clocks = log.static or (delay is not None and abs(delay) < corrections.MIN_LAG_OF_WRONG_CLOCK_S)
     if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_except_lag(check)) if _are_signals_suspicious(log) else ()
     found = _findings_except_lag(check)
     if any(finding.name == "payload" for finding in found):
-        own = undetermined_payload_finding(load, unexplained)
+        own = against_load.undetermined_payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
         if load.mass < 0 and load.identifiable[6]:
             raise DrakeTeleopError(found[-1].message, where=log.source)
@@ -118,7 +103,7 @@ def findings_if_load_is_suspicious(
 
 def motion_findings(check: Callable[[], ConventionCheckResult]) -> tuple[Finding, ...]:
     """Return the findings of `check` that concern the described motion, not the wrench."""
-    return tuple(x for x in _findings_except_lag(check) if x.name in MOTION_FINDINGS)
+    return tuple(x for x in _findings_except_lag(check) if x.name in corrections.MOTION_FINDINGS)
 
 
 def _findings_except_lag(check: Callable[[], ConventionCheckResult]) -> list[Finding]:
@@ -155,7 +140,7 @@ def check_conventions(
 ) -> ConventionCheckResult:
     with one_blas_thread():
         found = _check_description(LogData(description, source, dict(tables or {})), description)
-    note = note_that_table_needs_description(source)
+    note = table_files.note_that_table_needs_description(source)
     findings = tuple(replace(f, message=f"{f.message}{note}") for f in found.findings)
     return replace(found, findings=findings)
 
@@ -177,26 +162,26 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
     dead = dead_or_repeated_channel_findings("imu", description, data.tables)
     broken = dead_or_repeated_channel_findings("wrench", description, data.tables)
     if dead:  # A dead channel would cause wrong findings about motion and load.
-        fit = fit_load(data.read_thinned_log(description))
+        fit = against_load.fit_load(data.read_thinned_log(description))
         return ConventionCheckResult((*dead, *broken), fit, None, None)
-    findings, description = correct_accelerometer_unit(description, log)
+    findings, description = corrections.correct_accelerometer_unit(description, log)
     more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more
     mounting = None
     if description.imu and description.pose:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
-    fit = fit_load(data.read_thinned_log(description))
+    fit = against_load.fit_load(data.read_thinned_log(description))
     if broken or (mounting is not None and mounting.is_mirrored):
         return ConventionCheckResult((*broken, *findings), fit, mounting, None)
     if "weight" in log.estimated:  # the checks below require the weight of the load in the wrench
         return ConventionCheckResult(tuple(findings), fit, mounting, None)
     if not findings:
-        more, description = clock_drift_finding_and_correction(description, data)
+        more, description = against_load.clock_drift_finding_and_correction(description, data)
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_unit_or_origin_findings(description, data, lag)
-    more, delay = check_wrench_and_estimate_delay(description, data)
+    more, delay = against_load.check_wrench_and_estimate_delay(description, data)
     findings = _merge_clock_findings(description, [*findings, *more], mounting, delay)
     rest = _too_few_or_similar_poses_finding(log)
     if rest is not None:
@@ -210,7 +195,7 @@ def _merge_clock_findings(
     num_clocks = sum(finding.name == "clock" for finding in found)
     if num_clocks < 2 or mounting is None or mounting.clock_drift or delay is None:
         return found
-    if abs(mounting.lag_s + delay) > MIN_LAG_OF_WRONG_CLOCK_S:
+    if abs(mounting.lag_s + delay) > corrections.MIN_LAG_OF_WRONG_CLOCK_S:
         return found
     assert description.pose is not None
     text = f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench"

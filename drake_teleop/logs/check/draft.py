@@ -14,12 +14,8 @@ import numpy as np
 
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.read.description_fields import (
-    FORCE_UNITS,
-    POSITION_UNITS,
-    SI_VALUE_OF_UNIT,
-    TORQUE_UNITS,
-)
+from drake_teleop.logs.read import description_fields
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
 _TIME_NAME_PATTERN = (
@@ -76,12 +72,12 @@ _UNIT_OF_SPELLING = {
     "n.m": "N m",
 }
 _ALLOWED_UNITS = {
-    "force": FORCE_UNITS,
-    "torque": TORQUE_UNITS,
+    "force": description_fields.FORCE_UNITS,
+    "torque": description_fields.TORQUE_UNITS,
     "specific_force": ("m/s^2", "mm/s^2", "g"),
     "angular_velocity": ("rad/s", "deg/s"),
     "rotation_vector": ("rad", "deg"),
-    "position": POSITION_UNITS,
+    "position": description_fields.POSITION_UNITS,
     "euler": ("rad", "deg"),
     "time": ("s", "ms", "us", "ns"),
 }

@@ -33,13 +33,8 @@ from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
-from drake_teleop.logs.dataset.dataset_files import (
-    ContactColumns,
-    Dataset,
-    Episode,
-    open_dataset,
-    write_copy,
-)
+from drake_teleop.logs.dataset import dataset_files
+from drake_teleop.logs.dataset.dataset_files import ContactColumns, Dataset, Episode
 from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
@@ -105,7 +100,7 @@ def dataset_command(
             "exactly one of --load and --identify is required", where="dataset", remedy="give one"
         )
     known = None if load is None else Identification.load(load)
-    dataset, copied = open_dataset(path), out / path.resolve().name
+    dataset, copied = dataset_files.open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
         what = "the output folder is in the dataset, which must not change"
         raise DrakeTeleopError(what, where=str(out), remedy="give another --out")
@@ -118,7 +113,7 @@ def dataset_command(
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
         judged = [np.load(work / f"{k}.npy", allow_pickle=False) for k in range(len(rows))]
         columns = [ContactColumns(x[:, :6], x[:, 6] > 0.5) for x in judged]
-        write_copy(dataset, copied, columns)
+        dataset_files.write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = to_json_data(_dataset_summary(dataset, copied, shared, rows))

@@ -21,15 +21,10 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, replace_file_on_success, write_table, write_text
 from drake_teleop.common.numeric import Array
+from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.table_files import (
-    array_columns,
-    numeric_and_nested_columns,
-    numeric_or_nested_column_names,
-    read_table,
-)
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN = "observation.contact_wrench", "observation.in_contact"
@@ -65,7 +60,7 @@ class Dataset(NamedTuple):
 
     def read_episode(self, episode: Episode) -> Table:
         if self.kind == "tables":
-            return read_table(episode.file)
+            return table_files.read_table(episode.file)
         rows = slice(episode.first_row, episode.first_row + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
             if self.kind != "lerobot":
@@ -74,10 +69,10 @@ class Dataset(NamedTuple):
                     if self.kind == "hdf5"
                     else read_zarr(episode.file / "data", rows=rows)
                 )
-                return Table(episode.file, array_columns(arrays, None))
+                return Table(episode.file, table_files.array_columns(arrays, None))
             frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first_row, episode.rows)
-            return Table(episode.file, numeric_and_nested_columns(part))
+            return Table(episode.file, table_files.numeric_and_nested_columns(part))
 
 
 @lru_cache(maxsize=1)
@@ -86,7 +81,7 @@ def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
     import polars as pl
 
     frame = pl.scan_parquet(file)
-    return frame.select(numeric_or_nested_column_names(frame)).collect().lazy()
+    return frame.select(table_files.numeric_or_nested_column_names(frame)).collect().lazy()
 
 
 def open_dataset(path: Path) -> Dataset:

@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
-from drake_teleop.load.contact.detection import (
-    NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
-    fit_noise_floor,
-)
+from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.noise_floor import (
     DetectorSamples,
     NoiseFloor,
@@ -100,9 +97,9 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
-    floor = fit_noise_floor(*pooled, covariance, fade=0.0)
+    floor = detection.fit_noise_floor(*pooled, covariance, fade=0.0)
     threshold = max(
-        NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
+        detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
         _THRESHOLD_OVER_LARGEST_FREE_LEVEL * float(floor.free_maxima[0]),
     )
     return SharedLoad(load, phi, lag, typical, floor, threshold)

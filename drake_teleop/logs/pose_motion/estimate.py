@@ -11,32 +11,22 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.logs.pose_motion import linear_model, rigid
 from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import (
-    DELAY_SEARCH_HALF_RANGE_S,
     FitWindow,
     Spectra,
     choose_knot_spacing_and_delay,
-    correct_clock_rate,
-    delay_std,
-    estimate_clock_rate_error,
-    fit_linear_model,
-    fit_noise_levels,
-    guess_knot_spacing_and_delay,
-    spline_cache_of_averaged_poses,
 )
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER_PARAMETERS,
-    NUM_RIGID_PARAMETERS,
     OFFSET_AND_LOAD_PARAMETERS,
     ROTATION_PARAMETERS,
     RigidFit,
     RigidParameters,
     UnitsAndAxes,
-    estimate_units_and_axes,
-    fit_rigid,
 )
 from drake_teleop.logs.pose_motion.spectra import (
     MAX_FREQUENCY_HZ,
@@ -172,20 +162,20 @@ def estimate_from_poses(
         Z = spectra.second_moments()
         signals = spectra.taper, spectra.motion_signals, spectra.bands
         Q = noise_moments(splines, grid, *signals, splines.estimate_pose_noise())
-        levels = fit_noise_levels(Z, spectra.bands)
-        best = fit_linear_model(Z, levels)
+        levels = linear_model.fit_noise_levels(Z, spectra.bands)
+        best = linear_model.fit_linear_model(Z, levels)
 
         def fit_rigid_from(start: RigidParameters, free: NDArray[np.bool_]) -> RigidFit:
-            return fit_rigid(Z, Q, levels, start, free, best, gain_std=gain_std)
+            return rigid.fit_rigid(Z, Q, levels, start, free, best, gain_std=gain_std)
 
-        seen = estimate_units_and_axes(best)
+        seen = rigid.estimate_units_and_axes(best)
         start = _initial_rigid_parameters(p_SoPo_S, R_SP, seen)
-        fit_free = np.ones(NUM_RIGID_PARAMETERS, bool)
+        fit_free = np.ones(rigid.NUM_RIGID_PARAMETERS, bool)
         fit_free[16] = delay is None
         fit_free[LEVER_PARAMETERS], fit_free[ROTATION_PARAMETERS] = p_SoPo_S is None, R_SP is None
         fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
-            with_frame = fit_free | (np.arange(NUM_RIGID_PARAMETERS) > 16)
+            with_frame = fit_free | (np.arange(rigid.NUM_RIGID_PARAMETERS) > 16)
             free = fit_rigid_from(_initial_parameters_with_free_frame(fit, start, seen), with_frame)
         return PoseEstimate(
             splines=splines,
@@ -224,7 +214,7 @@ def fit_motion_to_load(
             fewest=_MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD,
             load=coefficients,
         )
-        return replace(motion, delay_std_s=delay_std(last) if delay is None else 0.0)
+        return replace(motion, delay_std_s=linear_model.delay_std(last) if delay is None else 0.0)
 
 
 def _find_splines_and_delay(
@@ -255,19 +245,19 @@ def _find_splines_and_delay(
     whole = FitWindow(grid, taper, gravity, top)
     rows = _part_with_most_varied_force(grid)
     part = whole.select_rows(rows)
-    margin = 2 * DELAY_SEARCH_HALF_RANGE_S
+    margin = 2 * linear_model.DELAY_SEARCH_HALF_RANGE_S
     near = (poses.t >= part.grid.t[0] - margin) & (poses.t <= part.grid.t[-1] + margin)
     near_poses = Poses(poses.t[near], poses.position[near], poses.quaternion[near])
-    cache = spline_cache_of_averaged_poses(near_poses)
-    spacing, late = guess_knot_spacing_and_delay(part, cache, guess, known=known)
+    cache = linear_model.spline_cache_of_averaged_poses(near_poses)
+    spacing, late = linear_model.guess_knot_spacing_and_delay(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
     disturbed = find_disturbances(first, spacing)[0]
     part = replace(part, taper=exclude_from_taper(part.taper, disturbed, grid.dt))
-    rate = 0.0 if known else estimate_clock_rate_error(part, cache, late, spacing)
+    rate = 0.0 if known else linear_model.estimate_clock_rate_error(part, cache, late, spacing)
     if rate:
-        near_poses = correct_clock_rate(near_poses, rate, part.grid, late)
-        poses = correct_clock_rate(poses, rate, part.grid, late)
-        cache = spline_cache_of_averaged_poses(near_poses)
+        near_poses = linear_model.correct_clock_rate(near_poses, rate, part.grid, late)
+        poses = linear_model.correct_clock_rate(poses, rate, part.grid, late)
+        cache = linear_model.spline_cache_of_averaged_poses(near_poses)
     choices, imu_rows, imu_spacing = [cache], None, spacing
     if imu is not None:
         imu_rows = correct_imu_data(PoseSplines(near_poses, imu_spacing), imu, gravity)

@@ -13,13 +13,9 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M, parameter_errors_by_gains
 from drake_teleop.load.identification import mark_undetermined
 from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
+from drake_teleop.logs.pose_motion import spectra
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, min_noise_power
-from drake_teleop.logs.pose_motion.spectra import (
-    NUM_MOMENT_SIGNALS,
-    SIGNAL_RATE_COLUMNS,
-    WRENCH_COLUMNS,
-    NoiseLevels,
-)
+from drake_teleop.logs.pose_motion.spectra import NUM_MOMENT_SIGNALS, WRENCH_COLUMNS, NoiseLevels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, NUM_MOTION_SIGNALS
 
 NUM_RIGID_PARAMETERS = 23
@@ -260,7 +256,7 @@ def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
-    B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
+    B[:, DELAY_PARAMETER, spectra.SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
         lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
         turned = (_rotate_about_own_axes(state.R_PS, x * unit) for x in (step, -step))

@@ -11,30 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common import rotations
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
-from drake_teleop.common.rotations import (
-    nearest_rotation,
-    quaternions_from_matrices,
-    rotation_matrices,
-)
+from drake_teleop.common.rotations import nearest_rotation
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
-from drake_teleop.logs.read.alignment import (
-    SMOOTHER_WINDOW_OVER_PERIOD,
-    angular_motion,
-    mean_time_step,
-    resample,
-    smooth_derivatives,
-    uniform_times,
-)
-from drake_teleop.logs.read.auto_frames import (
-    Estimate,
-    estimate_auto_gravity,
-    estimate_auto_imu_mounting,
-    estimate_auto_pose_frame,
-    restore_removed_weight,
-    wrench_of_weight,
-)
+from drake_teleop.logs.read import alignment, auto_frames, table_files
+from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angular_motion, resample
+from drake_teleop.logs.read.auto_frames import restore_removed_weight
 from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
@@ -57,19 +41,14 @@ from drake_teleop.logs.read.streams import (
     specific_force_at_So,
     uniform_times_of_streams,
 )
-from drake_teleop.logs.read.table_files import (
-    TABLE_READERS,
-    note_that_table_needs_description,
-    read_table,
-    require_file,
-)
+from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
 MIN_STATIC_POSES = 3
 MIN_BANDWIDTH_HZ = 1e-3
 _CONVERTED_CHUNK_ROWS = 2**16
 _MIN_IMU_GAP_OVER_STEP = 4.0
-_EstimateAuto = Callable[..., Estimate]
+_EstimateAuto = Callable[..., auto_frames.Estimate]
 
 
 def read_log(
@@ -96,13 +75,13 @@ def read_log(
         reader = _LogReader(load_description(path), str(path), bandwidth_hz)
         return reader.read_recording(differentiate=differentiate)
     if path.suffix.lower() in TABLE_READERS:
-        table = read_table(path)
+        table = table_files.read_table(path)
         description = describe_canonical(path, table)
         reader = _LogReader(description, str(path), bandwidth_hz, {path: table})
         return reader.read_recording(keep_time_origin=True, differentiate=differentiate)
     if is_bag(path):
         raise missing_topic_error(path)
-    require_file(path)
+    table_files.require_file(path)
     remedy = f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)"
     raise DrakeTeleopError(f"format {path.suffix!r} is not known", where=str(path), remedy=remedy)
 
@@ -144,11 +123,11 @@ class _LogReader:
         causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
         free = tuple(name for name, is_free in causes.items() if is_free)
         if self._description.gravity == "auto":
-            self._replace_auto_fields(estimate_auto_gravity)
+            self._replace_auto_fields(auto_frames.estimate_auto_gravity)
         if self._description.pose is not None and self._description.pose.is_frame_auto:
-            self._replace_auto_fields(estimate_auto_pose_frame, differentiate=False)
+            self._replace_auto_fields(auto_frames.estimate_auto_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.is_mounting_auto:
-            self._replace_auto_fields(estimate_auto_imu_mounting)
+            self._replace_auto_fields(auto_frames.estimate_auto_imu_mounting)
         table = self._table_of_stream(self._description.wrench)
         clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
         wrench = self._read_wrench("wrench", self._description.wrench, table, clock.num_rows)
@@ -209,7 +188,7 @@ class _LogReader:
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
-        of_table = note_that_table_needs_description(self._source)
+        of_table = table_files.note_that_table_needs_description(self._source)
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -220,21 +199,21 @@ class _LogReader:
     def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
         table = self._table_of_stream(stream)
         clock = self._read_clock_and_gaps("pose", stream, table)
-        t, raw = uniform_times(clock.t), None
+        t, raw = alignment.uniform_times(clock.t), None
         quaternion, position = self._poses_of_S(stream, table, clock)
         if position is not None:
             raw = Poses(clock.t, position, quaternion).with_continuous_quaternions()
             wrench, imu = self._description.wrench, self._description.imu
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, recorded_poses=raw)
-        dt = mean_time_step(t)
+        dt = alignment.mean_time_step(t)
         self._raise_one_sided_length_to_window(dt)
-        raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
+        raw_R = rotations.rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
         if position is not None:
             position = resample(t, clock.t, position)
-            acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
+            acceleration = alignment.smooth_derivatives(position, dt, self._bandwidth_hz)[2]
         s = rotate_world_to_S(R_WS, acceleration - self._description.gravity_W)
         return Stream("pose", t, s, *angular_motion(R_WS, dt, self._bandwidth_hz), R_WS, raw)
 
@@ -253,10 +232,10 @@ class _LogReader:
             part = slice(start, start + _CONVERTED_CHUNK_ROWS)
             q = orientations.quaternions(clock.kept_rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
-                R_WS = rotation_matrices(q, "quaternion_wxyz")
+                R_WS = rotations.rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
                     R_WS = R_WS @ stream.R_SP.T
-                    q = quaternions_from_matrices(R_WS)
+                    q = rotations.quaternions_from_matrices(R_WS)
                 if position is not None:  # from Po to So
                     position[part] -= R_WS @ origin
             quaternion[part] = q
@@ -265,8 +244,8 @@ class _LogReader:
     def _read_imu(self, stream: Imu, pose: Stream | None) -> Stream:
         table = self._table_of_stream(stream)
         clock = self._read_clock_and_gaps("imu", stream, table)
-        raw_t, t = clock.t, uniform_times(clock.t)
-        dt = mean_time_step(t)
+        raw_t, t = clock.t, alignment.uniform_times(clock.t)
+        dt = alignment.mean_time_step(t)
 
         def imu_vectors(field: str, sign: float = 1.0) -> Array | None:
             quantity = getattr(stream, field)
@@ -280,7 +259,7 @@ class _LogReader:
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
             self._raise_one_sided_length_to_window(dt)
-            alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
+            alpha = alignment.smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
             s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
@@ -323,7 +302,7 @@ class _LogReader:
                 raise self._no_R_WS_error("static", remedy)
             wrench = rotate_wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
-            wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
+            wrench = wrench + auto_frames.wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
         if n < MIN_STATIC_POSES:
             what = f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)"
@@ -350,7 +329,7 @@ class _LogReader:
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
         t = clock.t
-        if len(t) < MIN_STREAM_SAMPLES or len(uniform_times(t)) < MIN_STREAM_SAMPLES:
+        if len(t) < MIN_STREAM_SAMPLES or len(alignment.uniform_times(t)) < MIN_STREAM_SAMPLES:
             what = f"{len(t)} samples in {table.path.name} are too few"
             remedy = f"record at least {MIN_STREAM_SAMPLES}, evenly spaced"
             raise DrakeTeleopError(what, where=f"{self._source}:{name}", remedy=remedy)

@@ -17,11 +17,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import (
-    DrakeTeleopError,
-    refuse_polars_in_forked_process,
-    wrap_read_errors,
-)
+from drake_teleop.common import errors
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
@@ -52,8 +49,8 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     """
     kind = TABLE_READERS.check(path.suffix.lower(), str(path))
     require_file(path, folder=kind == ".zarr")
-    refuse_polars_in_forked_process()
-    with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
+    errors.refuse_polars_in_forked_process()
+    with errors.wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
         columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
         table = columns if isinstance(columns, Table) else Table(path, columns)
     if not table.columns or not all(len(c) for c in table.columns.values()):
