@@ -286,8 +286,14 @@ def _batch_result_of_estimate(
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    note = _note_on_disturbances_clock_and_misfit(found, gain_std)
-    return BatchResult(load, noise, rejected, note, equations)
+    notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
+    if not found.fit.is_explained_by_gains:
+        gains = f"gains beyond {gain_std:g}, " if gain_std else "gains (state wrench.gain_std), "
+        notes.append(
+            f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
+            f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"
+        )
+    return BatchResult(load, noise, rejected, "; ".join(notes), equations)
 
 
 def _physically_consistent_theta(found: PoseEstimate) -> Array:
@@ -298,14 +304,3 @@ def _physically_consistent_theta(found: PoseEstimate) -> Array:
     gram = np.linalg.pinv(covariance * np.outer(scale, scale), hermitian=True)
     gram = gram * np.outer(scale, scale)
     return consistent_least_squares(gram, gram @ theta, theta)
-
-
-def _note_on_disturbances_clock_and_misfit(found: PoseEstimate, gain_std: float) -> str:
-    notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
-    if not found.fit.is_explained_by_gains:
-        gains = f"gains beyond {gain_std:g}, " if gain_std else "gains (state wrench.gain_std), "
-        notes.append(
-            f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
-            f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"
-        )
-    return "; ".join(notes)

@@ -93,9 +93,8 @@ def compute_causal_wrench(
     "delayed" keeps the lag of the wrenches (N, 6), "predicted" extrapolates over it.
     """
     if mode not in CAUSAL_MODES:
-        raise DrakeTeleopError(
-            f"{mode!r} is not a causal mode", where="causal", remedy=f"give one of {CAUSAL_MODES}"
-        )
+        what = f"{mode!r} is not a causal mode"
+        raise DrakeTeleopError(what, where="causal", remedy=f"give one of {CAUSAL_MODES}")
     wait = max(0, math.ceil(delay_s / dt - 1e-6))
     lag = wait * dt + filter_lag(dt, cutoff_hz)
     ahead = lag if mode == "predicted" else 0.0

@@ -296,9 +296,8 @@ def _inspect_clock_and_flag_usable_rows(
     steps = np.diff(t)
     forward = steps[steps > 0]
     if not len(forward):
-        raise DrakeTeleopError(
-            "the time stamps never increase", where=at, remedy="name another column, or time.rate"
-        )
+        what = "the time stamps never increase"
+        raise DrakeTeleopError(what, where=at, remedy="name another column, or time.rate")
     median = float(np.median(forward))
     between = figures["episodes"] - 1
     gaps = int((steps > min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum()) - between

@@ -228,11 +228,8 @@ def identify_log(
 def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
     expect_type((str, Path), path, "log", "give the file's name")
     if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_BANDWIDTH_HZ:
-        raise DrakeTeleopError(
-            f"{cutoff_hz:g} Hz is too low",
-            where="cutoff_hz",
-            remedy=f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for no filter",
-        )
+        remedy = f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for no filter"
+        raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where="cutoff_hz", remedy=remedy)
 
 
 def _fit_load_to_motion(
@@ -420,9 +417,8 @@ def _read_and_eliminate_log(
     aligned = read_aligned_log(path, phi, late_s, cutoff_hz, delay, causal is not None, removed)
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
     if log.static and causal is not None:
-        raise DrakeTeleopError(
-            "poses at rest have no times for a causal filter", where="causal", remedy="leave it out"
-        )
+        what = "poses at rest have no times for a causal filter"
+        raise DrakeTeleopError(what, where="causal", remedy="leave it out")
     known = is_far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
@@ -563,11 +559,8 @@ def _findings_if_contact_is_large(
 
 
 def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        "the robot has removed the weight, so that sigma_weight has no effect",
-        where=where,
-        remedy="use sigma alone; it scales the inertia",
-    )
+    what = "the robot has removed the weight, so that sigma_weight has no effect"
+    return DrakeTeleopError(what, where=where, remedy="use sigma alone; it scales the inertia")
 
 
 def _checked_scales(

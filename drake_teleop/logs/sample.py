@@ -41,16 +41,9 @@ MOTION_PERIOD_S, REST_AT_ENDS_S = 8.0, 0.5
 _MAX_CLOCK_JITTER_S = 5e-5
 
 # UR5e, Denavit-Hartenberg parameters of the manufacturer: d, a [m], alpha [rad].
-_DH_PARAMETERS = np.array(
-    [
-        [0.1625, 0.0, np.pi / 2],
-        [0.0, -0.425, 0.0],
-        [0.0, -0.3922, 0.0],
-        [0.1333, 0.0, np.pi / 2],
-        [0.0997, 0.0, -np.pi / 2],
-        [0.0996, 0.0, 0.0],
-    ]
-)
+_LINK_OFFSETS_M = 0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996
+_LINK_LENGTHS_M = 0.0, -0.425, -0.3922, 0.0, 0.0, 0.0
+_LINK_TWISTS_RAD = np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0
 HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
 _JOINT_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])
 _NUM_RECORD_HARMONICS = 6
@@ -200,7 +193,8 @@ def sensor_motion(q: Array, qd: Array, qdd: Array) -> _Motion:
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
     s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])
-    for j, (d, a, twist) in enumerate(_DH_PARAMETERS):
+    links = zip(_LINK_OFFSETS_M, _LINK_LENGTHS_M, _LINK_TWISTS_RAD, strict=True)
+    for j, (d, a, twist) in enumerate(links):
         z, rate = R[:, :, 2], qd[:, j, np.newaxis]
         alpha = alpha + qdd[:, j, np.newaxis] * z + np.cross(omega, rate * z)
         omega = omega + rate * z

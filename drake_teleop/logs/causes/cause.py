@@ -117,12 +117,11 @@ def _wrong_axes_cause(Q: Array) -> Cause:
 def _gravity_direction_cause(state: FittedModel) -> Cause:
     true, angle, _ = candidates.estimated_gravity_tilt_deg_and_size_ratio(state)
     wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
-    return Cause(
-        "gravity direction",
+    text = (
         f"gravity is {angle:.2f} deg (+- {1.96 * wide:.2g}) off the described direction in the base"
-        " of the arm",
-        values={"angle_deg": angle, "gravity": true.tolist()},
+        " of the arm"
     )
+    return Cause("gravity direction", text, values={"angle_deg": angle, "gravity": true.tolist()})
 
 
 def direction_std_deg(x: Array, covariance: Array) -> float:
@@ -140,21 +139,19 @@ def _removed_weight_cause(state: FittedModel) -> Cause:
     own = float(np.sqrt(state.covariance[6, 6]))
     values = {"removed_mass": float(removed[0]), "removed_moment": removed[1:].tolist()}
     if abs(removed[0] - mass) < 0.02 * mass + 4.0 * np.hypot(deviation, own):
-        return Cause(
-            "weight removed",
+        text = (
             "the weight is already removed from the wrench, and the inertia of"
-            f" {mass:.4g} kg (+- {1.96 * own:.2g}) remains",
-            values=values,
+            f" {mass:.4g} kg (+- {1.96 * own:.2g}) remains"
         )
+        return Cause("weight removed", text, values=values)
     com = removed[1:] / removed[0] if removed[0] else np.zeros(3)
-    return Cause(
-        "payload configured",
+    text = (
         f"the weight of a payload of {removed[0]:.4g} kg (+- {1.96 * deviation:.2g}) at"
         f" {_format_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the"
         f" inertia is that of {mass:.4g} kg: the payload in the robot's controller is not that of"
-        " the load",
-        values=values,
+        " the load"
     )
+    return Cause("payload configured", text, values=values)
 
 
 def _torque_factor_cause(state: FittedModel) -> Cause:
@@ -172,79 +169,71 @@ def _torque_factor_cause(state: FittedModel) -> Cause:
 def _gain_error_cause(state: FittedModel, c: int) -> Cause:
     value, covariance = state.parameters_of_extension(f"gain {c}")
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
-    return Cause(
-        "gain",
+    text = (
         f"{CHANNEL_NAMES[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
-        " channels allow; calibrate the sensor",
-        values={"channel": CHANNEL_NAMES[c], "gain": 1.0 + float(value[0])},
+        " channels allow; calibrate the sensor"
     )
+    return Cause("gain", text, values={"channel": CHANNEL_NAMES[c], "gain": 1.0 + float(value[0])})
 
 
 def _pose_frame_cause(state: FittedModel) -> Cause:
     r, covariance = state.parameters_of_extension("frame")
     wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
-    return Cause(
-        "pose frame",
+    text = (
         f"the pose is that of a point at {_format_vector(-1e3 * r, 'mm in S')}"
-        f" (+- {wide.max():.2g} mm), not of the sensor",
-        values={"position_in_sensor": (-r).tolist()},
+        f" (+- {wide.max():.2g} mm), not of the sensor"
     )
+    return Cause("pose frame", text, values={"position_in_sensor": (-r).tolist()})
 
 
 def _sensor_rotation_cause(state: FittedModel) -> Cause:
     rho, covariance = state.parameters_of_extension("rotation")
     angle = float(np.degrees(np.linalg.norm(rho)))
     wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
-    return Cause(
-        "sensor rotation",
+    text = (
         f"the sensor is rotated by {angle:.2f} deg (+- {1.96 * wide:.2g}) against the motion, about"
-        f" {_format_vector(rho / (np.linalg.norm(rho) + 1e-12), 'in S', '.2f')}",
-        values={"rotation_vector": rho.tolist()},
+        f" {_format_vector(rho / (np.linalg.norm(rho) + 1e-12), 'in S', '.2f')}"
     )
+    return Cause("sensor rotation", text, values={"rotation_vector": rho.tolist()})
 
 
 def _drift_cause(state: FittedModel) -> Cause:
     size = 2.0 * candidates.drift_amplitudes(state)
-    return Cause(
-        "drift",
+    text = (
         f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m within the"
-        " record; the stated offsets are their means: let the sensor warm up",
-        values={"range": size.tolist()},
+        " record; the stated offsets are their means: let the sensor warm up"
     )
+    return Cause("drift", text, values={"range": size.tolist()})
 
 
 def _cable_cause(state: FittedModel) -> Cause:
     stiffness = candidates.max_cable_stiffness_n_m(state)
-    return Cause(
-        "cable",
+    text = (
         f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"
-        " probably of a cable or hose; guide it so that it is slack",
-        values={"stiffness": stiffness},
+        " probably of a cable or hose; guide it so that it is slack"
     )
+    return Cause("cable", text, values={"stiffness": stiffness})
 
 
 def _offset_or_load_step_cause(state: FittedModel, i: int) -> Cause:
     step, (values, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     if step.kind == "offsets":
-        return Cause(
-            "zero change",
+        text = (
             f"{when} the sensor has another zero: {_format_vector(values[:3], 'N')},"
             f" {_format_vector(values[3:], 'N m')} are added (a tare in the record); the stated"
-            " offsets are those before it",
-            start_s=step.time,
-            values={"change": values.tolist()},
+            " offsets are those before it"
         )
+        return Cause("zero change", text, start_s=step.time, values={"change": values.tolist()})
     mass, com = float(values[0]), mass_com_inertia(values)[1] if values[0] else np.zeros(3)
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     what = "added" if mass > 0.0 else "removed"
-    return Cause(
-        "load change",
+    text = (
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_format_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each part",
-        start_s=step.time,
-        values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
+        f" {_format_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each part"
     )
+    change = {"mass_change": mass, "com_of_change": np.asarray(com).tolist()}
+    return Cause("load change", text, start_s=step.time, values=change)
 
 
 def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:

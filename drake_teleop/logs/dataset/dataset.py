@@ -16,15 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    replace_file_on_success,
-    to_json_data,
-    write_json,
-    write_text,
-)
+from drake_teleop.common.files import replace_file_on_success
 from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import show_progress
@@ -96,16 +90,15 @@ def dataset_command(
         jobs: number of processes as in joblib.
     """
     if (load is None) != identify:
-        raise DrakeTeleopError(
-            "exactly one of --load and --identify is required", where="dataset", remedy="give one"
-        )
+        what = "exactly one of --load and --identify is required"
+        raise DrakeTeleopError(what, where="dataset", remedy="give one")
     known = None if load is None else Identification.load(load)
     dataset, copied = dataset_files.open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
         what = "the output folder is in the dataset, which must not change"
         raise DrakeTeleopError(what, where=str(out), remedy="give another --out")
-    make_folder(out)
-    with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
+    files.make_folder(out)
+    with files.output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
         streams = _described_or_drafted_streams(dataset, description)
         work = _open_work_folder(out, dataset, [str(load), known, streams])
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
@@ -114,13 +107,13 @@ def dataset_command(
         judged = [np.load(work / f"{k}.npy", allow_pickle=False) for k in range(len(rows))]
         columns = [ContactColumns(x[:, :6], x[:, 6] > 0.5) for x in judged]
         dataset_files.write_copy(dataset, copied, columns)
-        write_text(out / "description.yaml", to_yaml_text(streams))
+        files.write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
-        summary = to_json_data(_dataset_summary(dataset, copied, shared, rows))
+        summary = files.to_json_data(_dataset_summary(dataset, copied, shared, rows))
         page = render_page("drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary)
-        write_text(out / "report.html", page)
+        files.write_text(out / "report.html", page)
         shutil.rmtree(work)
-        write_json(out / "summary.json", summary)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         _print_summary(summary, out)
     return summary
@@ -131,9 +124,8 @@ def _described_or_drafted_streams(dataset: Dataset, description: Path | None) ->
         return _draft_streams_by_majority(dataset)
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
-        raise DrakeTeleopError(
-            "describes no wrench", where=str(description), remedy="see docs/log-description.md"
-        )
+        what = "describes no wrench"
+        raise DrakeTeleopError(what, where=str(description), remedy="see docs/log-description.md")
     for name in _STREAM_NAMES:
         if isinstance(data.get(name), dict):
             data[name].pop("file", None)
@@ -236,9 +228,8 @@ def _read_log_and_row_times(
     source = f"{episode.file.name}: {episode.name}"
     log = read_described_log(described, source, tables={episode.file: table}, differentiate=False)
     if log.posed is None and log.R_WS is None:
-        raise DrakeTeleopError(
-            "the episode has no orientation", where=source, remedy="describe pose.orientation"
-        )
+        what = "the episode has no orientation"
+        raise DrakeTeleopError(what, where=source, remedy="describe pose.orientation")
     assert described.wrench is not None
     clock = read_clock(described.wrench.time, table, described.wrench.columns, source)
     at = np.interp(np.arange(clock.num_rows), clock.kept_rows, clock.t - clock.t[0])
@@ -246,14 +237,14 @@ def _read_log_and_row_times(
 
 
 def _open_work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
-    files = sorted({episode.file for episode in dataset.episodes})
-    states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    paths = sorted({episode.file for episode in dataset.episodes})
+    states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in paths]
     key = hashlib.sha256(repr((settings, states)).encode()).hexdigest()
     work = out / _WORK_FOLDER_NAME
     if work.is_dir() and (work / "key").is_file() and (work / "key").read_text() != key:
         shutil.rmtree(work)
-    make_folder(work)
-    write_text(work / "key", key)
+    files.make_folder(work)
+    files.write_text(work / "key", key)
     return work
 
 
@@ -304,7 +295,7 @@ def _judge_episode(task: SharedJudgingData, work: Path, number: int) -> None:
         row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
     with replace_file_on_success(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, np.column_stack(columns))
-    write_json(work / f"{number}.json", {"episode": episode.name} | row)
+    files.write_json(work / f"{number}.json", {"episode": episode.name} | row)
 
 
 def _verdict_on_episode(

@@ -99,12 +99,11 @@ def open_dataset(path: Path) -> Dataset:
             episodes = [Episode(str(p.relative_to(path)), p, 0, 0) for p in files]
             found = Dataset(path, "tables", episodes, float("nan"))
     if not found.episodes:
-        raise DrakeTeleopError(
-            "contains no episodes",
-            where=str(path),
-            remedy="give a LeRobot folder, a robomimic .hdf5, a .zarr, or a folder of .csv or"
-            " .parquet files, one for each episode",
+        remedy = (
+            "give a LeRobot folder, a robomimic .hdf5, a .zarr, or a folder of .csv or"
+            " .parquet files, one for each episode"
         )
+        raise DrakeTeleopError("contains no episodes", where=str(path), remedy=remedy)
     return found
 
 

@@ -66,17 +66,12 @@ class ImuSplineRows:
     def pose_noise_shares_left_by_imu(self, frequency: Array) -> tuple[Array, Array]:
         """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
-        left = []
-        for pose, own, order, rows in zip(
-            self.pose_noise_powers,
-            self.imu_noise_powers,
-            (4, 2),
-            (self.acceleration_W, self.quaternion_rate),
-            strict=True,
-        ):
-            ratio = 0.0 if rows is None else pose / own
-            left.append(1.0 / (1.0 + ratio * w**order))
-        return left[0], left[1]
+        powers = zip(self.pose_noise_powers, self.imu_noise_powers, strict=True)
+        without = self.acceleration_W is None, self.quaternion_rate is None
+        position, rotation = (
+            0.0 if x else a / b for (a, b), x in zip(powers, without, strict=True)
+        )
+        return 1.0 / (1.0 + position * w**4), 1.0 / (1.0 + rotation * w**2)
 
 
 class PoseSplines:
@@ -115,14 +110,10 @@ class PoseSplines:
             return BSpline(knots, solveh_banded(gram, right), SPLINE_DEGREE)
         columns, shifted_t = [], imu_rows.t - self._start
         inside = (shifted_t >= knots[0]) & (shifted_t <= knots[-1])
-        for part, order, rows, pose, own in zip(
-            (slice(0, 3), slice(3, 7)),
-            (2, 1),
-            (imu_rows.acceleration_W, imu_rows.quaternion_rate),
-            imu_rows.pose_noise_powers,
-            imu_rows.imu_noise_powers,
-            strict=True,
-        ):
+        powers = zip(imu_rows.pose_noise_powers, imu_rows.imu_noise_powers, strict=True)
+        position = slice(0, 3), 2, imu_rows.acceleration_W
+        rotation = slice(3, 7), 1, imu_rows.quaternion_rate
+        for (part, order, rows), (pose, own) in zip((position, rotation), powers, strict=True):
             band, side = gram, right[:, part]
             if rows is not None:
                 weight = pose * self.rate / (own * imu_rows.rate)

@@ -164,12 +164,11 @@ def remove_delay(log: Log, delay_s: float) -> Log:
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
     if known.sum() < _MIN_SAMPLES_AFTER_DELAY:
-        raise DrakeTeleopError(
+        what = (
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples"
-            f" ({_MIN_SAMPLES_AFTER_DELAY} are required)",
-            where=log.source,
-            remedy="give a shorter delay, or `auto`",
+            f" ({_MIN_SAMPLES_AFTER_DELAY} are required)"
         )
+        raise DrakeTeleopError(what, where=log.source, remedy="give a shorter delay, or `auto`")
     motion = (resample(at[known], log.t, x) for x in log.motion)
     gravity, R_WS = (
         None if x is None else resample(at[known], log.t, x) for x in (log.gravity, log.R_WS)

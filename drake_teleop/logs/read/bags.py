@@ -136,11 +136,8 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dic
 
 
 def missing_topic_error(path: Path) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        "is a bag, and no topic is specified",
-        where=str(path),
-        remedy="describe it, with `topic` in each stream; `drake-teleop inspect` drafts that",
-    )
+    remedy = "describe it, with `topic` in each stream; `drake-teleop inspect` drafts that"
+    return DrakeTeleopError("is a bag, and no topic is specified", where=str(path), remedy=remedy)
 
 
 @contextmanager

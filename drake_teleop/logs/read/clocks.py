@@ -240,12 +240,11 @@ def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
     if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"
-    raise DrakeTeleopError(
+    what = (
         f"the median step of the time stamps is {step:.3g} s ({1 / MAX_RATE_HZ:g} to"
-        f" {1 / MIN_RATE_HZ:g} s are plausible), a rate of {1 / step:.3g} Hz",
-        where=f"{where}.unit",
-        remedy=remedy,
+        f" {1 / MIN_RATE_HZ:g} s are plausible), a rate of {1 / step:.3g} Hz"
     )
+    raise DrakeTeleopError(what, where=f"{where}.unit", remedy=remedy)
 
 
 def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:

@@ -23,26 +23,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
-from drake_teleop.logs.read.description_fields import (
-    SI_VALUE_OF_UNIT,
-    STANDARD_GRAVITY,
-    Acceleration,
-    AngularAcceleration,
-    AngularVelocity,
-    Column,
-    Force,
-    Frame,
-    GainStd,
-    Gravity,
-    ImuFrame,
-    Number,
-    Position,
-    PositionOrAuto,
-    RotationOrAuto,
-    StrictModel,
-    Torque,
-    Weight,
-)
+from drake_teleop.logs.read import description_fields as fields
+from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY, Column, Number, StrictModel
 
 _MAX_GRAVITY_M_S2 = 100.0
 
@@ -168,12 +150,12 @@ class Wrench(_RecordedStream):
 
     _quantities_of_topic = ("force", "torque")
 
-    force: Force
-    torque: Torque
+    force: fields.Force
+    torque: fields.Torque
     sign: Literal[1, -1] = 1
-    frame: Frame = "sensor"
-    weight: Weight = None
-    gain_std: GainStd = 0.0
+    frame: fields.Frame = "sensor"
+    weight: fields.Weight = None
+    gain_std: fields.GainStd = 0.0
 
 
 class Imu(_RecordedStream):
@@ -181,14 +163,14 @@ class Imu(_RecordedStream):
 
     _quantities_of_topic = ("specific_force", "angular_velocity")
 
-    specific_force: Acceleration | None = None
-    angular_velocity: AngularVelocity | None = None
-    angular_acceleration: AngularAcceleration | None = None
+    specific_force: fields.Acceleration | None = None
+    angular_velocity: fields.AngularVelocity | None = None
+    angular_acceleration: fields.AngularAcceleration | None = None
     sign: Literal[1, -1] = Field(
         default=1, description="sign of the specific force; -1 if the file has g - a"
     )
-    frame: ImuFrame = Field(default="sensor", description="axes of the IMU; auto: estimated")
-    position: PositionOrAuto = Field(
+    frame: fields.ImuFrame = Field(default="sensor", description="axes of the IMU; auto: estimated")
+    position: fields.PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: estimated"
     )
 
@@ -213,13 +195,13 @@ class Pose(_RecordedStream):
     _quantities_of_topic = ("orientation", "position")
 
     orientation: Orientation
-    position: Position | None = None
-    frame: Frame = "sensor"
-    position_in_sensor: PositionOrAuto = Field(
+    position: fields.Position | None = None
+    frame: fields.Frame = "sensor"
+    position_in_sensor: fields.PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0),
         description="origin of the posed frame in S, p_SoPo_S, m; auto: estimated",
     )
-    rotation_in_sensor: RotationOrAuto = Field(
+    rotation_in_sensor: fields.RotationOrAuto = Field(
         default=None,
         description="rotation R_SP from the posed frame to S, as in frame; auto: estimated",
     )
@@ -253,17 +235,17 @@ class Pose(_RecordedStream):
 class Static(_Stream):
     """Wrenches averaged over separate poses at rest, one pose per row."""
 
-    force: Force
-    torque: Torque
+    force: fields.Force
+    torque: fields.Torque
     sign: Literal[1, -1] = 1
-    frame: Frame = "sensor"
-    weight: Weight = None
-    gravity: Acceleration | None = Field(default=None, description="gravity in S")
-    specific_force: Acceleration | None = Field(
+    frame: fields.Frame = "sensor"
+    weight: fields.Weight = None
+    gravity: fields.Acceleration | None = Field(default=None, description="gravity in S")
+    specific_force: fields.Acceleration | None = Field(
         default=None, description="what an accelerometer reads at rest, -g_S, in S"
     )
     orientation: Orientation | None = None
-    gain_std: GainStd = 0.0
+    gain_std: fields.GainStd = 0.0
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Static:
@@ -280,7 +262,7 @@ class Static(_Stream):
 class Description(StrictModel):
     """Description of a log: a wrench with imu, pose or both; or static poses."""
 
-    gravity: Gravity = (0.0, 0.0, -STANDARD_GRAVITY)
+    gravity: fields.Gravity = (0.0, 0.0, -STANDARD_GRAVITY)
     wrench: Wrench | None = None
     imu: Imu | None = None
     pose: Pose | None = None
@@ -340,7 +322,9 @@ class Description(StrictModel):
 
     def unit_in_si(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
-        return float(np.linalg.norm(self.gravity_W)) if unit == "g" else SI_VALUE_OF_UNIT[unit]
+        return (
+            float(np.linalg.norm(self.gravity_W)) if unit == "g" else fields.SI_VALUE_OF_UNIT[unit]
+        )
 
 
 def load_description(path: str | Path) -> Description:

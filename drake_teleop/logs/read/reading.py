@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
-from drake_teleop.logs.read import alignment, auto_frames, table_files
+from drake_teleop.logs.read import alignment, auto_frames, streams, table_files
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angular_motion, resample
 from drake_teleop.logs.read.auto_frames import restore_removed_weight
 from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
@@ -30,17 +30,7 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.streams import (
-    MAX_PLAUSIBLE_VALUES,
-    MIN_STREAM_SAMPLES,
-    OrientationColumns,
-    Stream,
-    resample_to_clock,
-    rotate_world_to_S,
-    rotate_wrench_world_to_S,
-    specific_force_at_So,
-    uniform_times_of_streams,
-)
+from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES, OrientationColumns, Stream
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
@@ -137,8 +127,8 @@ class _LogReader:
             pose = self._read_pose(self._description.pose, differentiate=differentiate)
         if self._description.imu is not None:
             imu = self._read_imu(self._description.imu, pose)
-        streams = [stream for stream in (imu, pose) if stream is not None]
-        t = uniform_times_of_streams(clock.t, streams, self._source)
+        kinematics = [stream for stream in (imu, pose) if stream is not None]
+        t = streams.uniform_times_of_streams(clock.t, kinematics, self._source)
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
         posed, gain_std = None, self._description.wrench.gain_std
@@ -193,7 +183,7 @@ class _LogReader:
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_magnitude(values, *MAX_PLAUSIBLE_VALUES[field], where, remedy)
+        table.check_magnitude(values, *streams.MAX_PLAUSIBLE_VALUES[field], where, remedy)
         return values
 
     def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -214,7 +204,7 @@ class _LogReader:
         if position is not None:
             position = resample(t, clock.t, position)
             acceleration = alignment.smooth_derivatives(position, dt, self._bandwidth_hz)[2]
-        s = rotate_world_to_S(R_WS, acceleration - self._description.gravity_W)
+        s = streams.rotate_world_to_S(R_WS, acceleration - self._description.gravity_W)
         return Stream("pose", t, s, *angular_motion(R_WS, dt, self._bandwidth_hz), R_WS, raw)
 
     def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
@@ -262,7 +252,7 @@ class _LogReader:
             alpha = alignment.smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
+            s = streams.specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
         outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
@@ -275,7 +265,7 @@ class _LogReader:
             return vectors
         if pose is None or pose.R_WS is None:
             raise self._no_R_WS_error("imu")
-        return rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+        return streams.rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
     def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
@@ -300,7 +290,7 @@ class _LogReader:
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
                 raise self._no_R_WS_error("static", remedy)
-            wrench = rotate_wrench_world_to_S(R_SW, wrench)
+            wrench = streams.rotate_wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + auto_frames.wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
@@ -364,17 +354,17 @@ class _LogReader:
         def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
                 if stream is not None and (values := getattr(stream, field)) is not None:
-                    return resample_to_clock(t, stream, values)
+                    return streams.resample_to_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
         gravity = R_WS = None
         described, described_pose = self._description.wrench, self._description.pose
         in_base = described is not None and described.frame == "base"
         if pose is not None and pose.R_WS is not None:
-            R_WS = nearest_rotation(resample_to_clock(t, pose, pose.R_WS))
+            R_WS = nearest_rotation(streams.resample_to_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             if in_base:
-                wrench = rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = streams.rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
             raise self._no_R_WS_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None

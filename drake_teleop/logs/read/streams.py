@@ -8,15 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common import rotations
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import (
-    NUM_COLUMNS_OF_ROTATION_FORM,
-    nearest_rotation,
-    orthogonality_error,
-    quaternions_from_matrices,
-    rotation_matrices,
-)
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.read.alignment import low_pass, mean_time_step, resample, uniform_times
 from drake_teleop.logs.read.description import Description, Orientation
@@ -97,7 +91,7 @@ class OrientationColumns:
         self, description: Description, described: Orientation, table: Table, rows: int, where: str
     ) -> None:
         self._orientation, self._table, self._where = described, table, where
-        width = NUM_COLUMNS_OF_ROTATION_FORM[described.form]
+        width = rotations.NUM_COLUMNS_OF_ROTATION_FORM[described.form]
         self._columns = table.finite_numbers(described.columns, width, f"{where}.columns", rows)
         if described.form in ("rotation_vector", "euler"):
             self._columns *= description.unit_in_si(described.unit)
@@ -109,14 +103,14 @@ class OrientationColumns:
     def rotations(self, rows: NDArray[np.intp]) -> Array:
         """Return R_WS or R_WP (n, 3, 3) of n rows; raise an error if these are no rotations."""
         orientation = self._orientation
-        R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
-        self._check_rotation_errors(orthogonality_error(R), rows)
-        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
+        R = rotations.rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
+        self._check_rotation_errors(rotations.orthogonality_error(R), rows)
+        return rotations.nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
         """Return R_WS or R_WP of n rows as quaternions (n, 4) [w, x, y, z]."""
         if not self._orientation.form.startswith("quaternion"):
-            return quaternions_from_matrices(self.rotations(rows))
+            return rotations.quaternions_from_matrices(self.rotations(rows))
         q = self._columns[rows]
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
