@@ -83,10 +83,7 @@ def _fit_with_fallback_delay(
 
 
 def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log without delay, with motion from splines of the poses, and edge flags (N,).
-
-    A flag is True within two knot distances of an end or gap of the poses.
-    """
+    """Return the log without delay with motion of splines, and flags (N,) near ends and gaps."""
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W

@@ -238,10 +238,7 @@ def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, 
 
 
 def robust_offsets(residual: Array) -> tuple[Array, float]:
-    """Return sensor offsets (6,) and the share of samples that agree on them, Eq. (T12).
-
-    `residual` (N, 6) is the wrench without that of the load [N, N m].
-    """
+    """Return offsets (6,) of a residual (N, 6), and the share of samples that agree, Eq. (T12)."""
     offsets = narrowest_half_width_and_centre(residual)[1]
     agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):

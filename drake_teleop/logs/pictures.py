@@ -110,10 +110,7 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
 
 
 def amplitude_spectral_densities(x: Array, dt: float) -> tuple[Array, Array]:
-    """Return frequencies (m,) [Hz] and one-sided amplitude spectral densities (m, k) of x (N, k).
-
-    Welch's method. The densities are in unit of x / sqrt(Hz). Frequency 0 is omitted.
-    """
+    """Return frequencies (m,) [Hz] and densities (m, k) [1/sqrt(Hz)] of x (N, k), by Welch."""
     from scipy.signal import welch
 
     length = min(len(x), max(16, len(x) // 8), _MAX_WELCH_WINDOW_SAMPLES)

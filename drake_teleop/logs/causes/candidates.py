@@ -63,10 +63,7 @@ class Candidate:
 
 
 def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candidate]:
-    """Fit a model with each further extension, and yield those with sufficient effect.
-
-    Axis permutations and a rotated sensor are tried in the first round of the search only.
-    """
+    """Fit a model with each further extension, and yield those with sufficient effect."""
     model, data = state.model, state.data
     if is_first_round:
         yield from _axis_permutation_candidates(state)
@@ -273,10 +270,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
 
 
 def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
-    """Return fits with a similar torque unit that explain the record nearly as well.
-
-    Such units are within a factor of 2 of the found one; none without a torque factor.
-    """
+    """Return fits with other torque units, within a factor of 2, that are nearly as likely."""
     factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:

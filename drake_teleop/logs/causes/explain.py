@@ -73,10 +73,7 @@ SearchResult = tuple[FittedModel, float, list[Candidate]]
 def search_causes(
     data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
-    """Return the fitted model that explains a record, additional delay [s], and rejected causes.
-
-    Arguments are as for `explain_misfit`.
-    """
+    """Return the fitted model that explains a record, additional delay [s], and rejected causes."""
     plain = Model(extensions=always_fitted)
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
     if has_negative_mass(found[0]):

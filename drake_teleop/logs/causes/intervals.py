@@ -45,10 +45,7 @@ def load_covariance(
 def load_deviations_if_unexplained(
     state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause.
-
-    Those of the jackknife are widened by smooth misfit, rejected causes and gain errors.
-    """
+    """Return jackknife deviations (16,) of [offsets; phi], widened for an unexplained misfit."""
     least = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
     if state.residual_ratio > _LARGE_RESIDUAL_RATIO:
         least = _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
@@ -74,10 +71,7 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
 
 
 def load_covariance_by_gain_errors(state: FittedModel) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains.
-
-    It is 0 unless gain errors of a plausible size explain most of the misfit.
-    """
+    """Return the covariance (16, 16) of [offsets; phi] by errors of all gains; 0 if implausible."""
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
     unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)

@@ -347,11 +347,7 @@ class Motion(NamedTuple):
 
 
 class EpisodeSignals:
-    """Wrench of one episode and its motion.
-
-    Args:
-        log: with orientation; not low-passed.
-    """
+    """Wrench and motion of an episode, whose log has an orientation and is not low-passed."""
 
     def __init__(self, log: Log) -> None:
         self.log = log
@@ -388,10 +384,7 @@ class EpisodeSignals:
         return regressor(*self.motion_at_lag(lag)[:3])
 
     def measured_and_load_wrench(self, phi: Array, kind: str, lag: float) -> tuple[Array, Array]:
-        """Return the measured wrench (N, 6) in the axes of S, and that of load phi (10,).
-
-        `kind` is one of `HYPOTHESIS_KINDS`, `lag` the delay of the motion [frames].
-        """
+        """Return the wrench (N, 6) in the axes of S, and that of load phi at a lag [frames]."""
         at, wrench = self.motion_at_lag(lag), self.log.wrench
         s = at.s + at.gravity if kind == "weight removed" else at.s
         if kind == "base":

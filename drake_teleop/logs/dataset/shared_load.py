@@ -58,10 +58,7 @@ class SharedLoad:
 
 
 def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
-    """Return the load of a dataset from some of its episodes, or the given load.
-
-    Episodes with another load or wrong axes, and contact, have no influence if they are few.
-    """
+    """Return the load that most episodes of a dataset share, or the given load."""
     episodes = [EpisodeSignals(log) for log in logs]
     own = [fit_own_load_of_episode(signals) for signals in episodes]
     if load is None:

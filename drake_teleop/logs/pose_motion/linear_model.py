@@ -304,10 +304,7 @@ def delay_std(spectra: Spectra) -> float:
 def guess_knot_spacing_and_delay(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return knot distance [s] and delay [s] of highest likelihood on a coarse grid.
-
-    The delay is not changed if `known`.
-    """
+    """Return likeliest knot distance and delay [s] on a coarse grid; keep the delay if `known`."""
     spacings, found = _knot_spacings_for_pose_rate(cache)[::2], []
     start = window.spectra_at_delay(cache.splines_with_spacing(spacings[0]), delay)
     for h in spacings:
