@@ -87,10 +87,7 @@ class RigidFit:
 
 
 def motion_transformation_matrix(R: Array, r: Array) -> Array:
-    """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79), for R = R_PS, r = p_PoSo [m].
-
-    It maps motion signals zeta (16) of pose frame P, and the wrench F, to the sensor frame S.
-    """
+    """Return the matrix M (19, 22) of z = M [zeta; F], Eq. (T79), for R = R_PS, r = p_PoSo [m]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
@@ -106,10 +103,7 @@ _OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
-    """Return the coefficients (6, 16) of a load phi (10,) in the linear model, Eq. (T73).
-
-    `removed_weight` [m, m c] (4,) is the load whose weight the robot removed from the wrench.
-    """
+    """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without `removed_weight` (4,)."""
     C = _coefficients_without_removed_weight(phi)
     if removed_weight is not None:
         weight = _coefficients_without_removed_weight(np.concatenate([removed_weight, np.zeros(6)]))
