@@ -118,10 +118,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
-        "threshold": None,
-        "contacts": None,
-        "in_contact": None,
-        "causal": None,
+        **dict.fromkeys(("threshold", "contacts", "in_contact", "causal")),
     }
     if found.detection is not None:
         figures["threshold"] = found.detection.threshold

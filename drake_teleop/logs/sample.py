@@ -101,10 +101,7 @@ def _description_of_record(name: str) -> dict[str, Any]:
 
 
 def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict[str, Any]:
-    """Write records, descriptions, truth.json and summary.json into `out`; return the summary.
-
-    The same seed of the noise gives identical files.
-    """
+    """Write records, descriptions, truth.json and summary.json, equal for equal seeds, to `out`."""
     random = np.random.default_rng(seed)
     records = {"free": ((), "in free motion"), "touched": (FINGERTIP_PUSHES, "touched three times")}
     files = []
@@ -115,10 +112,9 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             write_text(out / f"{name}.yaml", text)
             _write_record(out, name, row, touches, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
+        load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
         truth = {
-            "mass": TRUE_MASS_KG,
-            "com": TRUE_COM_S,
-            "inertia_com": TRUE_INERTIA_COM,
+            **load,
             "phi": TRUE_PHI,
             "offsets": TRUE_OFFSETS[0],
             "offsets_touched": TRUE_OFFSETS[1],
@@ -175,12 +171,10 @@ def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
 def _random_motion(
     random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
 ) -> Callable[[Array], _Motion]:
-    """Return `sensor_motion` of a random motion between two rests, as a function of times [s].
-
-    `scale` multiplies the amplitudes of the joints.
-    """
-    size = 2, 6, harmonics - 1
-    sine, cosine = random.normal(size=size) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
+    """Return `sensor_motion` between two rests over times [s]; `scale` is that of joint angles."""
+    sine, cosine = (
+        random.normal(size=(2, 6, harmonics - 1)) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
+    )
     path = FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period_s)
     return lambda t: sensor_motion(*path.evaluate(np.clip(t - rest_s, 0, period_s)))
 

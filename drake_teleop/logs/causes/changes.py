@@ -24,10 +24,8 @@ _MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
 _STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
 MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
-_NUM_TRIED_STEP_TIMES = 2
-_MIN_STEP_OVER_DEVIATION = 5.0
-_MIN_OFFSET_STEP_OVER_NOISE, _MIN_MASS_STEP_OVER_MASS = 2.0, 0.01
-_MIN_MOMENT_STEP_OVER_MASS_M = 0.002
+_NUM_TRIED_STEP_TIMES, _MIN_STEP_OVER_DEVIATION, _MIN_OFFSET_STEP_OVER_NOISE = 2, 5.0, 2.0
+_MIN_MASS_STEP_OVER_MASS, _MIN_MOMENT_STEP_OVER_MASS_M = 0.01, 0.002
 
 
 def add_step(state: FittedModel, kind: str) -> FittedModel | None:
@@ -372,10 +370,8 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
         if not ends or all(state.model.steps[k].kind == "load" for k in ends):
             continue
         kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
-        model = replace(state.model, steps=kept)
-        x = model.start_parameters(state.x, Model())
-        dt = state.data.dt
-        span = (start - dt, stop + dt)
+        model, dt = replace(state.model, steps=kept), state.data.dt
+        x, span = model.start_parameters(state.x, Model()), (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
             return FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:

@@ -20,23 +20,16 @@ from scipy.interpolate import CubicSpline
 from drake_teleop.common.numeric import Array, position_of_parabola_minimum
 
 MAX_NOISE_LAG = 4  # order of the autoregressive noise
-CONSTANT_COLUMN = 0
-SPECIFIC_FORCE_SIGNALS = slice(1, 4)
-GRAVITY_SIGNALS = slice(4, 7)
-ALPHA_SIGNALS = slice(7, 10)
-OMEGA_PRODUCTS = slice(10, 16)
-WRENCH_SIGNALS = slice(16, 22)
-WRENCH_RATE_SIGNALS = slice(22, 28)
-ROTATION_SIGNALS = slice(28, 37)
-ROTATION_POSITION_PRODUCTS = slice(37, 64)
-TIME_POLYNOMIALS = slice(64, 67)
-NUM_SIGNALS = 67
+CONSTANT_COLUMN, SPECIFIC_FORCE_SIGNALS, GRAVITY_SIGNALS = 0, slice(1, 4), slice(4, 7)
+ALPHA_SIGNALS, OMEGA_PRODUCTS = slice(7, 10), slice(10, 16)
+WRENCH_SIGNALS, WRENCH_RATE_SIGNALS = slice(16, 22), slice(22, 28)
+ROTATION_SIGNALS, ROTATION_POSITION_PRODUCTS = slice(28, 37), slice(37, 64)
+TIME_POLYNOMIALS, NUM_SIGNALS = slice(64, 67), 67
 COLUMNS_REPEATED_BY_STEP = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _INSTANT_RATE_HZ, _MAX_INSTANTS = 50.0, 20_000
 _BLOCK_LENGTH_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
-_MAX_EXACTLY_AVERAGED_SAMPLES = 5
-_MIN_ACCELERATION_OVER_NOISE = 4.0
+_MAX_EXACTLY_AVERAGED_SAMPLES, _MIN_ACCELERATION_OVER_NOISE = 5, 4.0
 _MAX_ALPHA_NOISE_SHARE = 1.0 / 64.0
 _ALPHA_SMOOTHING_WIDTHS_ROWS = (5, 9, 15, 25)  # windows for a noisy angular acceleration [rows]
 _MIN_WRENCH_NOISE_OVER_SPREAD = 1e-4  # smallest noise of a sensor, as a share of the wrench

@@ -21,8 +21,7 @@ GOOD_SMOOTH_MISFIT, _WIDENING_BY_MISFIT = 1.35, 3.0
 """Largest smooth misfit of good records; growth of the deviations above it."""
 _MIN_WIDENING_SCORE, _FULLY_WIDENING_SCORE, _FULLY_WIDENING_RESIDUAL_SHARE = 6.0, 15.0, 0.5
 _CABLE_WIDENING_FACTOR, _LARGE_RESIDUAL_RATIO = 1.5, 20.0
-_MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL = 2.2
-_MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL = 6.0
+_MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL, _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL = 2.2, 6.0
 _CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
 _TRIED_SENSOR_GAIN_STDS = np.geomspace(1e-4, 0.1, 31)
 _MIN_LIKELIHOOD_RISE_BY_GAINS, _MIN_SHARE_EXPLAINED_BY_GAINS = 20.0, 0.5
@@ -46,10 +45,9 @@ def load_deviations_if_unexplained(
     state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi], widened for an unexplained misfit."""
-    least = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
-    if state.residual_ratio > _LARGE_RESIDUAL_RATIO:
-        least = _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
-    if state.smooth_misfit > least:
+    large = state.residual_ratio > _LARGE_RESIDUAL_RATIO
+    limits = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL, _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
+    if state.smooth_misfit > limits[large]:
         growth = 1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
         jackknife_std = jackknife_std * growth
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
@@ -60,8 +58,7 @@ def load_deviations_if_unexplained(
 def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
     squares = np.zeros(16)
     for candidate in rejected:
-        other = candidate.state
-        score = candidate.score
+        other, score = candidate.state, candidate.score
         share = min(1.0, score / _FULLY_WIDENING_SCORE) if score > _MIN_WIDENING_SCORE else 0.0
         if other.residual_ratio < _FULLY_WIDENING_RESIDUAL_SHARE * state.residual_ratio:
             share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts

@@ -22,15 +22,9 @@ from drake_teleop.logs.causes.instants import (
 
 OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter vector
 _NUM_EXTENSION_PARAMETERS = {
-    "gravity": 3,
-    "weight": 4,
-    "torque factor": 1,
-    "frame": 3,
-    "rotation": 3,
-    "linear drift": 6,
-    "drift": 18,
-    "cable": 12,
-}
+    "gravity": 3, "weight": 4, "torque factor": 1, "frame": 3, "rotation": 3,
+    "linear drift": 6, "drift": 18, "cable": 12,
+}  # fmt: skip
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _ROTATION_COLUMNS_OF_STEP = slice(16, 25)

@@ -37,11 +37,10 @@ VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
-_LOAD_FIT_CUTOFF_HZ = 15.0
 _FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
 """Findings with the sign; mirrored axes are a cause that `identify` names."""
 _CONTACT_FREE_SHARE = 0.75  # of a record with contact
-_MAX_FITTED_SAMPLES = 1500
+_LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
 
 
 @dataclass(frozen=True)
@@ -269,11 +268,8 @@ def undetermined_payload_finding(load: Identification, unexplained: float) -> Fi
         share = max(0.0, 100 * (1 - unexplained))
         fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit, which explains {share:.0f} % of"
         fitted += " the wrench's variance"
-    return Finding(
-        "payload",
-        f"payload not identifiable: {fitted}; record slow rotations about two horizontal axes,"
-        " without contact",
-    )
+    remedy = "record slow rotations about two horizontal axes, without contact"
+    return Finding("payload", f"payload not identifiable: {fitted}; {remedy}")
 
 
 def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[None, Description]]:

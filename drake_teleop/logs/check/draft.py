@@ -63,14 +63,9 @@ _ROBOT_COLUMN_NOTES = {
 }
 _UNIT_OF_SPELLING = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g")},
-    "µs": "us",
-    "°": "deg",
-    "dps": "deg/s",
-    "°/s": "deg/s",
-    "m/s²": "m/s^2",
-    "n*m": "N m",
-    "n.m": "N m",
-}
+    "µs": "us", "°": "deg", "dps": "deg/s", "°/s": "deg/s", "m/s²": "m/s^2",
+    "n*m": "N m", "n.m": "N m",
+}  # fmt: skip
 _ALLOWED_UNITS = {
     "force": description_fields.FORCE_UNITS,
     "torque": description_fields.TORQUE_UNITS,
@@ -86,9 +81,8 @@ _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
-_FILL_IN_TEXT = "FILL IN"
+_FILL_IN_TEXT, _MIN_CLOCK_ROWS = "FILL IN", 20
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
-_MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
 _RAW_COUNTS_NOTE = (
     "Force and torque are raw counts. scale is the value of one count in N and N m, from the"

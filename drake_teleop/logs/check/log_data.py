@@ -149,10 +149,8 @@ def dead_or_repeated_channel_findings(
         numbers: dict[str, Array] = {}
         for column in quantity.columns:
             x = tables[described.source].numbers_with_nan(column, where).T
-            named_parts = (
-                [str(column)] if len(x) == 1 else [f"{column}[{i}]" for i in range(len(x))]
-            )
-            numbers |= zip(named_parts, x, strict=True)
+            parts = [f"{column}[{i}]" for i in range(len(x))] if len(x) > 1 else [str(column)]
+            numbers |= zip(parts, x, strict=True)
         twice = _repeated_column_findings(where, quantity.columns, named)
         found += twice or _dead_channel_findings(where, numbers)
         found += [] if twice else _equal_channel_findings(where, numbers)
@@ -166,13 +164,9 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
         named[column] = where
         if before is not None:
             both = "twice" if before == where else f"in {before}.columns too"
-            found.append(
-                Finding(
-                    "repeated channel",
-                    f"{where}.columns names {column!r} {both}: one number cannot be two channels;"
-                    f" set {where}.columns to three columns of their own",
-                )
-            )
+            text = f"{where}.columns names {column!r} {both}: one number cannot be two channels"
+            remedy = f"set {where}.columns to three columns of their own"
+            found.append(Finding("repeated channel", f"{text}; {remedy}"))
     return found
 
 
@@ -183,24 +177,17 @@ def _dead_channel_findings(where: str, numbers: dict[str, Array]) -> list[Findin
     dead = [name for name, width in spread.items() if width == 0.0]
     if not dead or not (alive & (noise > 0.0)).any():
         return []
-    return [
-        Finding(
-            "dead channel",
-            f"{name!r} is {numbers[name][0]:.4g} in all rows, and its neighbours are not: the"
-            f" channel is dead or not connected; name another column in {where}.columns, or record"
-            " again",
-        )
-        for name in dead
-    ]
+    text = "in all rows, and its neighbours are not: the channel is dead or not connected"
+    remedy = f"name another column in {where}.columns, or record again"
+    values = [f"{name!r} is {numbers[name][0]:.4g}" for name in dead]
+    return [Finding("dead channel", f"{value} {text}; {remedy}") for value in values]
 
 
 def _equal_channel_findings(where: str, numbers: dict[str, Array]) -> list[Finding]:
+    text = "are the same in all rows: one was recorded twice"
+    remedy = f"name another column in {where}.columns, or record again"
     return [
-        Finding(
-            "repeated channel",
-            f"{a!r} and {b!r} are the same in all rows: one was recorded twice; name another column"
-            f" in {where}.columns, or record again",
-        )
+        Finding("repeated channel", f"{a!r} and {b!r} {text}; {remedy}")
         for (a, x), (b, y) in combinations(numbers.items(), 2)
         if np.ptp(x) > 0.0 and np.array_equal(x, y)
     ]

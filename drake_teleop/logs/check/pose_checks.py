@@ -29,12 +29,9 @@ _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
 MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
-_CONFUSED_TORQUE_UNITS = ("N m", "N mm", "lbf in")
+_TORQUE_UNIT_VALUES = [SI_VALUE_OF_UNIT[unit] for unit in ("N m", "N mm", "lbf in")]
 _WRONG_TORQUE_UNIT_RATIOS = (
-    *(
-        SI_VALUE_OF_UNIT[a] / SI_VALUE_OF_UNIT[b]
-        for a, b in permutations(_CONFUSED_TORQUE_UNITS, 2)
-    ),
+    *(a / b for a, b in permutations(_TORQUE_UNIT_VALUES, 2)),
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""

@@ -64,11 +64,10 @@ class Dataset(NamedTuple):
         rows = slice(episode.first_row, episode.first_row + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
             if self.kind != "lerobot":
-                arrays = (
-                    read_hdf5(episode.file, group=episode.group)
-                    if self.kind == "hdf5"
-                    else read_zarr(episode.file / "data", rows=rows)
-                )
+                if self.kind == "hdf5":
+                    arrays = read_hdf5(episode.file, group=episode.group)
+                else:
+                    arrays = read_zarr(episode.file / "data", rows=rows)
                 return Table(episode.file, table_files.array_columns(arrays, None))
             frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first_row, episode.rows)
@@ -204,10 +203,8 @@ def _add_features_to_metadata(text: str) -> str:
     features = data.get("info", {}).get("features", {})
     lists = [x for x in features.values() if isinstance(x, dict) and "feature" in x]
     like: dict[str, Any] = copy.deepcopy(lists[0]) if lists else {"_type": "List"}
-    features[CONTACT_WRENCH_COLUMN] = like | {
-        "feature": {"dtype": "float32", "_type": "Value"},
-        "length": -1,
-    }
+    number = {"dtype": "float32", "_type": "Value"}
+    features[CONTACT_WRENCH_COLUMN] = like | {"feature": number, "length": -1}
     features[IN_CONTACT_COLUMN] = {"dtype": "bool", "_type": "Value"}
     return json.dumps(data)
 
@@ -234,10 +231,8 @@ def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
 
 
 def _arrays_of_columns(new: ContactColumns) -> list[tuple[str, NDArray]]:
-    return [
-        ("contact_wrench", new.contact_wrench.astype(np.float32)),
-        ("in_contact", new.in_contact.astype(bool)),
-    ]
+    wrench, flags = new.contact_wrench.astype(np.float32), new.in_contact.astype(bool)
+    return [("contact_wrench", wrench), ("in_contact", flags)]
 
 
 def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
@@ -266,11 +261,8 @@ def _write_zarr(out: Path, columns: Sequence[ContactColumns]) -> None:
 
 def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[ContactColumns]) -> None:
     info = json.loads((source / "info.json").read_text(encoding="utf-8"))
-    info["features"][CONTACT_WRENCH_COLUMN] = {
-        "dtype": "float32",
-        "shape": [6],
-        "names": list(WRENCH_COLUMNS),
-    }
+    wrench = {"dtype": "float32", "shape": [6], "names": list(WRENCH_COLUMNS)}
+    info["features"][CONTACT_WRENCH_COLUMN] = wrench
     info["features"][IN_CONTACT_COLUMN] = {"dtype": "bool", "shape": [1], "names": None}
     make_folder(target)
     write_text(target / "info.json", json.dumps(info, indent=4, ensure_ascii=False))

@@ -48,12 +48,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class ImuData:
-    """IMU data at the sensor origin So, in the axes of S, at times t (K,) [s].
-
-    Attributes:
-        specific_force: (K, 3) [m/s^2], or None.
-        angular_velocity: (K, 3) [rad/s], or None.
-    """
+    """IMU data (K, 3) at So, in S, at times t (K,) [s]; None for an absent sensor."""
 
     t: Array
     specific_force: Array | None

@@ -232,10 +232,7 @@ class NoiseLevels:
         return np.flatnonzero(np.diff(self.group_of_band, prepend=-1))
 
     def negative_log_likelihoods(self, power: Array) -> Array:
-        """Return each channel's negative log likelihood (..., 6), Eq. (T75).
-
-        `power` (..., bands, 6) are noise powers.
-        """
+        """Return negative log likelihoods (..., 6) of `power` (..., bands, 6), Eq. (T75)."""
         return np.asarray(self.half_dof_of_bands @ np.log(power))
 
 

@@ -190,10 +190,7 @@ class PoseSplines:
         return np.asarray(self._spline(at, order))
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
-        """Return the signals zeta (N, 16) of Eq. (T73) at times t (N,) [s], in the axes of P.
-
-        They are [1, acceleration, -gravity, alpha, products of omega].
-        """
+        """Return [1, a, -g, alpha, products of omega] (N, 16) at times t [s], in P, Eq. (T73)."""
         a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
         zeta = np.empty((len(t), NUM_MOTION_SIGNALS))
         zeta[:, 0] = 1.0

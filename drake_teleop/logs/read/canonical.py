@@ -35,16 +35,9 @@ _KINEMATIC_COLUMNS = {
 }
 _MAX_REST_SPEED_RAD_S = 0.05  # rad/s
 _MIN_TURN_BETWEEN_POSES_RAD = np.radians(10.0)
-_ROW_SHAPE_OF_FIELD: dict[str, tuple[int, ...]] = {
-    "t": (),
-    "wrench": (6,),
-    "specific_force": (3,),
-    "angular_velocity": (3,),
-    "angular_acceleration": (3,),
-    "gravity": (3,),
-    "bridged": (),
-    "R_WS": (3, 3),
-}
+_VECTOR_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration", "gravity")
+_ROW_SHAPE_OF_FIELD: dict[str, tuple[int, ...]] = {"t": (), "wrench": (6,)}
+_ROW_SHAPE_OF_FIELD |= dict.fromkeys(_VECTOR_FIELDS, (3,)) | {"bridged": (), "R_WS": (3, 3)}
 
 
 @dataclass(frozen=True, repr=False)

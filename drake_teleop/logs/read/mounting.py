@@ -188,10 +188,7 @@ class LeverArm:
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
-    """Return the position of the accelerometer, fitted with offsets, load and delay, Eq. (T21).
-
-    Return None for a poor fit (contact), or few samples outside of gaps.
-    """
+    """Return the accelerometer's position, Eq. (T21); None for a poor fit or few samples."""
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_pass_log(remove_delay(log, estimate_delay(log, None) or 0.0), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,81 +84,76 @@ def read_described_log(
     differentiate: bool = True,
 ) -> Log:
     """Return the log of a description with absolute paths, as `read_log`."""
-    return _LogReader(description, source, 30.0, tables).read_recording(differentiate=differentiate)
+    reader = _LogReader(description, source, 30.0, dict(tables or {}))
+    return reader.read_recording(differentiate=differentiate)
 
 
+@dataclass
 class _LogReader:
-    def __init__(
-        self,
-        description: Description,
-        source: str,
-        bandwidth_hz: float | None,
-        tables: dict[Path, Table] | None = None,
-    ) -> None:
-        self._description = description
-        self._source = source
-        self._bandwidth_hz = bandwidth_hz
-        self._notes: list[str] = []
-        self._gaps: list[Array] = []
-        self._one_sided_s = 0.0
-        self._tables = dict(tables or {})
+    description: Description
+    source: str
+    bandwidth_hz: float | None
+    tables: dict[Path, Table] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    gaps: list[Array] = field(default_factory=list)
+    one_sided_s: float = 0.0
 
     def read_recording(self, *, keep_time_origin: bool = False, differentiate: bool = True) -> Log:
-        if self._description.static is not None:
+        if self.description.static is not None:
             if keep_time_origin:
-                self._notes.append("each row is interpreted as a pose at rest")
-            return self._read_static_poses(self._description.static)
-        assert self._description.wrench is not None
-        weight = self._description.wrench.weight
-        causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
+                self.notes.append("each row is interpreted as a pose at rest")
+            return self._read_static_poses(self.description.static)
+        assert self.description.wrench is not None
+        weight = self.description.wrench.weight
+        causes = {"gravity": self.description.gravity == "auto", "weight": weight == "removed"}
         free = tuple(name for name, is_free in causes.items() if is_free)
-        if self._description.gravity == "auto":
+        if self.description.gravity == "auto":
             self._replace_auto_fields(auto_frames.estimate_auto_gravity)
-        if self._description.pose is not None and self._description.pose.is_frame_auto:
+        if self.description.pose is not None and self.description.pose.is_frame_auto:
             self._replace_auto_fields(auto_frames.estimate_auto_pose_frame, differentiate=False)
-        if self._description.imu is not None and self._description.imu.is_mounting_auto:
+        if self.description.imu is not None and self.description.imu.is_mounting_auto:
             self._replace_auto_fields(auto_frames.estimate_auto_imu_mounting)
-        table = self._table_of_stream(self._description.wrench)
-        clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
-        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.num_rows)
+        table = self._table_of_stream(self.description.wrench)
+        clock = self._read_clock_and_gaps("wrench", self.description.wrench, table)
+        wrench = self._read_wrench("wrench", self.description.wrench, table, clock.num_rows)
         wrench = clock.select_timed_rows(wrench)
         pose = imu = None
-        if self._description.pose is not None:
-            pose = self._read_pose(self._description.pose, differentiate=differentiate)
-        if self._description.imu is not None:
-            imu = self._read_imu(self._description.imu, pose)
+        if self.description.pose is not None:
+            pose = self._read_pose(self.description.pose, differentiate=differentiate)
+        if self.description.imu is not None:
+            imu = self._read_imu(self.description.imu, pose)
         kinematics = [stream for stream in (imu, pose) if stream is not None]
-        t = streams.uniform_times_of_streams(clock.t, kinematics, self._source)
+        t = streams.uniform_times_of_streams(clock.t, kinematics, self.source)
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
-        posed, gain_std = None, self._description.wrench.gain_std
+        posed, gain_std = None, self.description.wrench.gain_std
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
-            posed = self._description.poses_with_frame(pose.recorded_poses, inertial)
-        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
+            posed = self.description.poses_with_frame(pose.recorded_poses, inertial)
+        log = replace(log, gain_std=gain_std, estimated=free, described=self.description)
         log = replace(log, posed=posed)
         log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
-        without = self._description.wrench.model_copy(update={"weight": None})
-        other = self._description.model_copy(update={"wrench": without})
+        without = self.description.wrench.model_copy(update={"weight": None})
+        other = self.description.model_copy(update={"wrench": without})
         return restore_removed_weight(log, np.array(weight), self._read_edited_log(other))
 
     def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
         read = partial(self._read_edited_log, differentiate=differentiate)
-        self._description, notes = describe(self._description, self._source, read)
-        self._notes += notes
+        self.description, notes = describe(self.description, self.source, read)
+        self.notes += notes
 
     def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
-        for stream in self._description.streams.values():
+        for stream in self.description.streams.values():
             self._table_of_stream(stream)
-        reader = _LogReader(description, self._source, 30.0, self._tables)
+        reader = _LogReader(description, self.source, 30.0, dict(self.tables))
         return reader.read_recording(differentiate=differentiate)
 
     def _table_of_stream(self, stream: Wrench | Imu | Pose | Static) -> Table:
-        if stream.source not in self._tables:
-            self._tables[stream.source] = read_stream_table(stream)
-        table = self._tables[stream.source]
+        if stream.source not in self.tables:
+            self.tables[stream.source] = read_stream_table(stream)
+        table = self.tables[stream.source]
         return table if isinstance(stream, Static) else table.rows_with_any_number(stream.columns)
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
@@ -174,11 +169,11 @@ class _LogReader:
     def _read_vectors(
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
     ) -> Array:
-        where = f"{self._source}:{name}.{field}.columns"
+        where = f"{self.source}:{name}.{field}.columns"
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
-        values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
-        of_table = table_files.note_that_table_needs_description(self._source)
+        values *= sign * self.description.unit_in_si(quantity.unit) * np.array(quantity.scale)
+        of_table = table_files.note_that_table_needs_description(self.source)
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -193,7 +188,7 @@ class _LogReader:
         quaternion, position = self._poses_of_S(stream, table, clock)
         if position is not None:
             raw = Poses(clock.t, position, quaternion).with_continuous_quaternions()
-            wrench, imu = self._description.wrench, self._description.imu
+            wrench, imu = self.description.wrench, self.description.imu
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, recorded_poses=raw)
         dt = alignment.mean_time_step(t)
@@ -203,9 +198,9 @@ class _LogReader:
         acceleration = np.zeros(3)
         if position is not None:
             position = resample(t, clock.t, position)
-            acceleration = alignment.smooth_derivatives(position, dt, self._bandwidth_hz)[2]
-        s = streams.rotate_world_to_S(R_WS, acceleration - self._description.gravity_W)
-        return Stream("pose", t, s, *angular_motion(R_WS, dt, self._bandwidth_hz), R_WS, raw)
+            acceleration = alignment.smooth_derivatives(position, dt, self.bandwidth_hz)[2]
+        s = streams.rotate_world_to_S(R_WS, acceleration - self.description.gravity_W)
+        return Stream("pose", t, s, *angular_motion(R_WS, dt, self.bandwidth_hz), R_WS, raw)
 
     def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
@@ -214,8 +209,8 @@ class _LogReader:
             quantity = "pose", "position", stream.position
             position = self._read_vectors(*quantity, table, clock.num_rows)
             position = clock.select_timed_rows(position)
-        where, form = f"{self._source}:pose.orientation", stream.orientation
-        orientations = OrientationColumns(self._description, form, table, clock.num_rows, where)
+        where, form = f"{self.source}:pose.orientation", stream.orientation
+        orientations = OrientationColumns(self.description, form, table, clock.num_rows, where)
         quaternion = orientations.allocate_quaternions(len(clock.kept_rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CONVERTED_CHUNK_ROWS):
@@ -249,7 +244,7 @@ class _LogReader:
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
             self._raise_one_sided_length_to_window(dt)
-            alpha = alignment.smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
+            alpha = alignment.smooth_derivatives(omega, dt, self.bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
             s = streams.specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
@@ -269,7 +264,7 @@ class _LogReader:
 
     def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
-        return DrakeTeleopError(what, where=f"{self._source}:{name}.frame", remedy=remedy)
+        return DrakeTeleopError(what, where=f"{self.source}:{name}.frame", remedy=remedy)
 
     def _read_static_poses(self, stream: Static) -> Log:
         table = self._table_of_stream(stream)
@@ -282,10 +277,10 @@ class _LogReader:
             gravity = -self._read_vectors("static", "specific_force", quantity, table, table.rows)
         else:
             assert stream.orientation is not None
-            where, form = f"{self._source}:static.orientation", stream.orientation
-            orientations = OrientationColumns(self._description, form, table, table.rows, where)
+            where, form = f"{self.source}:static.orientation", stream.orientation
+            orientations = OrientationColumns(self.description, form, table, table.rows, where)
             R_SW = np.swapaxes(orientations.rotations(np.arange(table.rows)), 1, 2)
-            gravity = R_SW @ self._description.gravity_W
+            gravity = R_SW @ self.description.gravity_W
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
@@ -297,58 +292,58 @@ class _LogReader:
         if n < MIN_STATIC_POSES:
             what = f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)"
             remedy = "record 12 or more, with different orientations"
-            raise DrakeTeleopError(what, where=f"{self._source}:static", remedy=remedy)
+            raise DrakeTeleopError(what, where=f"{self.source}:static", remedy=remedy)
         rest = np.zeros((n, 3))
         return Log(
             *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),
-            notes=tuple(self._notes),
-            source=self._source,
+            notes=tuple(self.notes),
+            source=self.source,
             gain_std=stream.gain_std,
-            described=self._description,
+            described=self.description,
             resolution=self._quantization_steps(stream, table),
         )
 
     def _quantization_steps(self, stream: Static, table: Table) -> tuple[float, float]:
         steps = []
-        for field, quantity in (("force", stream.force), ("torque", stream.torque)):
-            values = table.finite_numbers(quantity.columns, 3, f"static.{field}", table.rows)
-            unit = self._description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
+        for name, quantity in (("force", stream.force), ("torque", stream.torque)):
+            values = table.finite_numbers(quantity.columns, 3, f"static.{name}", table.rows)
+            unit = self.description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
             steps.append(decimal_resolution(values) * unit)
         return steps[0], steps[1]
 
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
+        clock = read_clock(stream.time, table, stream.columns, f"{self.source}:{name}.time")
         t = clock.t
         if len(t) < MIN_STREAM_SAMPLES or len(alignment.uniform_times(t)) < MIN_STREAM_SAMPLES:
             what = f"{len(t)} samples in {table.path.name} are too few"
             remedy = f"record at least {MIN_STREAM_SAMPLES}, evenly spaced"
-            raise DrakeTeleopError(what, where=f"{self._source}:{name}", remedy=remedy)
-        self._notes += [f"{name}: {note}" for note in clock.notes]
+            raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
+        self.notes += [f"{name}: {note}" for note in clock.notes]
         if stream.topic and stream.time.column == "stamp" and "header.stamp" not in table.columns:
-            self._notes.append(
+            self.notes.append(
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
-        found_gaps = find_gaps_in_times(t, self._bandwidth_hz)
+        found_gaps = find_gaps_in_times(t, self.bandwidth_hz)
         if clock.num_episodes > 1:
-            files = len({stream.source for stream in self._description.streams.values()})
-            self._notes += episodes_note(clock, files, f"{self._source}:{name}.time")
+            files = len({stream.source for stream in self.description.streams.values()})
+            self.notes += episodes_note(clock, files, f"{self.source}:{name}.time")
         elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
-            self._notes.append(
+            self.notes.append(
                 f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
             half = self._half_smoother_window_s(float(np.median(np.diff(t))))
-            self._gaps.append(found_gaps + np.array([-half, half]))
+            self.gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
     def _half_smoother_window_s(self, dt: float) -> float:
-        window = SMOOTHER_WINDOW_OVER_PERIOD / self._bandwidth_hz if self._bandwidth_hz else 0.0
+        window = SMOOTHER_WINDOW_OVER_PERIOD / self.bandwidth_hz if self.bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
     def _raise_one_sided_length_to_window(self, dt: float) -> None:
-        self._one_sided_s = max(self._one_sided_s, self._half_smoother_window_s(dt))
+        self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
 
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal_on_clock(field: str) -> Array:
@@ -358,18 +353,18 @@ class _LogReader:
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
         gravity = R_WS = None
-        described, described_pose = self._description.wrench, self._description.pose
+        described, described_pose = self.description.wrench, self.description.pose
         in_base = described is not None and described.frame == "base"
         if pose is not None and pose.R_WS is not None:
             R_WS = nearest_rotation(streams.resample_to_clock(t, pose, pose.R_WS))
-            gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
+            gravity = np.swapaxes(R_WS, 1, 2) @ self.description.gravity_W
             if in_base:
                 wrench = streams.rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
             raise self._no_R_WS_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
-            self._notes.append(
+            self.notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
         names = ("specific_force", "angular_velocity", "angular_acceleration")
@@ -378,20 +373,20 @@ class _LogReader:
             *(t, wrench, s, omega, alpha),
             gravity=gravity,
             R_WS=R_WS,
-            gravity_W=None if R_WS is None else self._description.gravity_W,
+            gravity_W=None if R_WS is None else self.description.gravity_W,
             bridged=self._flag_bridged_samples(t),
-            notes=tuple(self._notes),
-            source=self._source,
-            one_sided_s=self._one_sided_s,
+            notes=tuple(self.notes),
+            source=self.source,
+            one_sided_s=self.one_sided_s,
         )
 
     def _flag_bridged_samples(self, t: Array) -> NDArray[np.bool_] | None:
-        if not self._gaps:
+        if not self.gaps:
             return None
         flags = np.zeros(len(t), bool)
-        for start, stop in np.concatenate(self._gaps):
+        for start, stop in np.concatenate(self.gaps):
             flags[slice(*np.searchsorted(t, [start, stop]))] = True
         if (~flags).sum() < MIN_STREAM_SAMPLES:
             what = f"only {int((~flags).sum())} samples are outside of gaps"
-            raise DrakeTeleopError(what, where=self._source, remedy="record without interruptions")
+            raise DrakeTeleopError(what, where=self.source, remedy="record without interruptions")
         return flags

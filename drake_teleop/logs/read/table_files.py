@@ -43,10 +43,7 @@ def note_that_table_needs_description(source: str) -> str:
 
 
 def read_table(path: Path, *, header: bool = True) -> Table:
-    """Read a file with a suffix in `TABLE_READERS`; raise an error if it is invalid.
-
-    The columns of a text file without header are named from "0" on.
-    """
+    """Read a file with a suffix in `TABLE_READERS`; columns without header are "0", "1", ..."""
     kind = TABLE_READERS.check(path.suffix.lower(), str(path))
     require_file(path, folder=kind == ".zarr")
     errors.refuse_polars_in_forked_process()
@@ -107,10 +104,7 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
 
 
 def numeric_and_nested_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
-    """Return columns of a Polars frame by name, and elements of lists and structures as columns.
-
-    Columns of text and binary data, such as images, are omitted.
-    """
+    """Return columns of numbers, and elements of lists and structures, of a frame by name."""
     frame = frame.select(numeric_or_nested_column_names(frame)).collect().lazy()
     return _collect_columns(frame, _column_expressions(frame))
 
@@ -227,6 +221,8 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
 
 
 _ArrayReader = Callable[[Path], dict[str, NDArray]]
+_ARRAY_READERS: dict[str, _ArrayReader] = {".npz": _read_npz, ".npy": _read_npy, ".mat": read_mat}
+_ARRAY_READERS |= {".h5": read_hdf5, ".hdf5": read_hdf5, ".zarr": read_zarr}
 
 
 def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
@@ -240,12 +236,7 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
         **dict.fromkeys(
             (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_with_polars
         ),
-        ".npz": _reader_of_columns(_read_npz),
-        ".npy": _reader_of_columns(_read_npy),
-        ".mat": _reader_of_columns(read_mat),
-        ".h5": _reader_of_columns(read_hdf5),
-        ".hdf5": _reader_of_columns(read_hdf5),
-        ".zarr": _reader_of_columns(read_zarr),
+        **{suffix: _reader_of_columns(read) for suffix, read in _ARRAY_READERS.items()},
     },
 )
 """Readers of files by suffix; a reader returns columns by name."""
