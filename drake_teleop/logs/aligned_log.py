@@ -35,8 +35,7 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import note_that_table_needs_description
 
-_MAX_KNOWN_DELAY_STD_S = 0.005  # s, standard deviation
-_EDGE_MARGIN_OVER_KNOT_SPACING = 2.0
+_MAX_KNOWN_DELAY_STD_S, _EDGE_MARGIN_OVER_KNOT_SPACING = 0.005, 2.0
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9

@@ -39,16 +39,10 @@ def summarize_log(
 def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
-    return {
-        "start_s": stretch.start_s,
-        "stop_s": stretch.stop_s,
-        "mass": mass,
-        "mass_std": deviations[0],
-        "com": com,
-        "com_std": identification.com_standard_deviations(stretch.phi, stretch.covariance),
-        "phi": stretch.phi,
-        "phi_std": deviations,
-    }
+    com_std = identification.com_standard_deviations(stretch.phi, stretch.covariance)
+    load = {"mass": mass, "mass_std": deviations[0], "com": com, "com_std": com_std}
+    load |= {"phi": stretch.phi, "phi_std": deviations}
+    return {"start_s": stretch.start_s, "stop_s": stretch.stop_s, **load}
 
 
 def summarize_load(load: Identification) -> dict[str, Any]:

@@ -29,11 +29,9 @@ from drake_teleop.logs.read.tables import Table
 
 BANDWIDTH_FOR_GAP_LENGTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
-MIN_REPEATED_ROW_SHARE = 0.05
-"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK_ROWS` rows."""
-MIN_REPEATED_BLOCK_ROWS = 5
-_MAX_DRAFT_CORRECTIONS = 5
-"""Largest number of corrections of a draft by its data."""
+MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
+"""Smallest reported share of repeated rows, apart from blocks of some rows."""
+_MAX_DRAFT_CORRECTIONS = 5  # by the data
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}
 _INSPECTED_QUANTITIES = (
@@ -191,15 +189,11 @@ def _inspect_described_log(
         findings += found.findings
         summary["delay_s"] = found.delay_s
         summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
-        if found.mounting is not None:
-            summary["mounting"] = {
-                "R_SI": found.mounting.R_SI.tolist(),
-                "angle_deg": found.mounting.rotation_angle_deg,
-                "right_angled": found.mounting.is_right_angled,
-                "lag_s": found.mounting.lag_s,
-                "drift": found.mounting.clock_drift,
-                "unexplained": found.mounting.unexplained,
-            }
+        if (imu := found.mounting) is not None:
+            rotation = {"R_SI": imu.R_SI.tolist(), "angle_deg": imu.rotation_angle_deg}
+            rotation["right_angled"] = imu.is_right_angled
+            clock = {"lag_s": imu.lag_s, "drift": imu.clock_drift}
+            summary["mounting"] = {**rotation, **clock, "unexplained": imu.unexplained}
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
     return findings
 
@@ -241,13 +235,10 @@ def _inspect_stream(
         if not len(finite):
             continue
         saturated = 0 if time is None or not moving else _count_saturated_samples(x, same)
-        figures["columns"][column] = {
-            "min": float(finite.min()),
-            "max": float(finite.max()),
-            "mean": float(finite.mean()),
-            "noise": float(white_noise_deviations(finite[:, None])[0]),
-            "saturated": saturated,
-        }
+        ends = {"min": float(finite.min()), "max": float(finite.max())}
+        noise = float(white_noise_deviations(finite[:, None])[0])
+        mean = {"mean": float(finite.mean()), "noise": noise, "saturated": saturated}
+        figures["columns"][column] = ends | mean
         if saturated:
             text = (
                 f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
@@ -302,19 +293,15 @@ def _inspect_clock_and_flag_usable_rows(
     between = figures["episodes"] - 1
     gaps = int((steps > min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
-    figures |= {
-        "rate_hz": 1 / median,
-        "duration_s": float(t[-1] - t[0]),
-        "longest_gap_s": float(forward.max()),
-        "gaps": gaps,
-        "clock_jumps": back,
-    }
+    longest = float(forward.max())
+    figures |= {"rate_hz": 1 / median, "duration_s": float(t[-1] - t[0]), "longest_gap_s": longest}
+    figures |= {"gaps": gaps, "clock_jumps": back}
     findings = []
     if gaps:
         where = float(t[int(np.argmax(steps))] - t[0])
         text = (
-            f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
-            " missing or the clock jumped; the motion there is not used"
+            f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s: rows are missing or"
+            " the clock jumped; the motion there is not used"
         )
         findings.append(Finding("gap", text))
     if back:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -265,23 +266,17 @@ def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     return still or 5.0 < weight < 20.0
 
 
-def _is_readable(path: Path) -> bool:
-    try:
-        read_log(path)
-    except DrakeTeleopError:
-        return False
-    return True
-
-
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
     """Check a log and its description, including causes that identification finds."""
     checks = check_conventions_of_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
     except DrakeTeleopError as error:
-        if checks.findings or not _is_readable(path):
-            return checks
-        return replace(checks, findings=(Finding("payload", str(error)),))
+        if not checks.findings:
+            with suppress(DrakeTeleopError):
+                read_log(path)
+                return replace(checks, findings=(Finding("payload", str(error)),))
+        return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
@@ -466,13 +461,9 @@ def _read_and_eliminate_log(
             compensation.scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
         )
         options: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay_s": delay_s, "mode": causal}
-        causal_wrench = compute_causal_wrench(*both, log.dt, **options)
-        causal_wrench = replace(
-            causal_wrench,
-            offsets=causal_offsets,
-            contact=causal_wrench.contact[known],
-            scaled=causal_wrench.scaled[known],
-        )
+        late = compute_causal_wrench(*both, log.dt, **options)
+        inner = {"contact": late.contact[known], "scaled": late.scaled[known]}
+        causal_wrench = replace(late, offsets=causal_offsets, **inner)
     contact = low_pass_wrench(contact_wrench(log.wrench, offsets, *log.motion, phi))
     measured = log.wrench - offsets
     findings = _findings_if_contact_is_large(Path(path), measured, contact, identification)

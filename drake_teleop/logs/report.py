@@ -72,23 +72,15 @@ def write_report(
     `alone` is the load of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
-    tables = [
-        (
-            "The load and the sensor's offsets",
-            "About the origin of the sensor frame S, in its axes. The intervals contain the true"
-            " value in 95 of 100 records, if the residual is noise. Parameters that the record"
-            " does not determine have no value.",
-            parameter_rows(result),
-        )
-    ]
+    text = (
+        "About the origin of the sensor frame S, in its axes. The intervals contain the true value"
+        " in 95 of 100 records, if the residual is noise. Parameters that the record does not"
+        " determine have no value."
+    )
+    tables = [("The load and the sensor's offsets", text, parameter_rows(result))]
     if alone is not None:
-        tables.append(
-            (
-                "The object alone",
-                "The load minus the given gripper; the uncertainties of both are combined.",
-                parameter_rows(alone)[6:],
-            )
-        )
+        text = "The load minus the given gripper; the uncertainties of both are combined."
+        tables.append(("The object alone", text, parameter_rows(alone)[6:]))
     samples = f"{summary['samples']} poses at rest"
     if not log.static:
         samples = (
@@ -98,7 +90,14 @@ def write_report(
         )
     if summary["rejected"] > 0:
         samples += f"; {summary['rejected']:.1%} of them rejected as disturbed, shaded below"
-    spectrum = "each pose" if log.static else "each frequency"
+    fit = "Measured wrench and V φ, both without offsets, and their difference."
+    identifiability = (
+        f"Top: the residual at {'each pose' if log.static else 'each frequency'}. Below: each"
+        " parameter with its interval, and its standard deviation, relative to a typical value for"
+        " a load of this mass and size: identified up to 5 %, weakly identified up to 50 %, else"
+        " not identified."
+    )
+    picture = png_data_url(path.parent / "knowledge.png")
     page = render_page(
         "drake_teleop.logs",
         "report.html.j2",
@@ -109,18 +108,8 @@ def write_report(
         tables=tables,
         determined=found.base_parameters.text_lines(),
         figures=[
-            (
-                "Fit",
-                png_data_url(path.parent / "fit.png"),
-                "Measured wrench and V φ, both without offsets, and their difference.",
-            ),
-            (
-                "Residual, intervals and identifiability",
-                png_data_url(path.parent / "knowledge.png"),
-                f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
-                "its standard deviation, relative to a typical value for a load of this mass and "
-                "size: identified up to 5 %, weakly identified up to 50 %, else not identified.",
-            ),
+            ("Fit", png_data_url(path.parent / "fit.png"), fit),
+            ("Residual, intervals and identifiability", picture, identifiability),
         ],
         summary=dict(summary),
     )
@@ -136,13 +125,10 @@ def _summary_tiles(load: Identification) -> list[tuple[str, str, str]]:
     )
     count = int(load.identifiable[6:].sum())
     force, torque = (np.linalg.norm(part) for part in np.split(load.residual_rms, 2))
+    rms = "rms of the force and of the torque that the load does not explain"
     return [
         (mass, "kg", f"mass, ± {deviation:.2g} kg" if load.identifiable[6] else "mass"),
         (com, "mm", "centre of mass from the origin of S: x, y, z"),
         (f"{count} of 10", "", "parameters of the load are identified"),
-        (
-            f"{force:.2g} N, {torque:.2g}",
-            "N m",
-            "rms of the force and of the torque that the load does not explain",
-        ),
+        (f"{force:.2g} N, {torque:.2g}", "N m", rms),
     ]

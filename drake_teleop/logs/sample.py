@@ -113,22 +113,13 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             _write_record(out, name, row, touches, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
-        truth = {
-            **load,
-            "phi": TRUE_PHI,
-            "offsets": TRUE_OFFSETS[0],
-            "offsets_touched": TRUE_OFFSETS[1],
-            "delay_s": POSE_DELAY_S,
-            "contacts": [_true_contact(touch) for touch in FINGERTIP_PUSHES],
-        }
+        offsets = {"offsets": TRUE_OFFSETS[0], "offsets_touched": TRUE_OFFSETS[1]}
+        contacts = [_true_contact(touch) for touch in FINGERTIP_PUSHES]
+        truth = {**load, "phi": TRUE_PHI, **offsets, "delay_s": POSE_DELAY_S, "contacts": contacts}
         write_json(out / "truth.json", truth)
-        summary = {
-            "seed": seed,
-            "files": [*files, "truth.json"],
-            "duration_s": MOTION_PERIOD_S + 2 * REST_AT_ENDS_S,
-            "wrench_hz": WRENCH_HZ,
-            "pose_hz": POSE_HZ,
-        }
+        duration_s = MOTION_PERIOD_S + 2 * REST_AT_ENDS_S
+        summary = {"seed": seed, "files": [*files, "truth.json"], "duration_s": duration_s}
+        summary |= {"wrench_hz": WRENCH_HZ, "pose_hz": POSE_HZ}
         write_json(out / "summary.json", summary)
     if not quiet:
         _print_summary(out)

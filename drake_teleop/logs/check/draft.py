@@ -148,11 +148,9 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
     none = [_FILL_IN_TEXT] * 3
-    wrench = stream_with_time(
-        force=_draft_quantity(table, plain, "force", found.get("force", none)),
-        torque=_draft_quantity(table, plain, "torque", found.get("torque", none)),
-        sign=1,
-    )
+    pair = {x: found.get(x, none) for x in ("force", "torque")}
+    both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
+    wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
     if any(re.search(_BASE_AXES_COLUMN_PATTERN, name) for name in forces):
         wrench["frame"] = "base"

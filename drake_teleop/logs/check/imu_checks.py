@@ -28,10 +28,8 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
 MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02  # calibrated sensors are within 1 %
-_MIN_GRAVITY_ERROR_OVER_DEVIATION = 5.0
-_MIN_ALPHA_CORRELATION = 0.8
-_ALPHA_COMPARISON_CUTOFF_HZ = 5.0
-_MAX_UNSWAPPED_OVER_BEST_CORRELATION = 0.5
+_MIN_GRAVITY_ERROR_OVER_DEVIATION, _ALPHA_COMPARISON_CUTOFF_HZ = 5.0, 5.0
+_MIN_ALPHA_CORRELATION, _MAX_UNSWAPPED_OVER_BEST_CORRELATION = 0.8, 0.5
 _GRAVITY_WINDOW_RANGE_S, _MIN_GRAVITY_WINDOWS, _MAX_GRAVITY_WINDOWS = (2.0, 8.0), 6, 60
 _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0.05, 3.0
 
@@ -97,11 +95,9 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     text = "the axes of the gyroscope are not those of the accelerometer"
     names = imu.angular_velocity.columns
     if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
-        return Finding(
-            "swapped axes",
-            f"{text}: its x, y, z should be its {', '.join(axis_names_of_rows(P))}; correct"
-            " imu.angular_velocity.columns, and signs by imu.angular_velocity.scale",
-        ), description
+        text += f": its x, y, z should be its {', '.join(axis_names_of_rows(P))}"
+        remedy = "correct imu.angular_velocity.columns, and signs by imu.angular_velocity.scale"
+        return Finding("swapped axes", f"{text}; {remedy}"), description
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
     finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
     return finding, edit_field(description, "imu.angular_velocity.columns", ordered)
@@ -118,12 +114,10 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     limit = _MAX_UNSWAPPED_OVER_BEST_CORRELATION * largest
     if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > limit:
         return None
-    return Finding(
-        "swapped axes",
-        "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axis_names_of_rows(best))}; correct"
-        " imu.angular_acceleration.columns, or remove it",
-    )
+    text = "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
+    text += f" the gyroscope's {', '.join(axis_names_of_rows(best))}"
+    remedy = "correct imu.angular_acceleration.columns, or remove it"
+    return Finding("swapped axes", f"{text}; {remedy}")
 
 
 def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
@@ -254,10 +248,6 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
         return finding, edit_field(description, "imu.time.offset", offset)
     late = found.mid_record_lag_s - drift * found.mid_record_time_s
     lag, lines, edited = data.start_lag_and_clock_drift_correction("imu", description, late, drift)
-    finding = Finding(
-        "clock",
-        f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
-        f" {1e3 * drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
-        f" constant); set {lines}",
-    )
-    return finding, edited
+    text = f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
+    text += f" {1e3 * drift:.3g} ms more each second ({found.lag_s:.3f} s is the best constant)"
+    return Finding("clock", f"{text}; set {lines}"), edited

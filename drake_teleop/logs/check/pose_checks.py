@@ -21,8 +21,7 @@ from drake_teleop.logs.read.mounting import lever_matrix, rotation_angle_deg
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
-_ACCELERATION_CUTOFF_HZ = 3.0
-_MAX_SHIFT_FIT_CONDITION_NUMBER = 1e8
+_ACCELERATION_CUTOFF_HZ, _MAX_SHIFT_FIT_CONDITION_NUMBER = 3.0, 1e8
 _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15

@@ -38,8 +38,7 @@ DELAY_SEARCH_HALF_RANGE_S = 0.25
 MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-7
 """Least noise of a channel relative to the wrench, for rounded numbers."""
 _COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
-_REWEIGHTING_ITERATIONS = 4
-_MIN_AVERAGED_POSE_RATE_HZ = 125.0
+_REWEIGHTING_ITERATIONS, _MIN_AVERAGED_POSE_RATE_HZ = 4, 125.0
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_RELATIVE_PIVOT_FOR_INVERSE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
 _TRIED_OFFSET_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))

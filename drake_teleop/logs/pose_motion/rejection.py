@@ -15,11 +15,9 @@ NOTHING_REJECTED_NOTE = (
     " cannot be distinguished from errors of the motion: no sample was rejected"
 )
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
-_STD_PER_NORMAL_MAD = 1.4826
-_MAX_FIT_STD_GROWTH = 2.5
+_STD_PER_NORMAL_MAD, _MAX_FIT_STD_GROWTH = 1.4826, 2.5
 _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE = 0.3
-_MIN_REJECTION_MARGIN_S = 0.1
-"""Least margin on both sides of a rejected time span [s]."""
+_MIN_REJECTION_MARGIN_S = 0.1  # least margin on both sides of a rejected time span [s]
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:

@@ -333,13 +333,10 @@ def _expected_misfit_by_gains(
 
 
 def _add_rigid_step(state: RigidParameters, step: Array) -> RigidParameters:
-    R_PS = _rotate_about_own_axes(state.R_PS, step[ROTATION_PARAMETERS])
-    return RigidParameters(
-        state.theta + step[OFFSET_AND_LOAD_PARAMETERS],
-        state.delay_s + float(step[16]),
-        state.p_PoSo_P + step[LEVER_PARAMETERS],
-        Rotation.from_matrix(R_PS).as_matrix(),
-    )
+    theta = state.theta + step[OFFSET_AND_LOAD_PARAMETERS]
+    delay_s, p = state.delay_s + float(step[16]), state.p_PoSo_P + step[LEVER_PARAMETERS]
+    R = _rotate_about_own_axes(state.R_PS, step[ROTATION_PARAMETERS])
+    return RigidParameters(theta, delay_s, p, Rotation.from_matrix(R).as_matrix())
 
 
 def _rotate_about_own_axes(R: Array, rho: Array) -> Array:

@@ -18,8 +18,7 @@ from drake_teleop.logs.read.canonical import Log
 
 _MIN_SAMPLES_AFTER_DELAY = 8
 _INTERPOLATED_CHUNK_ROWS = 2**18
-_MIN_SMOOTHER_WINDOW_SAMPLES = 9
-_SMOOTHER_DEGREE = 5
+_MIN_SMOOTHER_WINDOW_SAMPLES, _SMOOTHER_DEGREE = 9, 5
 SMOOTHER_WINDOW_OVER_PERIOD = 1.8  # window [s] of the smoother times its bandwidth [Hz]
 
 
@@ -210,8 +209,7 @@ def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 
 MAX_SEARCHED_DELAY_S = 0.25
-_MAX_SAMPLES_FOR_DELAY = 5000
-_MIN_SAMPLES_FOR_DELAY = 32
+_MIN_SAMPLES_FOR_DELAY, _MAX_SAMPLES_FOR_DELAY = 32, 5000
 
 
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:

@@ -174,11 +174,8 @@ def describe_canonical(path: Path, table: Table) -> Description:
     }
     if "orientation" in fields:
         fields["orientation"]["form"] = "quaternion_wxyz"
-    wrench = {
-        "file": path,
-        "force": {"columns": WRENCH_COLUMNS[:3]},
-        "torque": {"columns": WRENCH_COLUMNS[3:]},
-    }
+    force, torque = {"columns": WRENCH_COLUMNS[:3]}, {"columns": WRENCH_COLUMNS[3:]}
+    wrench = {"file": path, "force": force, "torque": torque}
     if _are_rows_at_rest(table, fields):
         kinematics = "orientation" if "orientation" in fields else "specific_force"
         return Description.model_validate({"static": wrench | {kinematics: fields[kinematics]}})

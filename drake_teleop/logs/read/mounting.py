@@ -161,8 +161,7 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
 
 MAX_LEVER_ARM_DEVIATION_M = 0.005  # of a determined coordinate
 MAX_UNEXPLAINED_SHARE = 0.05  # of the variance, for a valid fit
-IMU_COMPARISON_CUTOFF_HZ = 8.0
-NUM_COMPARED_SAMPLES = 1500
+IMU_COMPARISON_CUTOFF_HZ, NUM_COMPARED_SAMPLES = 8.0, 1500
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _MIN_MOTION_OVER_NOISE_POWER = 20.0
 

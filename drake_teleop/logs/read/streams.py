@@ -19,14 +19,10 @@ from drake_teleop.logs.read.tables import Table
 
 MIN_STREAM_SAMPLES = 16
 MAX_PLAUSIBLE_VALUES = {
-    "force": (1e6, "N"),
-    "torque": (1e6, "N m"),
-    "specific_force": (1e6, "m/s^2"),
-    "gravity": (1e6, "m/s^2"),
-    "angular_velocity": (1e6, "rad/s"),
-    "angular_acceleration": (1e9, "rad/s^2"),
-    "position": (1e9, "m"),
-}
+    "force": (1e6, "N"), "torque": (1e6, "N m"), "position": (1e9, "m"),
+    "specific_force": (1e6, "m/s^2"), "gravity": (1e6, "m/s^2"),
+    "angular_velocity": (1e6, "rad/s"), "angular_acceleration": (1e9, "rad/s^2"),
+}  # fmt: skip
 """Largest plausible value of each signal and its unit, also for wrong units."""
 
 

@@ -110,9 +110,8 @@ class Table:
         """Return the numbers (N,) of a column, with NaN and infinity."""
         numbers = self.numbers_with_nan(name, where)
         if numbers.shape[1] != 1:
-            what = (
-                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1"
-            )
+            column = f"{str(name)!r} of {self.path.name}"
+            what = f"{column} has {numbers.shape[1]} numbers per row, not 1"
             raise DrakeTeleopError(what, where=where, remedy="name a column that has one")
         return numbers[:, 0]
 
@@ -131,12 +130,10 @@ class Table:
         if bad.any():
             first = int(np.argmax(bad))
             worst = values[first][np.argmax(np.abs(values[first]))]
-            raise DrakeTeleopError(
-                f"{worst:g} {unit}".rstrip() + f" in row {self.line_in_file(first)} of"
-                f" {self.path.name} is outside {-largest:g} to {largest:g}",
-                where=where,
-                remedy=remedy,
-            )
+            row = f"row {self.line_in_file(first)} of {self.path.name}"
+            value = f"{worst:g} {unit}".rstrip()
+            what = f"{value} in {row} is outside {-largest:g} to {largest:g}"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
 
     def _finite_column(self, name: str, where: str) -> Array:
         if name not in self.columns:
