@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
-from drake_teleop.logs.causes import cause, changes
+from drake_teleop.logs.causes import candidates, cause, changes, intervals
 from drake_teleop.logs.causes.candidates import (
     EXTENSIONS_BY_PLAUSIBILITY,
     Candidate,
-    fit_candidates,
     has_negative_inertia,
     has_negative_mass,
-    is_plausible,
     start_parameters_of_tilt_fit,
 )
 from drake_teleop.logs.causes.cause import Cause, RecordPartWithLoad
@@ -23,8 +21,6 @@ from drake_teleop.logs.causes.changes import remove_small_steps
 from drake_teleop.logs.causes.instants import BlockMeans, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     GOOD_SMOOTH_MISFIT,
-    jackknife_load_deviations,
-    load_covariance,
     load_covariance_by_gain_errors,
     load_covariance_by_torque_unit,
     load_deviations_if_unexplained,
@@ -117,9 +113,9 @@ def _search_causes_from(
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
             return state, delay_s, []
-        found = list(fit_candidates(state, is_first_round=number == 0))
+        found = list(candidates.fit_candidates(state, is_first_round=number == 0))
         found = _remove_cable_if_weight_explains_as_much(found)
-        rejected = [x for x in found if is_plausible(x.state)]
+        rejected = [x for x in found if candidates.is_plausible(x.state)]
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]
         winner = _most_plausible_of_best_candidates(effective)
         calmest = _candidate_with_much_smaller_residual(state, rejected)
@@ -149,7 +145,7 @@ def _search_causes_from(
 
 
 def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Candidate]:
-    weights = (x for x in found if x.name == "weight" and not is_plausible(x.state))
+    weights = (x for x in found if x.name == "weight" and not candidates.is_plausible(x.state))
     best = max((x.score for x in weights), default=0)
     return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
@@ -264,9 +260,9 @@ def explain_misfit(
     """
     with one_blas_thread():
         state, delay_s, rejected = search_causes(data, with_delay, always_fitted)
-        blocks = jackknife_load_deviations(state)
+        blocks = intervals.jackknife_load_deviations(state)
         gains = load_covariance_by_gain_errors(state) + load_covariance_by_torque_unit(state)
-        covariance = load_covariance(state, rejected, blocks, gains)
+        covariance = intervals.load_covariance(state, rejected, blocks, gains)
         causes = cause.causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):

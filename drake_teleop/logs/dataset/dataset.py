@@ -27,14 +27,12 @@ from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
-from drake_teleop.logs.dataset import dataset_files
+from drake_teleop.logs.dataset import dataset_files, episode_verdict
 from drake_teleop.logs.dataset.dataset_files import ContactColumns, Dataset, Episode
 from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
-    HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
     WrenchHypothesis,
-    find_offset_step,
     find_simplest_hypothesis_and_residual,
     ln_half_width_and_centre_of_calm_half,
 )
@@ -309,7 +307,7 @@ def _verdict_on_episode(
     faults = saturation_faults(log.wrench)
     faults += name_faults(found, usual_lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
-    step = find_offset_step(residual, found.spread)
+    step = episode_verdict.find_offset_step(residual, found.spread)
     if step is not None:
         k, before, after = step
         offsets[:k], offsets[k:] = before, after
@@ -371,7 +369,7 @@ def _dataset_summary(
         "ok": names["ok"],
         "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
         "lag_frames": shared.lag_frames,
-        "noise": shared.usual_half_widths / HALF_WIDTH_OF_NORMAL,
+        "noise": shared.usual_half_widths / episode_verdict.HALF_WIDTH_OF_NORMAL,
         "contact_threshold": shared.threshold,
         **summarize_load(shared.identification),
     }
