@@ -199,12 +199,7 @@ def replace_specific_force_by_acceleration(log: Log) -> Log:
 
 @dataclass(frozen=True)
 class LoadFitOfPosedLog:
-    """Load identified from a log with poses, after removal of the delay.
-
-    Attributes:
-        log: used samples with the motion of splines, low-passed.
-        delay_source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
-    """
+    """Load identified from a log with poses; `log` are the used samples, with spline motion."""
 
     log: Log
     fit: BatchResult

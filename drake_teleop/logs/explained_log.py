@@ -31,11 +31,10 @@ from drake_teleop.logs.read.table_files import note_that_table_needs_description
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
-_MAX_PLAUSIBLE_MASS_KG = 1000.0
+_MAX_PLAUSIBLE_MASS_KG, _UNIT_RATIO_TOLERANCE = 1000.0, 1e-3
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
 _FORCE_UNITS = ("N", "kgf", "lbf")
 _TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
-_UNIT_RATIO_TOLERANCE = 1e-3
 _POSITION_FIELDS = ("pose.position_in_sensor", "imu.position")
 _ROTATION_FIELDS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
 _DECIMALS_OF_FIELD = {"gravity": 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
@@ -189,9 +188,8 @@ def _correct_unit_or_torque_scale(fields: DescriptionFields, torque_factor: floa
 
 
 _SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
-_MIN_BLOCK_MEANS_TO_EXPLAIN = 100
+_MIN_BLOCK_MEANS_TO_EXPLAIN, _BLOCK_MEAN_BANDWIDTH_HZ = 100, 25.0
 _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
-_BLOCK_MEAN_BANDWIDTH_HZ = 25.0
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
@@ -304,11 +302,11 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Caus
 
 def unexplained_finding(why: MisfitExplanation) -> Finding:
     ratio = why.state.residual_ratio
-    return Finding(
-        "misfit",
+    text = (
         f"the residual is up to {ratio:.0f} times the sensor's noise, and no known cause explains"
-        " it; record without contact, with the same load throughout and with loose cables",
     )
+    remedy = "record without contact, with the same load throughout and with loose cables"
+    return Finding("misfit", f"{text} it; {remedy}")
 
 
 def removed_weight_note(why: MisfitExplanation) -> str:

@@ -78,7 +78,11 @@ def _describe_canonical_without_nan_rows(log: Path, table: Table) -> Description
         return describe_canonical(log, table)
     except DrakeTeleopError:
         # A canonical log with NaN or a missing column gets the specific message.
-        return describe_canonical(log, _remove_nonfinite_rows(table))
+        columns = [table.numbers_with_nan(name, name) for name in table.columns]
+        if len({len(x) for x in columns}) != 1:
+            raise
+        rows = np.flatnonzero(~np.isfinite(np.hstack(columns)).all(axis=1))
+        return describe_canonical(log, _remove_rows(table, rows))
 
 
 def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
@@ -334,13 +338,6 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
-
-
-def _remove_nonfinite_rows(table: Table) -> Table:
-    columns = [table.numbers_with_nan(name, name) for name in table.columns]
-    if len({len(x) for x in columns}) != 1:
-        return table
-    return _remove_rows(table, np.flatnonzero(~np.isfinite(np.hstack(columns)).all(axis=1)))
 
 
 def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:

@@ -59,9 +59,8 @@ from drake_teleop.logs.read.reading import MIN_BANDWIDTH_HZ, read_log
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
-_MIN_TARE_SAMPLES = 10
+_MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
-_MIN_CORRECTED_DELAY_S = 1e-4
 _MAX_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
 
 
@@ -493,24 +492,22 @@ def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
         found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
-        raise DrakeTeleopError(
-            f"the span from {start_s:g} to {stop_s:g} s has {found} ({_MIN_TARE_SAMPLES} required)",
-            where="untouched",
-            remedy="give a longer span without contact, in seconds after the first sample; the"
-            f" record has {log.t[-1] - log.t[0]:.4g} s",
+        what = (
+            f"the span from {start_s:g} to {stop_s:g} s has {found} ({_MIN_TARE_SAMPLES} required)"
         )
+        remedy = "give a longer span without contact, in seconds after the first sample; the record"
+        remedy += f" has {log.t[-1] - log.t[0]:.4g} s"
+        raise DrakeTeleopError(what, where="untouched", remedy=remedy)
     return rows
 
 
 def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
-        raise DrakeTeleopError(
-            f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples"
-            f" ({_MIN_TARE_SAMPLES} or more are required, but not all)",
-            where="causal_tare_s",
-            remedy="give another contact-free start",
-        )
+        what = f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples"
+        what += f" ({_MIN_TARE_SAMPLES} or more are required, but not all)"
+        remedy = "give another contact-free start"
+        raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     return rows
 
 

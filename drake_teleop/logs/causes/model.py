@@ -137,7 +137,9 @@ class Model:
             out[..., instants.GRAVITY_SIGNALS] += removed  # - V(-g) w
         if "cable" in parts:
             out[..., : instants.NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
-        turned = self._sensor_rotations(x)
+        turned = self.axes[None]
+        if "rotation" in parts:
+            turned = Rotation.from_rotvec(x[:, parts["rotation"]]).as_matrix() @ self.axes
         out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
         factor = np.full(len(x), self.torque_factor)
         if "torque factor" in parts:
@@ -175,11 +177,6 @@ class Model:
             M[:, :3, instants.ALPHA_SIGNALS] -= cross_matrix(r)
             M[:, :3, instants.OMEGA_PRODUCTS] += centripetal_matrix(r)
         return M
-
-    def _sensor_rotations(self, x: Array) -> Array:
-        if "rotation" not in self.parameter_slices:
-            return self.axes[None]
-        return Rotation.from_rotvec(x[:, self.parameter_slices["rotation"]]).as_matrix() @ self.axes
 
     def wrench_derivative(self, x: Array) -> Array:
         """Return d coefficients / dx (size, 6, k), of k signals in the wrench by parameters x."""

@@ -45,14 +45,7 @@ _LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
 
 @dataclass(frozen=True)
 class LoadFitQuality:
-    """Least squares fit of a load to a log, Eq. (5).
-
-    Attributes:
-        unexplained: share of the residual in the wrench's variance.
-        noise_share: share of white noise in this variance.
-        mass: fitted mass [kg].
-        independent_samples: number of samples with independent noise.
-    """
+    """Fit of a load to a log, Eq. (5): shares of residual and white noise in the variance."""
 
     unexplained: float
     mass: float

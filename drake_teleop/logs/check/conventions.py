@@ -34,13 +34,7 @@ _MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest rea
 
 @dataclass(frozen=True)
 class ConventionCheckResult:
-    """Result of the checks of a log description.
-
-    Attributes:
-        fit: fit of a load, after correction of IMU errors.
-        mounting: mounting of the IMU relative to the pose, if determined.
-        delay_s: delay of the motion behind the wrench, if determined [s].
-    """
+    """Findings of the checks, fit of a load after IMU corrections, and delay of the motion [s]."""
 
     findings: tuple[Finding, ...]
     fit: LoadFitQuality
@@ -208,19 +202,17 @@ def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:
     if not log.static:
         return None
     if len(log) < _MIN_CHECKED_POSES:
-        return Finding(
-            "static poses",
-            f"{len(log)} poses at rest are too few to check the fit; record 12, turned about two"
-            " horizontal axes",
-        )
+        remedy = "record 12, turned about two horizontal axes"
+        text = f"{len(log)} poses at rest are too few to check the fit; {remedy}"
+        return Finding("static poses", text)
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
     if least >= _MIN_GRAVITY_DIRECTION_SPREAD:
         return None
     angle = float(np.degrees(np.arcsin(least)))
-    return Finding(
-        "static poses",
+    text = (
         f"the poses are too alike: along one direction gravity in S varies by only {angle:.2g} deg,"
-        " which does not separate offsets from the load; add poses that are turned by 45 deg or"
-        " more about two horizontal axes",
     )
+    text += " which does not separate offsets from the load"
+    remedy = "add poses that are turned by 45 deg or more about two horizontal axes"
+    return Finding("static poses", f"{text}; {remedy}")

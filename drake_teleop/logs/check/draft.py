@@ -421,7 +421,5 @@ def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
 
 def _guess_time_unit(table: Table, column: str) -> str:
     step = float(np.nanmedian(np.abs(np.diff(table.single_column(column, column)))))
-    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
-        if step * scale <= 0.3:
-            return unit
-    return "ns"
+    units = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6)
+    return next((unit for unit, scale in units if step * scale <= 0.3), "ns")

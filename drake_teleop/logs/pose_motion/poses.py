@@ -11,13 +11,7 @@ from drake_teleop.common.numeric import Array
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of a frame P in the world.
-
-    Attributes:
-        t: (K,) increasing stamps [s], possibly uneven.
-        position: (K, 3) p_WoPo_W [m].
-        quaternion: (K, 4) [w, x, y, z] of R_WP, unit length.
-    """
+    """Poses of frame P at stamps t (K,) [s]: p_WoPo_W [m], unit [w, x, y, z] of R_WP (K, 4)."""
 
     t: Array
     position: Array

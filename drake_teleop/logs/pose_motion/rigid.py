@@ -31,13 +31,7 @@ _MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class RigidParameters:
-    """Parameters of a rigid load, its delay and its pose frame.
-
-    Attributes:
-        theta: (16,) [offsets; phi].
-        delay_s: delay tau of the poses [s].
-        p_PoSo_P, R_PS: lever r (3,) [m] and rotation R (3, 3) of Eq. (T79).
-    """
+    """Parameters [offsets; phi] (16,), delay tau [s], and r (3,) [m], R (3, 3) of Eq. (T79)."""
 
     theta: Array
     delay_s: float

@@ -39,9 +39,7 @@ SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
 class WrenchGrid:
     """Instants t (M,) of the motion signals [s], at about 100 Hz, and samples of the wrench.
 
-    Attributes:
-        wrench: (N, 6) samples, N = M stride.
-        known_load: (6, 16) coefficients of an identified load, or None.
+    `wrench` (N, 6) has N = M stride samples; `known_load` (6, 16) is Eq. (T73) of a load, or None.
     """
 
     t: Array
@@ -197,10 +195,7 @@ _MIN_REMAINING_DOF_SHARE = 0.25
 class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
-    Attributes:
-        half_dof_of_bands: (bands,) half the number of independent values in each band.
-        group_of_band: (bands,) group of each band.
-        relative_power: (bands, 6) power relative to the level.
+    Each band has half its number of independent values, its group, and power (6,) over the level.
     """
 
     half_dof_of_bands: Array

@@ -74,13 +74,12 @@ def import_optional_module(name: str, path: Path) -> Any:
         raise DrakeTeleopError(what, where=str(path), remedy=remedy) from None
 
 
-_MAT_HEADER_BYTES = 128
+_MAT_HEADER_BYTES, _MAT_FLAGS_AND_SIZE_TYPES = 128, [6, 5]
 _MAT_MATRIX_TYPE, _MAT_COMPRESSED_TYPE = 14, 15
 _MAT_STRUCTURE_CLASS, _MAX_MAT_STRUCTURE_DEPTH = 2, 20
 _MAT_NUMERIC_CLASSES, _MAT_COMPLEX_FLAG = range(6, 16), 1 << 11
 _DTYPE_OF_MAT_TYPE = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4"}
 _DTYPE_OF_MAT_TYPE |= {9: "f8", 12: "i8", 13: "u8"}
-_MAT_FLAGS_AND_SIZE_TYPES = [6, 5]
 _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
 

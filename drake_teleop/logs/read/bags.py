@@ -93,7 +93,11 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         blocks = _read_column_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
-    columns = _join_blocks(blocks)
+    columns = {
+        name: np.concatenate([block[name] for block in blocks])
+        for name, values in blocks[0].items()
+        if all(name in b and b[name].shape[1:] == values.shape[1:] for b in blocks)
+    }
     received = columns.pop(_RECEPTION_TIME_COLUMN)
     absent = _remove_fields_marked_absent(columns)
     columns |= _columns_by_short_name(columns)
@@ -220,14 +224,6 @@ def _read_column_blocks(
         remedy = f"give child_frame, one of {named}" if named else "leave it out"
         raise DrakeTeleopError(f"has {what}", where=where, remedy=remedy)
     return blocks
-
-
-def _join_blocks(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
-    return {
-        name: np.concatenate([block[name] for block in blocks])
-        for name, values in blocks[0].items()
-        if all(name in b and b[name].shape[1:] == values.shape[1:] for b in blocks)
-    }
 
 
 def _columns_of_messages(messages: list[Any]) -> dict[str, NDArray]:

@@ -216,13 +216,11 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
     steps = np.diff(t)
     if (steps < 0).any():
         first = int(np.argmax(steps < 0))
-        raise DrakeTeleopError(
-            f"{int((steps < 0).sum())} time stamps decrease, the first in row"
-            f" {table.line_in_file(rows[first + 1])} of {table.path.name}, by {-steps[first]:.3g}"
-            " s",
-            where=where,
-            remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
-        )
+        count, row = int((steps < 0).sum()), table.line_in_file(rows[first + 1])
+        what = f"{count} time stamps decrease, the first in row {row} of {table.path.name}"
+        what += f", by {-steps[first]:.3g} s"
+        remedy = "cut the log there, sort the rows, or use another clock: time.column, time.rate"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     if len(t) > 1 and t[0] == t[-1]:
         what = f"the time stamps of {table.path.name} never increase"
         raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")

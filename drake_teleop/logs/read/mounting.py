@@ -168,12 +168,9 @@ _MIN_MOTION_OVER_NOISE_POWER = 20.0
 
 @dataclass(frozen=True)
 class LeverArm:
-    """Estimated position of the accelerometer.
+    """Estimated p_SoIo_S (3,) of the accelerometer from its described position, in S [m].
 
-    Attributes:
-        p_SoIo_S: (3,) position relative to the described one, in S [m].
-        deviations: (3,) standard deviations [m]; inf if undetermined.
-        source: "pose" or "wrench".
+    `deviations` (3,) are standard [m], inf if undetermined; `source` is "pose" or "wrench".
     """
 
     p_SoIo_S: Array

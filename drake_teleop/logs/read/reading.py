@@ -34,10 +34,8 @@ from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES, OrientationColumn
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
-MIN_STATIC_POSES = 3
-MIN_BANDWIDTH_HZ = 1e-3
-_CONVERTED_CHUNK_ROWS = 2**16
-_MIN_IMU_GAP_OVER_STEP = 4.0
+MIN_STATIC_POSES, MIN_BANDWIDTH_HZ = 3, 1e-3
+_CONVERTED_CHUNK_ROWS, _MIN_IMU_GAP_OVER_STEP = 2**16, 4.0
 _EstimateAuto = Callable[..., auto_frames.Estimate]
 
 
