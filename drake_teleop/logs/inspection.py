@@ -30,7 +30,7 @@ from drake_teleop.logs.read.tables import Table
 BANDWIDTH_FOR_GAP_LENGTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
-"""Smallest reported share of repeated rows, apart from blocks of some rows."""
+"""Smallest reported share of repeated rows, and smallest number of rows of a reported block."""
 _MAX_DRAFT_CORRECTIONS = 5  # by the data
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}

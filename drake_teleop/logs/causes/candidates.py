@@ -51,10 +51,7 @@ _SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fitted load model with one more extension, such as drift: a possible cause of a misfit.
-
-    `score` is twice the gain in log likelihood, minus a cost of the added parameters.
-    """
+    """Fit with one more extension; `score` is twice its gain in log likelihood, minus a cost."""
 
     name: str
     state: FittedModel

@@ -179,10 +179,7 @@ def _edits_with_far_better_fit(
     given: LoadFitQuality,
     edits: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
-    """Return the edits with which a load of positive mass explains the wrench far better.
-
-    If there are none, each edit is tried with the opposite sign of the wrench.
-    """
+    """Return edits with which a load of positive mass fits far better, else with opposite sign."""
     positive, negative = [], []
     for finding, edited in edits:
         fit = corrections.call_or_none_if_unreadable(fit_description, edited)

@@ -211,8 +211,8 @@ def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:
         return None
     angle = float(np.degrees(np.arcsin(least)))
     text = (
-        f"the poses are too alike: along one direction gravity in S varies by only {angle:.2g} deg,"
+        f"the poses are too alike: along one direction gravity in S varies by only {angle:.2g} deg"
     )
-    text += " which does not separate offsets from the load"
+    text = f"{text}, which does not separate offsets from the load"
     remedy = "add poses that are turned by 45 deg or more about two horizontal axes"
     return Finding("static poses", f"{text}; {remedy}")

@@ -93,11 +93,8 @@ def find_simplest_hypothesis_and_residual(
 ) -> tuple[WrenchHypothesis, Array]:
     """Return the simplest hypothesis that explains the wrench of an episode, and its residual.
 
-    The residual (N, 6) is the reading without the wrench of load phi (10,); offsets remain.
-
-    Args:
-        usual_lag: lag of the other episodes [frames].
-        typical: (6,) half widths of the residual of other episodes [N, N m].
+    The residual (N, 6) is the reading without the wrench of load phi (10,); offsets remain. Other
+    episodes have the lag `usual_lag` [frames] and residuals of half widths `typical` (6,) [N, N m].
     """
     search = HypothesisSearch(signals, phi, usual_lag, _MIN_HALF_WIDTH_OVER_TYPICAL * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))

@@ -71,10 +71,7 @@ def _fit_sensor_model(
     which: int,
     pose_noise: tuple[float, int],
 ) -> _ImuSensorModel | None:
-    """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y.
-
-    `which` is 0 for an accelerometer, 1 for a gyroscope.
-    """
+    """Fit accelerometer (0) or gyroscope (1) data y (K, 3) to splines; None if unexplained."""
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
     even = t[0] + dt * np.arange(place[-1] + 1)
