@@ -210,9 +210,7 @@ def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:
     if least >= _MIN_GRAVITY_DIRECTION_SPREAD:
         return None
     angle = float(np.degrees(np.arcsin(least)))
-    text = (
-        f"the poses are too alike: along one direction gravity in S varies by only {angle:.2g} deg"
-    )
-    text = f"{text}, which does not separate offsets from the load"
+    alike = f"along one direction gravity in S varies by only {angle:.2g} deg"
+    effect = "which does not separate offsets from the load"
     remedy = "add poses that are turned by 45 deg or more about two horizontal axes"
-    return Finding("static poses", f"{text}; {remedy}")
+    return Finding("static poses", f"the poses are too alike: {alike}, {effect}; {remedy}")
