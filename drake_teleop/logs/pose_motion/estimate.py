@@ -204,7 +204,10 @@ def fit_motion_to_load(
     lost: NDArray[np.bool_] | None = None,
     imu: ImuData | None = None,
 ) -> PoseMotion:
-    """Return the motion from poses of S that fits a load's coefficients (6, 16), (T73), best."""
+    """Return the motion from poses of S with which a load fits a wrench best.
+
+    `coefficients` (6, 16) are the load's, Eq. (T73). Other arguments as for `estimate_from_poses`.
+    """
     with one_blas_thread():
         motion, last, _ = _find_splines_and_delay(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
