@@ -67,15 +67,11 @@ _UNIT_OF_SPELLING = {
     "n*m": "N m", "n.m": "N m",
 }  # fmt: skip
 _ALLOWED_UNITS = {
-    "force": description_fields.FORCE_UNITS,
-    "torque": description_fields.TORQUE_UNITS,
-    "specific_force": ("m/s^2", "mm/s^2", "g"),
-    "angular_velocity": ("rad/s", "deg/s"),
-    "rotation_vector": ("rad", "deg"),
-    "position": description_fields.POSITION_UNITS,
-    "euler": ("rad", "deg"),
-    "time": ("s", "ms", "us", "ns"),
-}
+    "force": description_fields.FORCE_UNITS, "torque": description_fields.TORQUE_UNITS,
+    "specific_force": ("m/s^2", "mm/s^2", "g"), "angular_velocity": ("rad/s", "deg/s"),
+    "rotation_vector": ("rad", "deg"), "position": description_fields.POSITION_UNITS,
+    "euler": ("rad", "deg"), "time": ("s", "ms", "us", "ns"),
+}  # fmt: skip
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
