@@ -461,7 +461,7 @@ def _read_and_eliminate_log(
         )
         options: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay_s": delay_s, "mode": causal}
         late = compute_causal_wrench(*both, log.dt, **options)
-        inner = {"contact": late.contact[known], "scaled": late.scaled[known]}
+        inner: dict[str, Any] = {"contact": late.contact[known], "scaled": late.scaled[known]}
         causal_wrench = replace(late, offsets=causal_offsets, **inner)
     contact = low_pass_wrench(contact_wrench(log.wrench, offsets, *log.motion, phi))
     measured = log.wrench - offsets
