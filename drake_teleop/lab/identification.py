@@ -205,17 +205,12 @@ def _trajectory_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[Fourie
 
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
-        raise DrakeTeleopError(
-            f"has {len(trajectory.q0)} joints, but the arm {robot.arm.num_joints}",
-            where="trajectory",
-            remedy="compute a trajectory for this arm",
-        )
+        what = f"has {len(trajectory.q0)} joints, but the arm {robot.arm.num_joints}"
+        raise DrakeTeleopError(what, where="trajectory", remedy="compute a trajectory for this arm")
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
-        raise DrakeTeleopError(
-            f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s",
-            where="trajectory",
-            remedy="set simulation.duration to the period",
-        )
+        what = f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s"
+        remedy = "set simulation.duration to the period"
+        raise DrakeTeleopError(what, where="trajectory", remedy=remedy)
     worst = check_trajectory(robot, trajectory)[0]
     if worst.used_share > 1:
         raise DrakeTeleopError(

@@ -6,17 +6,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    CannotWrite,
-    output_folder,
-    refuse_to_replace_inputs,
-    remove_log,
-    wrap_write_errors,
-    write_json,
-    write_picture,
-    write_table,
-)
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identification import identify_load, simulate_with_real_time_factor
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
@@ -72,32 +63,29 @@ def run_command(
     contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
-        raise DrakeTeleopError(
-            "a recorded drive contains its seed and load, which cannot be replaced",
-            where="run --inputs",
-            remedy="remove --seed and --fresh",
-        )
-    refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario)
+        what = "a recorded drive contains its seed and load, which cannot be replaced"
+        raise DrakeTeleopError(what, where="run --inputs", remedy="remove --seed and --fresh")
+    files.refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario)
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
-    with output_folder(out):
+    with files.output_folder(out):
         with show_progress(progress and not quiet) as stage:
             run = _run_into_folder(setup, out, stage, fresh, drive)
             written = stage("Write pictures and 3D replay")
-            write_picture(out / "overview.png", draw_overview(run.result))
+            files.write_picture(out / "overview.png", draw_overview(run.result))
             written(0.3)
             write_replay(out / "replay.html", run.result, run.scenario)
             written(1.0)
         summary = {"scenario": str(scenario if drive is None else drive.folder)} | summarise(run)
         session = {"load_source": run.load_source, "real_time_factor": run.real_time_factor}
-        write_table(out / "sensor_log.parquet", run.result.sensor_log())
+        files.write_table(out / "sensor_log.parquet", run.result.sensor_log())
         if run.identification is not None:
             run.identification.save(out / "identification.json")
-        write_json(out / "session.json", session)
-        write_json(out / "summary.json", summary)
+        files.write_json(out / "session.json", session)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         _print_summary(summary | session, out)
     return summary | session
@@ -108,9 +96,9 @@ def _run_into_folder(
 ) -> ScenarioRun:
     log, scenario_file = out / "log.parquet", out / _SCENARIO_FILE_NAME
     # After an interruption, old files must not look like results of this run.
-    remove_log(log)
+    files.remove_log(log)
     for name in _RESULT_FILE_NAMES:
-        with wrap_write_errors(out / name):
+        with files.wrap_write_errors(out / name):
             (out / name).unlink(missing_ok=True)
     had_scenario = scenario_file.exists()
     write_scenario(scenario_file, setup)
@@ -125,7 +113,7 @@ def _run_into_folder(
             scenario_file.unlink(missing_ok=True)
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(_describe_unfinished_log(log)) from error
-        if isinstance(error, CannotWrite):
+        if isinstance(error, files.CannotWrite):
             raise DrakeTeleopError(str(error), remedy=_describe_unfinished_log(log)) from error
         raise
 

@@ -126,11 +126,9 @@ class ImpedanceRange:
         for name in ("mass", "damping", "stiffness"):
             low, high = getattr(self, name)
             if not -np.inf < low <= high < np.inf:
-                raise DrakeTeleopError(
-                    f"{low} to {high} is no range (both ends must be finite)",
-                    where=f"ImpedanceRange.{name}",
-                    remedy="give (smallest, largest)",
-                )
+                what = f"{low} to {high} is no range (both ends must be finite)"
+                remedy = "give (smallest, largest)"
+                raise DrakeTeleopError(what, where=f"ImpedanceRange.{name}", remedy=remedy)
 
     def corners(self, omega: Array) -> Complex:
         """Return the range's corners (..., 4) [N s/m], counter-clockwise from the lower left."""

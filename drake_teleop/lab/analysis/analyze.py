@@ -13,17 +13,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import summary_values
+from drake_teleop.lab.analysis import report, summary_values
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.report import (
-    ReportCurves,
-    print_tables,
-    verdict_sentences,
-    write_report,
-)
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
 from drake_teleop.lab.identification import slave_arm
@@ -53,16 +47,16 @@ def analyze_command(
     summary, curves = analyze(setup, direction, progress and not quiet)
     summary = {"scenario": str(scenario), **summary}
     with output_folder(out):
-        write_report(summary, curves, out)
+        report.write_report(summary, curves, out)
         write_json(out / "summary.json", summary)
     if not quiet:
-        print_tables(summary, out)
+        report.print_tables(summary, out)
     return summary
 
 
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | StartStage = True
-) -> tuple[dict[str, Any], ReportCurves]:
+) -> tuple[dict[str, Any], report.ReportCurves]:
     """Analyse a scenario without its passivity method; return summary and curves of the report."""
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze_in_stages(scenario, direction, stage)
@@ -70,7 +64,7 @@ def analyze(
 
 def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
-) -> tuple[dict[str, Any], ReportCurves]:
+) -> tuple[dict[str, Any], report.ReportCurves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
@@ -141,12 +135,14 @@ def _analyze_in_stages(
         )
         measured(1.0)
     summary = to_json_data(summary)
-    summary["verdict"] = verdict_sentences(summary)
+    summary["verdict"] = report.verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
         loop = cut_loop(summary_values.axis_with_grip(contact, grip), sampling)
         nyquist[grip] = -loop_response(loop, summary_values.OMEGA, axis.delay)
-    return summary, ReportCurves(axis, summary_values.OMEGA, H, closed_form, wall, nyquist, maps)
+    return summary, report.ReportCurves(
+        axis, summary_values.OMEGA, H, closed_form, wall, nyquist, maps
+    )
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
@@ -175,11 +171,9 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
-        raise DrakeTeleopError(
-            "is 0, so that the slave cannot press on the sheet spring",
-            where="kinematic_scaling.translation_scale",
-            remedy="choose a scale above 0, or leave the sheet spring (sheet_spring) out",
-        )
+        what = "is 0, so that the slave cannot press on the sheet spring"
+        remedy = "choose a scale above 0, or leave the sheet spring (sheet_spring) out"
+        raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _TIP_DEPTH_IN_LEAF_M]
     displacement = goal - NominalSlave(scenario.slave).start_tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()

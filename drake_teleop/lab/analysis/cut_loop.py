@@ -14,13 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
+from drake_teleop.lab.analysis import period_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.period_map import (
-    RECEIVED_FORCE,
-    SAMPLED_FORCE,
-    Sampling,
-    period_map_of_cut_loop,
-)
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
@@ -59,12 +54,12 @@ class CutLoop:
         return cls(open_multipliers, closed_multipliers, np.broadcast_to(period_s, shape), *found)
 
 
-def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
+def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
     """Return the loop without delay, cut at the displayed force."""
-    M = period_map_of_cut_loop(axis, sampling)
+    M = period_map.period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
-    closed[..., :, SAMPLED_FORCE] += M[..., :n, n + 3 + RECEIVED_FORCE]
+    closed[..., :, period_map.SAMPLED_FORCE] += M[..., :n, n + 3 + period_map.RECEIVED_FORCE]
     opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
     zeros = np.linalg.eigvals(closed).astype(np.complex128)
     return CutLoop.from_multipliers(opened, zeros, 1 / np.asarray(sampling.hand_hz))

@@ -74,11 +74,9 @@ class Linearization:
         if size <= _MAX_STATES_FOR_DENSE_EIGENVALUES:
             values = np.linalg.eigvals(A.toarray())
         elif size > MAX_STATES:
-            raise DrakeTeleopError(
-                f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})",
-                where="channel.delay",
-                remedy="shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)",
-            )
+            what = f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})"
+            remedy = "shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)"
+            raise DrakeTeleopError(what, where="channel.delay", remedy=remedy)
         else:
             values = _find_eigenvalues_near_circle(
                 A.astype(complex).tocsc(), 2 * np.pi * _MAX_SEARCHED_EIGENVALUE_HZ * self.dt
@@ -136,11 +134,9 @@ class Linearization:
         parts = port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
-            raise DrakeTeleopError(
-                f"'{missing[0]}' is no port or component of this model",
-                where="close_loop",
-                remedy=f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']",
-            )
+            what = f"'{missing[0]}' is no port or component of this model"
+            remedy = f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']"
+            raise DrakeTeleopError(what, where="close_loop", remedy=remedy)
         return tuple(known.index(name) for name in parts)
 
 

@@ -107,18 +107,14 @@ def force_distortion(
 
 def _check_parameter_values(name: str, values: ArrayLike) -> Array:
     if name not in _PARAMETER_NAMES:
-        raise DrakeTeleopError(
-            f"'{name}' is no parameter of a stability map",
-            where="stability_map",
-            remedy=f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}",
-        )
+        what = f"'{name}' is no parameter of a stability map"
+        remedy = f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}"
+        raise DrakeTeleopError(what, where="stability_map", remedy=remedy)
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
-        raise DrakeTeleopError(
-            f"the values (shape {array.shape}) do not increase",
-            where=f"stability_map:{name}",
-            remedy="give at least one number, each above the one before",
-        )
+        what = f"the values (shape {array.shape}) do not increase"
+        remedy = "give at least one number, each above the one before"
+        raise DrakeTeleopError(what, where=f"stability_map:{name}", remedy=remedy)
     return array
 
 

@@ -50,11 +50,9 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
     """
     if axis.ideal_servo:
-        raise DrakeTeleopError(
-            "the sampled model does not include an ideal servo",
-            where="axis.ideal_servo",
-            remedy="set it to False with high gains, or use two_port.hybrid_matrix",
-        )
+        what = "the sampled model does not include an ideal servo"
+        remedy = "set it to False with high gains, or use two_port.hybrid_matrix"
+        raise DrakeTeleopError(what, where="axis.ideal_servo", remedy=remedy)
     servo_samples, sensor_samples = (
         _samples_per_hand_period(sampling, name) for name in ("joint_control_hz", "sensor_hz")
     )
@@ -132,11 +130,9 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
     if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
-        raise DrakeTeleopError(
-            f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)",
-            where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand",
-        )
+        what = f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)"
+        remedy = f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand"
+        raise DrakeTeleopError(what, where=f"sampling.{name}", remedy=remedy)
     return count
 
 
@@ -145,11 +141,9 @@ def _low_pass_sections(sampling: Sampling) -> Array:
         return np.zeros((0, 5))
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
     if not (cutoffs < rates / 2).all():
-        raise DrakeTeleopError(
-            "the cut-off frequency is not below half of the sensor's rate",
-            where="sampling.low_pass_hz",
-            remedy="choose less than half of sensor_hz",
-        )
+        what = "the cut-off frequency is not below half of the sensor's rate"
+        remedy = "choose less than half of sensor_hz"
+        raise DrakeTeleopError(what, where="sampling.low_pass_hz", remedy=remedy)
     pairs = zip(cutoffs.flat, rates.flat, strict=True)
     sections = np.array([butterworth_sections(cutoff, rate) for cutoff, rate in pairs])
     return sections.reshape(*rates.shape, 2, 5)

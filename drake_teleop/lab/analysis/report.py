@@ -15,16 +15,9 @@ from matplotlib.figure import Figure
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, VERMILION, Picture, plot_style
-from drake_teleop.lab.analysis import absolute_stability, transparency
+from drake_teleop.lab.analysis import absolute_stability, transparency, two_port
 from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.two_port import (
-    power_ratio,
-    reference_impedances,
-    scale_slave_power,
-    scattering_matrix,
-    transmitted_impedance,
-)
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
 #: Parameter of a map -> label of its axis, and the factor to its unit.
@@ -119,8 +112,8 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
         for column, (name, environment) in enumerate(environments.items()):
             shown = {
                 "ideal": transparency.ideal_impedance(curves.axis, s, environment),
-                "closed form": transmitted_impedance(curves.closed_form, environment),
-                "Diagram, linearised": transmitted_impedance(curves.H, environment),
+                "closed form": two_port.transmitted_impedance(curves.closed_form, environment),
+                "Diagram, linearised": two_port.transmitted_impedance(curves.H, environment),
             }
             styles = ((GREY, "--", 1.0), (COLOURS[3], "-", 2.4), (COLOURS[0], "-", 1.1))
             for (label, felt), (colour, line, width) in zip(shown.items(), styles, strict=True):
@@ -167,9 +160,9 @@ def draw_nyquist(curves: ReportCurves) -> Figure:
 def draw_absolute_stability(curves: ReportCurves) -> Figure:
     """Draw Llewellyn's parameter, the scattering norm, and structured singular values mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
-    ratio = power_ratio(axis)
-    scaled = scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
-    S = scattering_matrix(scaled, reference_impedances(axis))
+    ratio = two_port.power_ratio(axis)
+    scaled = two_port.scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
+    S = two_port.scattering_matrix(scaled, two_port.reference_impedances(axis))
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
     hands = absolute_stability.impedance_range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)

@@ -58,11 +58,9 @@ class Criterion:
 
     def __init__(self, name: str, scales: CriterionScales) -> None:
         if name not in CRITERIA:
-            raise DrakeTeleopError(
-                f"there is no criterion '{name}'",
-                where="criterion",
-                remedy=f"choose one of {', '.join(CRITERIA)}",
-            )
+            what = f"there is no criterion '{name}'"
+            remedy = f"choose one of {', '.join(CRITERIA)}"
+            raise DrakeTeleopError(what, where="criterion", remedy=remedy)
         self.name = name
         self.with_offsets = name.endswith("16")
         whitened = name in ("kappa_w10", "A16", "D16")

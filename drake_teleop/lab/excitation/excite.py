@@ -11,21 +11,9 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
+from drake_teleop.lab.excitation import limits, optimizer
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ, LimitUse, check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
-from drake_teleop.lab.excitation.limits import (
-    LIMIT_NAMES,
-    allocate_link_motions,
-    write_limit_uses,
-    write_link_motions,
-    write_sensor_motion,
-)
-from drake_teleop.lab.excitation.optimizer import (
-    DesignProblem,
-    DesignTask,
-    FeasibleIterate,
-    minimise_criterion,
-)
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -85,7 +73,7 @@ def excite(
 
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
-    task = DesignTask(
+    task = optimizer.DesignTask(
         robot.arm.table,
         robot.limits,
         Criterion(criterion, robot.criterion_scales),
@@ -99,8 +87,8 @@ def excite(
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        problem = DesignProblem(task)
-        found = minimise_criterion(
+        problem = optimizer.DesignProblem(task)
+        found = optimizer.minimise_criterion(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.criterion_value for iterate in found), default=np.inf))
@@ -120,7 +108,7 @@ def excite(
 def assemble_excitation(
     robot: Robot,
     criterion: str,
-    iterates: list[FeasibleIterate],
+    iterates: list[optimizer.FeasibleIterate],
     trajectory: FourierTrajectory,
     uses: list[LimitUse],
 ) -> Excitation:
@@ -142,7 +130,7 @@ def assemble_excitation(
 
 def find_best_within_limits(
     robot: Robot,
-    iterates: list[FeasibleIterate],
+    iterates: list[optimizer.FeasibleIterate],
     progress: Callable[[float], None] = lambda done: None,
     fallback_trajectories: Iterable[FourierTrajectory] = (),
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
@@ -180,16 +168,16 @@ def trajectory_sensor_motion(
 ) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = allocate_link_motions(*joints[0].shape)
-    write_link_motions(robot.arm.table, *joints, motions)
+    motions = limits.allocate_link_motions(*joints[0].shape)
+    limits.write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
-    write_sensor_motion(motions, out)
+    limits.write_sensor_motion(motions, out)
     s, omega, alpha = out
     return s, omega, alpha
 
 
 def _feasible_candidates(
-    iterates: list[FeasibleIterate], robot: Robot
+    iterates: list[optimizer.FeasibleIterate], robot: Robot
 ) -> Iterator[FourierTrajectory]:
     ranked = sorted(iterates, key=lambda iterate: iterate.criterion_value)
     last = dict.fromkeys((iterate.start_index for iterate in ranked), 0.0)
@@ -209,7 +197,10 @@ def _feasible_candidates(
 
 
 def _shrinking_motions_about_start_posture(
-    robot: Robot, iterates: list[FeasibleIterate], problem: DesignProblem, seed: int
+    robot: Robot,
+    iterates: list[optimizer.FeasibleIterate],
+    problem: optimizer.DesignProblem,
+    seed: int,
 ) -> Iterator[FourierTrajectory]:
     best = sorted(iterates, key=lambda iterate: iterate.criterion_value)[:_NUM_FALLBACK_MOTIONS]
     motions = [iterate.trajectory for iterate in best]
@@ -227,11 +218,11 @@ def _shrinking_motions_about_start_posture(
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = allocate_link_motions(*joints[0].shape)
-    write_link_motions(robot.arm.table, *joints, motions)
-    smooth, largest = np.empty((2, len(LIMIT_NAMES)))
-    gradients = np.empty((len(LIMIT_NAMES), 3, *joints[0].shape))
-    write_limit_uses(
+    motions = limits.allocate_link_motions(*joints[0].shape)
+    limits.write_link_motions(robot.arm.table, *joints, motions)
+    smooth, largest = np.empty((2, len(limits.LIMIT_NAMES)))
+    gradients = np.empty((len(limits.LIMIT_NAMES), 3, *joints[0].shape))
+    limits.write_limit_uses(
         robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
     )
     return largest

@@ -129,19 +129,15 @@ def RobotFromModel(
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
-            raise DrakeTeleopError(
-                f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg",
-                where="--payload",
-                remedy="give the mass beyond the sensor in kg",
-            )
+            what = f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg"
+            remedy = "give the mass beyond the sensor in kg"
+            raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         if payload is None:
             assumptions.append(f"a load of {mass:g} kg (--payload)")
         if mass <= load[0]:
-            raise DrakeTeleopError(
-                f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor",
-                where="--payload",
-                remedy="give the total mass beyond the sensor, or remove the option",
-            )
+            what = f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor"
+            remedy = "give the total mass beyond the sensor, or remove the option"
+            raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         missing_mass, com = mass - load[0], np.array([0.0, 0.0, _ASSUMED_PAYLOAD_COM_ALONG_Z_S_M])
         inertia = missing_mass * _ASSUMED_PAYLOAD_GYRATION_RADIUS_M**2 * np.eye(3) * 2 / 3
         reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)

@@ -18,27 +18,9 @@ from scipy.special import ndtri
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.lab.excitation import excite, limits, optimizer, prediction
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.excite import (
-    Excitation,
-    assemble_excitation,
-    find_best_within_limits,
-    trajectory_sensor_motion,
-)
-from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_gradient_by_joints
-from drake_teleop.lab.excitation.optimizer import (
-    Bounds,
-    DesignProblem,
-    DesignTask,
-    Evaluation,
-    minimise_criterion,
-)
-from drake_teleop.lab.excitation.prediction import (
-    SensorNoise,
-    predicted_covariance,
-    spatial_inertia_matrix,
-)
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import (
@@ -76,7 +58,7 @@ _INFORMATION_REGULARISATION = 1e-11
 class ShortestMotion:
     """Checked motion; `errors_over_tolerances` (k,) are predicted errors, at most 1."""
 
-    excitation: Excitation
+    excitation: excite.Excitation
     errors_over_tolerances: Array
 
 
@@ -97,7 +79,7 @@ def design_shortest_motion(
     errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
     errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
-    task = DesignTask(
+    task = optimizer.DesignTask(
         robot.arm.table,
         robot.limits,
         Criterion("A16", robot.criterion_scales),
@@ -111,7 +93,7 @@ def design_shortest_motion(
     for k in range(_MAX_DESIGN_ROUNDS):
         problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
-        found = minimise_criterion(
+        found = optimizer.minimise_criterion(
             problem, seed=seed + _SEED_STEP_BETWEEN_ROUNDS * k, starts=num_starts, progress=progress
         )
         found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
@@ -120,9 +102,9 @@ def design_shortest_motion(
                 break
             around = None
             continue
-        trajectory, uses = find_best_within_limits(robot, found)
-        motion = trajectory_sensor_motion(robot, trajectory)
-        covariance = predicted_covariance(
+        trajectory, uses = excite.find_best_within_limits(robot, found)
+        motion = excite.trajectory_sensor_motion(robot, trajectory)
+        covariance = prediction.predicted_covariance(
             *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
         )
         reached = deviations_over_tolerances(errors, covariance)
@@ -133,7 +115,7 @@ def design_shortest_motion(
             progressed = trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
             vain_rounds = 0 if progressed else vain_rounds + 1
             if trajectory.period < shortest_period:
-                excitation = assemble_excitation(robot, "period", found, trajectory, uses)
+                excitation = excite.assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
             if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
@@ -157,7 +139,7 @@ def sidak_factor(count: int) -> float:
     return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / count)))
 
 
-class ShortestMotionProblem(DesignProblem):
+class ShortestMotionProblem(optimizer.DesignProblem):
     """Design problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
@@ -169,7 +151,9 @@ class ShortestMotionProblem(DesignProblem):
         best: unknowns of the shortest period passed to `value`.
     """
 
-    def __init__(self, task: DesignTask, errors: Array, robot: Robot, around: Array | None) -> None:
+    def __init__(
+        self, task: optimizer.DesignTask, errors: Array, robot: Robot, around: Array | None
+    ) -> None:
         super().__init__(task)
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
@@ -178,7 +162,7 @@ class ShortestMotionProblem(DesignProblem):
         self._noise = white_noise_densities_over_wrench_noise(noise, phi)
         self._roots = np.sqrt(noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
-        self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
+        self._gradients = np.empty((2 + len(limits.LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
@@ -198,13 +182,15 @@ class ShortestMotionProblem(DesignProblem):
         self.task = task
         return np.append(x, np.log(period))
 
-    def bounds(self, x: Array) -> Bounds:
+    def bounds(self, x: Array) -> optimizer.Bounds:
         """Return bounds of the unknowns; only log T is bounded, near that of x."""
         ends = x[-1] + np.array([-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP])
         low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
-    def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
+    def evaluate(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float
+    ) -> optimizer.Evaluation:
         """Evaluate log T and eight limits: the tolerance, then those of the arm."""
         self._at = x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
@@ -213,7 +199,7 @@ class ShortestMotionProblem(DesignProblem):
         g[:2] = 0.0
         sharpness = _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
         use, worst, g_V = self._largest_error_over_tolerance(sharpness)
-        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
+        limits.add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
@@ -222,7 +208,9 @@ class ShortestMotionProblem(DesignProblem):
         g[:, 1] /= T
         g[:, 2] /= T**2
         gradients = np.hstack([self._gradients_by_unknowns(), by_log_period[:, np.newaxis]])
-        return Evaluation(float(x[-1]), np.append(use, smooth), gradients, max(worst, largest))
+        return optimizer.Evaluation(
+            float(x[-1]), np.append(use, smooth), gradients, max(worst, largest)
+        )
 
     def value(self) -> float:
         """Return the period of the last evaluated point [s]."""
@@ -267,13 +255,13 @@ class ShortestMotionProblem(DesignProblem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise_densities_over_wrench_noise(noise: SensorNoise, phi: Array) -> Array:
+def white_noise_densities_over_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)
         at_So[:3, 3:] = cross_matrix(noise.p_SoAo_S)
-        through = spatial_inertia_matrix(phi) @ at_So
+        through = prediction.spatial_inertia_matrix(phi) @ at_So
         density = density + through @ np.diag(noise.white_noise_densities[6:]) @ through.T
     roots = np.sqrt(noise.white_noise_densities[:6])
     return density / np.outer(roots, roots)

@@ -76,11 +76,9 @@ def new_command(
             read += [slave.tool.path] if tool and slave.tool else []
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
-                raise DrakeTeleopError(
-                    "does not describe the given models, whose names YAML cannot contain",
-                    where=str(scenario),
-                    remedy="use simpler names of files and frames",
-                )
+                what = "does not describe the given models, whose names YAML cannot contain"
+                remedy = "use simpler names of files and frames"
+                raise DrakeTeleopError(what, where=str(scenario), remedy=remedy)
     except BaseException:
         for each in made:
             with suppress(OSError):

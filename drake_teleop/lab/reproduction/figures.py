@@ -9,16 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from drake_teleop.common import style
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    VERMILION,
-    Picture,
-    plot_style,
-    shade_contact,
-)
 
 
 def scaling_figure(
@@ -36,11 +28,11 @@ def scaling_figure(
     """
     time, time_unit = _time_axis(t)
     traces = [np.asarray(trace, float) for trace in values]
-    with plot_style():
-        figure = Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
+    with style.plot_style():
+        figure = style.Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
         rows = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for axes, trace, sigma in zip(rows, traces, sigmas, strict=True):
-            axes.plot(time, trace, color=BLUE if sigma else GREEN)
+            axes.plot(time, trace, color=style.BLUE if sigma else style.GREEN)
             axes.set_title(_sigma_title(sigma))
             peak = float(np.abs(trace).max())
             slave, master = _format_number(peak), _format_number(peak / downscaling)
@@ -73,22 +65,24 @@ def contact_figure(
     per_second = 1e3 if time_unit == "ms" else 1.0
     traces = [np.asarray(trace, float) for trace in (measured, contact_force)]
     touched = np.asarray(contact, bool)
-    with plot_style():
-        figure = Picture(figsize=(7.6, 5.0))
+    with style.plot_style():
+        figure = style.Picture(figsize=(7.6, 5.0))
         rows = figure.subplots(2, 1, sharex=True, sharey=True)
         titles = ("Measured force", "Calculated contact force, σ = 0")
-        for axes, trace, title, colour in zip(rows, traces, titles, (BLUE, GREEN), strict=True):
-            shade_contact(axes, time, touched)
+        for axes, trace, title, colour in zip(
+            rows, traces, titles, (style.BLUE, style.GREEN), strict=True
+        ):
+            style.shade_contact(axes, time, touched)
             axes.plot(time, trace, color=colour)
             axes.set_title(title)
             axes.set_ylabel(f"{symbol} [N]")
             if turning_s is not None:
-                _draw_time_mark(axes, turning_s * per_second, "no contact", GREY)
+                _draw_time_mark(axes, turning_s * per_second, "no contact", style.GREY)
         if touched.any():
-            _draw_time_mark(rows[0], time[np.argmax(touched)], "contact", VERMILION)
-        _draw_time_mark(rows[1], detected_s * per_second, "detected", VERMILION)
+            _draw_time_mark(rows[0], time[np.argmax(touched)], "contact", style.VERMILION)
+        _draw_time_mark(rows[1], detected_s * per_second, "detected", style.VERMILION)
         for level in (-threshold, threshold):
-            rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
+            rows[1].axhline(level, color=style.VERMILION, linewidth=0.8, linestyle=":")
         peaks = [f"peak {_format_number(np.abs(trace).max())} N" for trace in traces]
         _write_note_above_axes(rows[0], peaks[0])
         _write_note_above_axes(rows[1], f"{peaks[1]}   ·   threshold {_format_number(threshold)} N")
@@ -122,7 +116,7 @@ def _format_number(value: float) -> str:
 
 
 def _write_note_above_axes(axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="right", color=GREY, fontsize=8.5)
+    axes.set_title(text, loc="right", color=style.GREY, fontsize=8.5)
 
 
 def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> None:
@@ -130,7 +124,7 @@ def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> Non
         "right",
         functions=(lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling),
     )
-    right.set_ylabel(label, color=GREY)
+    right.set_ylabel(label, color=style.GREY)
     right.spines["right"].set_visible(True)
 
 
