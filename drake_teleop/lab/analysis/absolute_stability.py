@@ -204,10 +204,8 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
-
-
 def _enclosing_discs(corners: Complex) -> tuple[Complex, Array]:
     half = (corners[..., 2:3] - corners[..., :1]) / 2
-    right = half.real + np.abs(half) * _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS
+    # Centres of the discs, from few to many half diagonals beside the range.
+    right = half.real + np.abs(half) * np.array([0.3, 1.0, 3.0, 10.0, 100.0])
     return corners[..., :1] + 1j * half.imag + right, np.hypot(right, half.imag)

@@ -20,14 +20,13 @@ from drake_teleop.lab.analysis.linearization import close_network, hybrid_along,
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
-from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.identification import true_load
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_TIP_DEPTH_IN_LEAF_M = 5e-3
 
 
 def analyze_command(
@@ -67,12 +66,11 @@ def _analyze_in_stages(
 ) -> tuple[dict[str, Any], report.ReportCurves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
-    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    estimate = true_load(scenario)
     along = task_direction(linear, UNIT_VECTORS[direction])
     sampling = sampling_of_scenario(linear)
-    wall = (5100.0, 0.0)
-    if along.axis.wall_stiffness > 0.0:
-        wall = (along.axis.wall_stiffness, along.axis.wall_damping)
+    is_wall_known, omega = along.axis.wall_stiffness > 0.0, summary_values.OMEGA
+    wall = (along.axis.wall_stiffness, along.axis.wall_damping) if is_wall_known else (5100.0, 0.0)
     axis = dataclasses.replace(along.axis, wall_stiffness=0.0, wall_damping=0.0)
     contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
 
@@ -88,9 +86,8 @@ def _analyze_in_stages(
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    with_hand = hybrid_along(
-        close_other_directions(free, linear, along), summary_values.OMEGA, along.hand, along.tool
-    )
+    one_open = close_other_directions(free, linear, along)
+    with_hand = hybrid_along(one_open, omega, along.hand, along.tool)
     H = absorb_impedances(with_hand, hand=-summary_values.S_AT_OMEGA * axis.hand_mass)
     closed_form = hybrid_matrix(axis, summary_values.S_AT_OMEGA)
     progress(0.3)
@@ -100,7 +97,7 @@ def _analyze_in_stages(
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": wall[0],
-        "wall_is": describe_wall_source(scenario, along.axis.wall_stiffness > 0.0),
+        "wall_is": describe_wall_source(scenario, is_wall_known),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
             summary_values.summarise_diagram_stability(
@@ -130,19 +127,15 @@ def _analyze_in_stages(
     summary["measured"] = None
     if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        summary["measured"] = summary_values.measure_free_impedance(
-            linear, along, close_other_directions(free, linear, along)
-        )
+        summary["measured"] = summary_values.measure_free_impedance(linear, along, one_open)
         measured(1.0)
     summary = to_json_data(summary)
     summary["verdict"] = report.verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
         loop = cut_loop(summary_values.axis_with_grip(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, summary_values.OMEGA, axis.delay)
-    return summary, report.ReportCurves(
-        axis, summary_values.OMEGA, H, closed_form, wall, nyquist, maps
-    )
+        nyquist[grip] = -loop_response(loop, omega, axis.delay)
+    return summary, report.ReportCurves(axis, omega, H, closed_form, wall, nyquist, maps)
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
@@ -158,12 +151,8 @@ def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
 
 def sampling_of_scenario(scenario: Scenario) -> Sampling:
     rates, sensor = scenario.rates, scenario.wrist_sensor
-    return Sampling(
-        rates.hand_hz,
-        rates.joint_control_hz,
-        rates.sensor_hz,
-        None if sensor.ideal else sensor.bandwidth_hz,
-    )
+    low_pass_hz = None if sensor.ideal else sensor.bandwidth_hz
+    return Sampling(rates.hand_hz, rates.joint_control_hz, rates.sensor_hz, low_pass_hz)
 
 
 def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
@@ -174,7 +163,7 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
         what = "is 0, so that the slave cannot press on the sheet spring"
         remedy = "choose a scale above 0, or leave the sheet spring (sheet_spring) out"
         raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
-    goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _TIP_DEPTH_IN_LEAF_M]
+    goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).start_tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ displacement / scaling.translation_scale)

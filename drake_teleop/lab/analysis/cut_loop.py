@@ -22,7 +22,6 @@ _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
 _ANGLE_OFFSETS_NEAR_POLES = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_GAIN_CROSSINGS = 32
-_MAX_GAIN_OF_NO_LOOP = 1e-9  # largest |L| that counts as no loop
 _DISTANCE_OF_MULTIPLIER_FROM_ONE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
@@ -80,7 +79,7 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
 
     `response` (N,) is from `loop_response`, at increasing frequencies.
     """
-    if np.abs(response).max() < _MAX_GAIN_OF_NO_LOOP:
+    if np.abs(response).max() < 1e-9:  # no loop
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
     crossings = _zero_crossing_fractions(log_gain)

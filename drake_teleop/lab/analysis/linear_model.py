@@ -16,7 +16,6 @@ from drake_teleop.lab.analysis.one_axis import Complex
 COMPONENT_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 _MAX_STATES_FOR_DENSE_EIGENVALUES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # limit of the sparse search
 _EIGENVALUES_PER_SHIFT = 40
 
 
@@ -78,9 +77,8 @@ class Linearization:
             remedy = "shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)"
             raise DrakeTeleopError(what, where="channel.delay", remedy=remedy)
         else:
-            values = _find_eigenvalues_near_circle(
-                A.astype(complex).tocsc(), 2 * np.pi * _MAX_SEARCHED_EIGENVALUE_HZ * self.dt
-            )
+            highest = 2 * np.pi * 100.0 * self.dt
+            values = _find_eigenvalues_near_circle(A.astype(complex).tocsc(), highest)
         return values[np.argsort(-np.abs(values))].astype(complex)
 
     @property

@@ -60,14 +60,12 @@ def stability_map(
     """
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
-    def axis_and_loop_at(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
-        return _axis_and_loop_with_values(axis, sampling, {x_name: at_x, y_name: at_y})
-
     def is_stable(at_x: Array, at_y: Array) -> NDArray[np.bool_]:
-        moved, loop = axis_and_loop_at(at_x, at_y)
+        values = {x_name: at_x, y_name: at_y}
+        moved, loop = _axis_and_loop_with_values(axis, sampling, values)
         return count_unstable_multipliers(loop, moved.delay) == 0
 
-    moved, loop = axis_and_loop_at(xs, ys[:, None])
+    moved, loop = _axis_and_loop_with_values(axis, sampling, {x_name: xs, y_name: ys[:, None]})
     shape = len(ys), len(xs)
     unstable = np.broadcast_to(count_unstable_multipliers(loop, moved.delay), shape)
     stable = unstable == 0

@@ -53,9 +53,8 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
         what = "the sampled model does not include an ideal servo"
         remedy = "set it to False with high gains, or use two_port.hybrid_matrix"
         raise DrakeTeleopError(what, where="axis.ideal_servo", remedy=remedy)
-    servo_samples, sensor_samples = (
-        _samples_per_hand_period(sampling, name) for name in ("joint_control_hz", "sensor_hz")
-    )
+    servo_samples = _samples_per_hand_period(sampling, "joint_control_hz")
+    sensor_samples = _samples_per_hand_period(sampling, "sensor_hz")
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
     n = FIRST_FILTER_STATE + 2 * sections.shape[-2]
@@ -201,11 +200,9 @@ class _PeriodMapRows:
         return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
 
     def slave_rows(self, time: Array) -> Array:
-        axis = self._axis
-        mass = axis.slave_mass
-        x, v, push = mass_spring_responses_to_unit_x_v_u(
-            axis.wall_stiffness / mass, axis.wall_damping / mass, time
-        )
+        mass = self._axis.slave_mass
+        stiffness, damping = self._axis.wall_stiffness / mass, self._axis.wall_damping / mass
+        x, v, push = mass_spring_responses_to_unit_x_v_u(stiffness, damping, time)
         by_force = -push / np.asarray(mass)[..., None]
         ahead = {SLAVE_X: x, SLAVE_V: v, SERVO_A: push, _HELD_ENVIRONMENT_FORCE: by_force}
         rows = [self._make_row({k: y[..., i] for k, y in ahead.items()}) for i in range(2)]

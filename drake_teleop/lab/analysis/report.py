@@ -65,19 +65,13 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the parameters of the one-axis model as rows (name, value with unit)."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
+    hand = f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m"
+    loops = (f"{which} loop {axis[f'{which}_gain']:.4g} 1/s" for which in ("position", "velocity"))
     return [
-        (
-            "Hand",
-            f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m, "
-            f"{axis['hand_stiffness']:g} N/m",
-        ),
+        ("Hand", f"{hand}, {axis['hand_stiffness']:g} N/m"),
         ("Device", f"{axis['device_mass']:.4g} kg, {axis['device_damping']:.3g} N s/m"),
         ("Slave, with its tool", f"{axis['slave_mass']:.4g} kg at the tip"),
-        (
-            "Servo",
-            f"position loop {axis['position_gain']:.4g} 1/s, "
-            f"velocity loop {axis['velocity_gain']:.4g} 1/s",
-        ),
+        ("Servo", ", ".join(loops)),
         ("Tool beyond the sensor", f"{axis['tool_mass']:g} kg"),
         ("Scales", f"force {scale}, motion {axis['position_scale']:g}"),
         ("Elimination", f"σ = {axis['sigma']:g}, γ = {axis['gamma']:g}"),
@@ -89,14 +83,11 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
     wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
     if not row["stable"]:
         return (row["grip"], wall, "no", "", "", "")
-    return (
-        row["grip"],
-        wall,
-        "yes",
-        "any" if row["gain"] is None else f"{row['gain']:.3g}",
-        "any" if row["phase_deg"] is None else f"{row['phase_deg']:.0f}°",
-        "any" if row["round_trip_s"] is None else f"{1e3 * (row['round_trip_s'] - 2 * delay):.1f}",
-    )
+    trip = row["round_trip_s"]
+    gain = "any" if row["gain"] is None else f"{row['gain']:.3g}"
+    phase = "any" if row["phase_deg"] is None else f"{row['phase_deg']:.0f}°"
+    reserve = "any" if trip is None else f"{1e3 * (trip - 2 * delay):.1f}"
+    return (row["grip"], wall, "yes", gain, phase, reserve)
 
 
 def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
@@ -318,10 +309,8 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
         "These limits exclude Coulomb friction, which dissipates energy.",
     ]
     if absolute["absolutely_stable"]:
-        return [
-            *sentences,
-            "It is absolutely stable: no passive hand and environment make it oscillate.",
-        ]
+        stable = "It is absolutely stable: no passive hand and environment make it oscillate."
+        return [*sentences, stable]
     lacking = absolute["lacking_damping_Ns_per_m"]
     remedy = "No damping" if lacking is None else f"{lacking:.3g} N s/m more damping"
     return [

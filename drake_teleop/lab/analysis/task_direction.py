@@ -143,10 +143,8 @@ def _find_displaced_posture(slave: SlavePlant, displacement_W: Array) -> Array:
     else:
         q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
-        raise DrakeTeleopError(
-            f"the arm cannot reach this displacement of {displacement_W} m "
-            f"({IkStatus(status).name})",
-            where="displacement",
-            remedy="choose a smaller displacement or another start posture",
-        )
+        reason = IkStatus(status).name
+        what = f"the arm cannot reach this displacement of {displacement_W} m ({reason})"
+        remedy = "choose a smaller displacement or another start posture"
+        raise DrakeTeleopError(what, where="displacement", remedy=remedy)
     return q
