@@ -17,14 +17,9 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_LOAD_SOURCE_OF_RUN = "estimated during the run"
 _SCENARIO_FILE_NAME = "scenario.yaml"
 _RESULT_FILE_NAMES = (
-    "sensor_log.parquet",
-    "identification.json",
-    "overview.png",
-    "replay.html",
-    "session.json",
+    *("sensor_log.parquet", "identification.json", "overview.png", "replay.html", "session.json"),
 )
 
 
@@ -135,26 +130,20 @@ def run_scenario(
         fresh: True ignores the cached load.
     """
     check_scenario(scenario)
-    estimates_load = scenario.load_estimator.enabled
+    estimates_load, source = scenario.load_estimator.enabled, "estimated during the run"
     if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
-        return ScenarioRun(
-            scenario,
-            found.result,
-            found.identification,
-            _LOAD_SOURCE_OF_RUN,
-            found.real_time_factor,
-        )
-    identification, estimate, floor, source = None, None, None, _LOAD_SOURCE_OF_RUN
+        loaded = found.identification, source, found.real_time_factor
+        return ScenarioRun(scenario, found.result, *loaded)
+    identification, estimate, floor = None, None, None
     with show_progress(progress) as stage:
         if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
             identification, estimate, floor = load.identification, load.estimate, load.noise_floor
             source = "cache" if load.from_cache else "identified before the run"
         station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-        result, factor = simulate_with_real_time_factor(
-            station, scenario.simulation, stage("Run the scenario"), log
-        )
+        started = stage("Run the scenario")
+        result, factor = simulate_with_real_time_factor(station, scenario.simulation, started, log)
     return ScenarioRun(scenario, result, identification, source, factor)
 
 

@@ -67,11 +67,10 @@ def compare_command(
     Rates, integrator and environment of the scenario are not used. Return the content of
     summary.json (docs/delay-figures.md).
     """
-    for name in networks:
-        if name not in PRESETS:
-            remedy = suggest_name(name, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
-            what = f"there is no network '{name}'"
-            raise DrakeTeleopError(what, where="networks", remedy=remedy)
+    if unknown := [name for name in networks if name not in PRESETS]:
+        remedy = suggest_name(unknown[0], tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
+        what = f"there is no network '{unknown[0]}'"
+        raise DrakeTeleopError(what, where="networks", remedy=remedy)
     methods = tuple(METHODS) if methods is None else methods
     for name in methods:
         METHODS.check(name, "methods")
@@ -151,9 +150,8 @@ def simulate_press(
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(one_dof.RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
-    setup, task = delayed_contact.delayed_contact(
-        scenario, Channel(network=network), PassivityConfig(method=method), leaf
-    )
+    channel, passivity = Channel(network=network), PassivityConfig(method=method)
+    setup, task = delayed_contact.delayed_contact(scenario, channel, passivity, leaf)
     setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
@@ -202,15 +200,11 @@ def _run_one_dof_study(
     for method in methods:
         step_addresses(method)
     seeds = range(seed, seed + 2)
-    found = _run_in_processes(
-        longest_round_trip,
-        [
-            (m, one_dof.OneDof(wall_stiffness=wall), *impairment, seeds)
-            for m, wall, impairment in cases
-        ],
-        jobs,
-        stage("One degree of freedom"),
-    )
+    runs = [
+        (method, one_dof.OneDof(wall_stiffness=wall), *impairment, seeds)
+        for method, wall, impairment in cases
+    ]
+    found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
     return [
         {
             "method": method,
@@ -228,16 +222,10 @@ def _run_release_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
-    found = _run_in_processes(
-        simulate_release_and_taps,
-        [(method, network, seed) for network, method in cases],
-        jobs,
-        stage("Let go, and taps"),
-    )
+    runs = [(method, network, seed) for network, method in cases]
+    found = _run_in_processes(simulate_release_and_taps, runs, jobs, stage("Let go, and taps"))
     return [
-        {"method": method, "network": network}
-        | dataclasses.asdict(one)
-        | {"tap_shares": list(one.tap_shares)}
+        {"method": method, "network": network, **vars(one), "tap_shares": list(one.tap_shares)}
         for (network, method), one in zip(cases, found, strict=True)
     ]
 
@@ -249,17 +237,11 @@ def _run_station_study(
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, delayed_contact.LEAF_THICKNESSES_M, methods))
-    results = _run_in_processes(
-        simulate_press,
-        [(base, method, network, leaf, estimate) for network, leaf, method in cases],
-        jobs,
-        stage("The whole station"),
-    )
+    runs = [(base, method, network, leaf, estimate) for network, leaf, method in cases]
+    results = _run_in_processes(simulate_press, runs, jobs, stage("The whole station"))
     leaves = list(delayed_contact.LEAF_THICKNESSES_M)
-    rows = sorted(
-        (row for row, _ in results),
-        key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])),
-    )
+    rows = [row for row, _ in results]
+    rows.sort(key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results
@@ -273,15 +255,10 @@ def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
         model = one_dof.OneDof(sigma=sigma, wall_stiffness=wall)
         run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
-        rows.append(
-            {
-                "sigma": sigma,
-                "round_trip_s": round_trip,
-                "wall_N_per_m": wall,
-                "injected_J": max(0.0, -run.least_energy_sum(one_dof.ACTUAL)),
-                "damping_Ns_per_m": one_dof.covering_damping(model, round_trip),
-            }
-        )
+        row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
+        row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.ACTUAL))
+        row["damping_Ns_per_m"] = one_dof.covering_damping(model, round_trip)
+        rows.append(row)
         progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))
     return rows
 

@@ -80,17 +80,15 @@ def delayed_contact(
         width=_LEAF_WIDTH_M,
         thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
-    return (
-        replace(
-            base.without_environment(),
-            simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
-            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
-            channel=channel,
-            passivity=passivity,
-            sheet_spring=sheet,
-        ),
-        task,
+    scenario = replace(
+        base.without_environment(),
+        simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
+        operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
+        channel=channel,
+        passivity=passivity,
+        sheet_spring=sheet,
     )
+    return scenario, task
 
 
 def leaf_thickness(stiffness: float) -> float:
