@@ -9,8 +9,7 @@ from typing import Any
 from drake_teleop.lab.comparison.one_dof import WRIST_TO_TIP_DISTANCE_M
 from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N
 
-VERDICT_UNSTABLE = "unstable"
-VERDICT_POSITION_ERROR = "position error"
+VERDICT_UNSTABLE, VERDICT_POSITION_ERROR = "unstable", "position error"
 VERDICT_CHATTERS, VERDICT_LEAKS, VERDICT_HOLDS = "chatters", "leaks", "holds"
 MAX_POSITION_ERROR_M, MIN_LEAKED_ENERGY_J = 5e-3, 1e-3  #: m; J
 

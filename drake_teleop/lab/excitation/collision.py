@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,8 +22,7 @@ from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize_without_limit_warnings
 
-# Vertices of the circumscribed polygon of a cylinder.
-_NUM_CYLINDER_RIM_POINTS = 24
+_NUM_CYLINDER_RIM_POINTS = 24  # of the circumscribed polygon of a cylinder
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +70,9 @@ def _convex_hull_points(shape: geometry.Shape) -> Array:
         return corners * [shape.a(), shape.b(), shape.c()]
     if isinstance(shape, geometry.Cylinder):
         angle = 2 * np.pi * np.arange(_NUM_CYLINDER_RIM_POINTS) / _NUM_CYLINDER_RIM_POINTS
-        radius = shape.radius() / np.cos(np.pi / _NUM_CYLINDER_RIM_POINTS)
-        rim = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-        half = shape.length() / 2
-        ends = [np.column_stack([rim, np.full(_NUM_CYLINDER_RIM_POINTS, z)]) for z in (-half, half)]
-        return np.concatenate(ends)
+        radius, half = shape.radius() / np.cos(np.pi / len(angle)), shape.length() / 2
+        x, y = radius * np.cos(angle), radius * np.sin(angle)
+        return np.vstack([np.column_stack([x, y, np.full(len(x), z)]) for z in (-half, half)])
     hull = shape.GetConvexHull()
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
 
@@ -96,17 +94,14 @@ _NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
 _NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.02, 0.05), 0.25, 0.1
-# Smallest number of postures near contact for a correction.
-_MIN_POSTURES_NEAR_CONTACT = 5
+_MIN_POSTURES_NEAR_CONTACT = 5  # for a correction
 # Share of postures below which near capsules count although their shapes were never near.
 _MAX_SHARE_OF_RARE_CAPSULE_CONTACT = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
-_BOX_FOR_HALF_SPACE, _POSE_OF_BOX_FOR_HALF_SPACE = (
-    geometry.Box(10, 10, 1),
-    RigidTransform([0, 0, -0.5]),
-)
+_BOX_FOR_HALF_SPACE = geometry.Box(10, 10, 1)
+_POSE_OF_BOX_FOR_HALF_SPACE = RigidTransform([0, 0, -0.5])
 _MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
@@ -132,9 +127,8 @@ class CollisionScene:
         _add_load(self.plant, instance, self.sensor_frame, reserve)
         _complete_collision_shapes(self.plant, self.scene_graph, visuals_collide)
         _check_shape_sizes(self.plant, self.scene_graph, where)
-        _add_shape(
-            self.plant, self.plant.world_body(), RigidTransform(), geometry.HalfSpace(), _TABLE_NAME
-        )
+        world, table = self.plant.world_body(), geometry.HalfSpace()
+        _add_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)
         finalize_without_limit_warnings(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
@@ -153,15 +147,10 @@ class CollisionScene:
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
-            together = [
-                shape
-                for body, row in self._rows.items()
-                if row == link
-                for shape in self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
-            ]
-            manager.Apply(
-                geometry.CollisionFilterDeclaration().ExcludeWithin(geometry.GeometrySet(together))
-            )
+            bodies = [self.plant.get_body(body) for body, row in self._rows.items() if row == link]
+            together = itertools.chain(*map(self.plant.GetCollisionGeometriesForBody, bodies))
+            shapes = geometry.GeometrySet(list(together))
+            manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(shapes))
         candidates = self.scene_graph.model_inspector().GetCollisionCandidates()
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
@@ -191,8 +180,7 @@ class CollisionScene:
                 names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
                 touching.append(" and ".join(names))
             if touch or neighbours:
-                exclude = geometry.CollisionFilterDeclaration().ExcludeBetween
-                manager.Apply(exclude(geometry.GeometrySet(a), geometry.GeometrySet(b)))
+                _exclude_pair(manager, a, b)
                 del distances[a, b]
         return distances, sorted(set(touching))
 
@@ -271,8 +259,14 @@ def _exclude_coaxial_pairs(
         first = of_pair[:_NUM_COAXIALITY_POSTURES]
         if first.max() < min(MIN_CLEARANCE_M, first.min() + _MIN_PAIR_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
-            exclude = geometry.CollisionFilterDeclaration().ExcludeBetween
-            manager.Apply(exclude(geometry.GeometrySet(a), geometry.GeometrySet(b)))
+            _exclude_pair(manager, a, b)
+
+
+def _exclude_pair(
+    manager: geometry.CollisionFilterManager, a: geometry.GeometryId, b: geometry.GeometryId
+) -> None:
+    exclude = geometry.CollisionFilterDeclaration().ExcludeBetween
+    manager.Apply(exclude(geometry.GeometrySet(a), geometry.GeometrySet(b)))
 
 
 def _shape_with_enclosing_capsule(
@@ -290,14 +284,12 @@ def _shape_with_enclosing_capsule(
 def _add_load(
     plant: MultibodyPlant, instance: tree.ModelInstanceIndex, frame: tree.Frame, phi: Array
 ) -> None:
-    mass = float(phi[0])
-    unit = inertia_about_origin(phi) / mass
+    mass, unit = float(phi[0]), inertia_about_origin(phi) / phi[0]
     moments, products = np.diag(unit), unit[np.triu_indices(3, 1)]
     inertia = tree.SpatialInertia(mass, phi[1:4] / mass, tree.UnitInertia(*moments, *products))
     body = plant.AddRigidBody("drake_teleop_reserve", instance, inertia)
-    plant.AddJoint(
-        tree.WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform())
-    )
+    weld = tree.WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform())
+    plant.AddJoint(weld)
 
 
 def _complete_collision_shapes(
@@ -322,18 +314,15 @@ def _check_shape_sizes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph, 
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(tree.BodyIndex(index))
-        for solid in plant.GetCollisionGeometriesForBody(body):
-            shape = inspector.GetShape(solid)
+        for shape in map(inspector.GetShape, plant.GetCollisionGeometriesForBody(body)):
             if isinstance(shape, geometry.HalfSpace):  # replaced by a plate
                 continue
             capsule = bounding_capsule(shape)
             size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
             if not size <= _MAX_SHAPE_SIZE_M:
-                raise DrakeTeleopError(
-                    f"{body.name()} has a shape of {size:.3g} m (at most {_MAX_SHAPE_SIZE_M:g} m)",
-                    where=where,
-                    remedy="give all lengths in metres",
-                )
+                limit = f"(at most {_MAX_SHAPE_SIZE_M:g} m)"
+                what = f"{body.name()} has a shape of {size:.3g} m {limit}"
+                raise DrakeTeleopError(what, where=where, remedy="give all lengths in metres")
 
 
 def _add_shape(

@@ -21,9 +21,6 @@ from drake_teleop.station import replay_file
 
 _TABLE_COLOUR, _LINK_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
 _TABLE_THICKNESS_M = 0.03
-_LINK_RADIUS_TO_LENGTH = 0.04  # radius of a bone over its length
-# Camera position from the middle of the motion, in sizes of the arm.
-_CAMERA_OFFSET_IN_ARM_SIZES = np.array([0.55, -0.75, 0.3])
 
 
 def write_motion_replay(path: Path, excitation: Excitation) -> None:
@@ -84,11 +81,10 @@ def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
         visuals = plant.GetVisualGeometriesForBody(body)
         shapes = visuals or plant.GetCollisionGeometriesForBody(body)
         replay_file.add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _LINK_COLOUR)
-        for number, p_BJ in enumerate(
-            () if visuals else _outboard_joint_points(robot, context, body)
-        ):
+        points = () if visuals else _outboard_joint_points(robot, context, body)
+        for number, p_BJ in enumerate(points):
             name, length = f"/arm/{k}/bone_{number}", float(np.linalg.norm(p_BJ))
-            meshcat.SetObject(name, Cylinder(_LINK_RADIUS_TO_LENGTH * length, length), _LINK_COLOUR)
+            meshcat.SetObject(name, Cylinder(0.04 * length, length), _LINK_COLOUR)
             along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
             meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 
@@ -113,4 +109,4 @@ def _add_table_and_sensor_path(meshcat: Meshcat, path_S: Array, bodies: Array) -
     meshcat.SetObject("/room/table", Box(2 * size, 2 * size, _TABLE_THICKNESS_M), _TABLE_COLOUR)
     meshcat.SetTransform("/room/table", RigidTransform([0.0, 0.0, -_TABLE_THICKNESS_M / 2]))
     meshcat.SetLine("/way", path_S.T, 3.0, replay_file.colour_to_rgba(BLUE))
-    meshcat.SetCameraPose(middle + size * _CAMERA_OFFSET_IN_ARM_SIZES, middle)
+    meshcat.SetCameraPose(middle + size * np.array([0.55, -0.75, 0.3]), middle)

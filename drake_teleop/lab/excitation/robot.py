@@ -80,9 +80,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
-    scene = CollisionScene(
-        parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_collide=not own
-    )
+    reserve = (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
+    scene = CollisionScene(parse, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
@@ -144,9 +143,8 @@ def RobotFromModel(
     with translate_drake_errors(path):
         scene = CollisionScene(parse, reserve, visuals_collide=False, where=str(path))
     assumptions += missing
-    scene.arm, completed = fill_missing_joint_limits(
-        scene.arm, str(path), acceleration, hint=" (--acceleration)"
-    )
+    hint = " (--acceleration)"
+    scene.arm, completed = fill_missing_joint_limits(scene.arm, str(path), acceleration, hint=hint)
     return _make_robot(
         scene,
         path.name,

@@ -38,20 +38,15 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 _MAX_LOG_PERIOD_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
-# Additional margin after a round that missed the tolerance.
-_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005
-# Number of rounds without any motion before the search fails.
-_MAX_ROUNDS_WITHOUT_MOTION = 3
+_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005  # after a round that missed the tolerance
+_MAX_ROUNDS_WITHOUT_MOTION = 3  # before the search fails
 # Largest misfit of a motion that later rounds vary, and number of such starts.
 _MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
-# Difference between the seeds of rounds.
 _SEED_STEP_BETWEEN_ROUNDS = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
 _MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
-# Sharpness of the maximum over tolerances, relative to that over eigenvalues.
-_TOLERANCE_SHARPNESS_RATIO = 4.0
-# Regularisation of the balanced information; it is singular without motion.
-_INFORMATION_REGULARISATION = 1e-11
+_TOLERANCE_SHARPNESS_RATIO = 4.0  # sharpness over tolerances to that over eigenvalues
+_INFORMATION_REGULARISATION = 1e-11  # of balanced information, which is singular without motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +74,10 @@ def design_shortest_motion(
     errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
     errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
-    task = optimizer.DesignTask(
-        robot.arm.table,
-        robot.limits,
-        Criterion("A16", robot.criterion_scales),
-        robot.home_posture,
-        1.0,
-        harmonics,
-    )
-    worst, around = np.inf, None
+    unused, start = Criterion("A16", robot.criterion_scales), robot.home_posture
+    task = optimizer.DesignTask(robot.arm.table, robot.limits, unused, start, 1.0, harmonics)
+    worst, around, vain_rounds, empty_rounds = np.inf, None, 0, 0
     best: ShortestMotion | None = None
-    vain_rounds, empty_rounds = 0, 0
     for k in range(_MAX_DESIGN_ROUNDS):
         problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
@@ -104,9 +92,8 @@ def design_shortest_motion(
             continue
         trajectory, uses = excite.find_best_within_limits(robot, found)
         motion = excite.trajectory_sensor_motion(robot, trajectory)
-        covariance = prediction.predicted_covariance(
-            *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
-        )
+        noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
+        covariance = prediction.predicted_covariance(*motion, 1 / CHECK_RATE_HZ, noise, phi)
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
@@ -126,12 +113,11 @@ def design_shortest_motion(
             factor = _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(factor, last_factor)
     if best is not None:
         return best
-    raise DrakeTeleopError(
-        "no motion within the limits reaches the tolerance"
-        + (f": the best one exceeds it by a factor of {worst:.3g}" if np.isfinite(worst) else ""),
-        where=f"{robot.name}: {tolerance}",
-        remedy="give larger tolerances, or repeat the motion of `excite`",
-    )
+    what = "no motion within the limits reaches the tolerance"
+    if np.isfinite(worst):
+        what += f": the best one exceeds it by a factor of {worst:.3g}"
+    remedy = "give larger tolerances, or repeat the motion of `excite`"
+    raise DrakeTeleopError(what, where=f"{robot.name}: {tolerance}", remedy=remedy)
 
 
 def sidak_factor(count: int) -> float:
@@ -156,8 +142,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
     ) -> None:
         super().__init__(task)
         self._around, self._at, self.best = around, np.empty(0), around
-        self._least = np.inf
-        self._errors = errors
+        self._errors, self._least = errors, np.inf
         noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
         self._noise = white_noise_densities_over_wrench_noise(noise, phi)
         self._roots = np.sqrt(noise.white_noise_densities[:6])
