@@ -69,9 +69,8 @@ def contact_figure(
         figure = style.Picture(figsize=(7.6, 5.0))
         rows = figure.subplots(2, 1, sharex=True, sharey=True)
         titles = ("Measured force", "Calculated contact force, σ = 0")
-        for axes, trace, title, colour in zip(
-            rows, traces, titles, (style.BLUE, style.GREEN), strict=True
-        ):
+        colours = (style.BLUE, style.GREEN)
+        for axes, trace, title, colour in zip(rows, traces, titles, colours, strict=True):
             style.shade_contact(axes, time, touched)
             axes.plot(time, trace, color=colour)
             axes.set_title(title)
@@ -120,10 +119,8 @@ def _write_note_above_axes(axes: Axes, text: str) -> None:
 
 
 def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> None:
-    right = axes.secondary_yaxis(
-        "right",
-        functions=(lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling),
-    )
+    scales = (lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling)
+    right = axes.secondary_yaxis("right", functions=scales)
     right.set_ylabel(label, color=style.GREY)
     right.spines["right"].set_visible(True)
 
@@ -131,11 +128,6 @@ def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> Non
 def _draw_time_mark(axes: Axes, time: float, text: str, colour: str) -> None:
     axes.axvline(time, color=colour, linewidth=0.9, linestyle="--")
     axes.annotate(
-        text,
-        (time, 0.03),
-        xycoords=("data", "axes fraction"),
-        xytext=(4, 0),
-        textcoords="offset points",
-        color=colour,
-        fontsize=8.5,
-    )
+        text, (time, 0.03), xycoords=("data", "axes fraction"), xytext=(4, 0),
+        textcoords="offset points", color=colour, fontsize=8.5,
+    )  # fmt: skip

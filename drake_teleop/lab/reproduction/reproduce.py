@@ -20,8 +20,6 @@ from drake_teleop.station.replay import write_replay
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
 
-# Slow motion of the replay; the contact lasts 40 ms.
-_REPLAY_SLOWDOWN = 8.0
 _FORCE_Z_INDEX, _TORQUE_X_INDEX = 2, 3
 
 
@@ -49,17 +47,13 @@ def reproduce_command(
         torque_run = experiments.simulate_free_motion(
             torque, estimate, stage("Fig. 7: horizontal free motion")
         )
-        ideal_run = experiments.simulate_ideal_motion(
-            stage("Rotation about all axes, ideal sensor")
-        )
+        about_all_axes = stage("Rotation about all axes, ideal sensor")
+        ideal_run = experiments.simulate_ideal_motion(about_all_axes)
         contact_run = experiments.simulate_contact(contact, estimate, stage)
+        measure_free_run = experiments.peaks_and_residuals_of_free_run
         summary = {
-            "free_force": experiments.peaks_and_residuals_of_free_run(
-                force_run, _FORCE_Z_INDEX, "N"
-            ),
-            "free_torque": experiments.peaks_and_residuals_of_free_run(
-                torque_run, _TORQUE_X_INDEX, "Nm"
-            ),
+            "free_force": measure_free_run(force_run, _FORCE_Z_INDEX, "N"),
+            "free_torque": measure_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
             "ideal": experiments.wrench_errors_of_ideal_run(ideal_run),
             "contact": experiments.detection_and_peaks_of_contact_run(contact_run),
             "identification": experiments.errors_of_identification(load, force),
@@ -113,11 +107,8 @@ def draw_figures(
 
 def _measure_simulation_speed(progress: UpdateProgress) -> experiments.NamedValues:
     scenario = LoadScenario("free_motion_force")
-    bare, station = (
-        speed.MakeBarePlantSimulator(scenario),
-        speed.MakeSettledStationSimulator(scenario),
-    )
-    simulators = {"bare": bare, "station": station}
+    simulators = {"bare": speed.MakeBarePlantSimulator(scenario)}
+    simulators["station"] = speed.MakeSettledStationSimulator(scenario)
     cost = speed.cpu_time_per_simulated_second(simulators, progress=progress)
     return {
         "real_time_factor": 1 / cost["station"],
@@ -136,38 +127,27 @@ def _write_results(
     pictures: dict[str, Figure],
 ) -> None:
     force, torque, contact = runs
+    without_sheet = experiments.without_leaf_spring_with_next_seed(contact.scenario)
     files.make_folder(out / "logs")
     for name, result, scenario in (
         ("identification", load.result, identification_scenario(force.scenario, seed)),
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
         ("contact_transition", contact.contact_result, contact.scenario),
-        (
-            "contact_transition_without_sheet",
-            contact.free_result,
-            experiments.without_leaf_spring_with_next_seed(contact.scenario),
-        ),
+        ("contact_transition_without_sheet", contact.free_result, without_sheet),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
     files.write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
-    write_replay(
-        out / "replay.html", contact.contact_result, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
-    )
+    # The contact lasts 40 ms.
+    write_replay(out / "replay.html", contact.contact_result, contact.scenario, slow_motion=8.0)
     figures = report.values_by_full_name(summary)
     files.write_text(out / "table.md", _markdown_table(report.compare_with_paper(figures)))
-    report.write_report(
-        out,
-        pictures,
-        setup=_describe_setup(seed, force.scenario, load),
-        summary=figures,
-        parameters=report.parameter_rows(
-            experiments.true_offsets_and_phi(force.scenario),
-            load.estimate,
-            load.batch.standard_deviations,
-        ),
-    )
+    true = experiments.true_offsets_and_phi(force.scenario)
+    rows = report.parameter_rows(true, load.estimate, load.batch.standard_deviations)
+    setup = _describe_setup(seed, force.scenario, load)
+    report.write_report(out, pictures, setup=setup, summary=figures, parameters=rows)
 
 
 def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
@@ -205,9 +185,7 @@ def _print_comparison(rows: list[report.Comparison], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("What")
-    table.add_column("Paper")
+    table = Table("What", "Paper", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("This run", justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     table.add_column("Verdict", no_wrap=True)

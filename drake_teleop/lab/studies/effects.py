@@ -244,7 +244,7 @@ class _MeasureData:
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
         count = len(levels.names)
-        mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
+        figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
             is_compared, combinations, weights = self.model.comparison_weights(factor)
@@ -255,11 +255,8 @@ class _MeasureData:
                 compared = self._count_combinations(combinations, factor)
             why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        unused = self._count_combinations(np.ones(1), factor) - compared
-        return MainEffect(
-            levels.names, runs, mean, half, effect, effect_half, why, compared, unused,
-            self.is_fitted,
-        )  # fmt: skip
+        counts = compared, self._count_combinations(np.ones(1), factor) - compared
+        return MainEffect(levels.names, runs, *figures, why, *counts, self.is_fitted)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
@@ -321,8 +318,8 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return whether each point is complete and not dominated; columns are minimised."""
     found = complete.copy()
+    other = values[complete]
     for index in np.flatnonzero(complete):
-        other = values[complete]
         dominated = np.all(other <= values[index], axis=1) & np.any(other < values[index], axis=1)
         found[index] = not dominated.any()
     return found
@@ -336,5 +333,4 @@ def measure_values(rows: pl.DataFrame, measure: str) -> Array:
     """Return the values (N,) of a measure in all rows; nan where missing."""
     import polars as pl
 
-    column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    return column
+    return rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()

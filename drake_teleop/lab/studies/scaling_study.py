@@ -30,10 +30,9 @@ if TYPE_CHECKING:
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
 CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
-TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
-    ("touch", "press", "insert"), tuple(CRITERIA)
-)
+TASK_CRITERIA = dict.fromkeys(("reach", "touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
+TASK_CRITERIA["reach"] = ("effort", "time")
 _ETA_STUDY_NAME = "scaling_object"
 _SIGMA_KEY, _GAMMA_KEY, _ETA_KEY = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
 _NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
@@ -95,9 +94,8 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_BOOTSTRAP_SEED).multinomial(
-        count, np.full(count, 1 / count), _NUM_BOOTSTRAP_DRAWS
-    )
+    generator, equal = np.random.default_rng(_BOOTSTRAP_SEED), np.full(count, 1 / count)
+    draws = generator.multinomial(count, equal, _NUM_BOOTSTRAP_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
         np.mean([_means_over_unscaled(tables[task][name], weights) for name in names], axis=0)
@@ -142,8 +140,7 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     tables = {}
     for name, measure in measures.items():
         values = effects.measure_values(rows, measure)
-        if name == "success":
-            values = np.nan_to_num(values)
+        values = np.nan_to_num(values) if name == "success" else values
         shaped = values.reshape(len(sigmas), count, seeds)
         tables[name] = np.broadcast_to(shaped, (len(sigmas), len(gammas), seeds))
     return tables
@@ -173,22 +170,21 @@ def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
     import polars as pl
 
     sigmas, gammas = _sigmas_and_gammas()
-    return pl.DataFrame(
-        [
-            {
-                "way": selection,
-                "sigma": sigma,
-                "gamma": gamma,
-                "merit": found.merit[i, j],
-                "low": found.merit_low[i, j],
-                "high": found.merit_high[i, j],
-                "best_in": found.best_share[i, j],
-            }
-            for selection, found in answers.items()
-            for i, sigma in enumerate(sigmas)
-            for j, gamma in enumerate(gammas)
-        ]
-    )
+    rows = [
+        {
+            "way": selection,
+            "sigma": sigma,
+            "gamma": gamma,
+            "merit": found.merit[i, j],
+            "low": found.merit_low[i, j],
+            "high": found.merit_high[i, j],
+            "best_in": found.best_share[i, j],
+        }
+        for selection, found in answers.items()
+        for i, sigma in enumerate(sigmas)
+        for j, gamma in enumerate(gammas)
+    ]
+    return pl.DataFrame(rows)
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
@@ -196,10 +192,8 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
         values = effects.values_by_seed(rows, measure, by=_ETA_KEY)
-        figures = (
-            *effects.means_and_half_widths_over_seeds(values),
-            effects.effect_half_widths_over_seeds(values),
-        )
+        of_effect = effects.effect_half_widths_over_seeds(values)
+        figures = *effects.means_and_half_widths_over_seeds(values), of_effect
         names = (measure, f"{measure}_half", f"{measure}_effect_half")
         for row, at_eta in zip(table, np.column_stack(figures), strict=True):
             row |= {n: v if np.isfinite(v) else None for n, v in zip(names, at_eta, strict=True)}

@@ -86,14 +86,12 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = margin / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
     caps = {f: min(MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
-    study = Study(
-        factors=[
-            Factor(field="method", words=list(CANDIDATE_METHODS)),
-            Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
-            Factor(field="low_pass_hz", values=low_passes),
-        ],
-        measures=SEARCH_MEASURES,
-    )
+    factors = [
+        Factor(field="method", words=list(CANDIDATE_METHODS)),
+        Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
+        Factor(field="low_pass_hz", values=low_passes),
+    ]
+    study = Study(factors=factors, measures=SEARCH_MEASURES)
     rows = execute("search", study, OneAxisGammaSearch(base, stated, caps))
     search = [_add_predicted_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
@@ -199,19 +197,10 @@ def _rms_load_force_in_swing(trial: StationPressTrial) -> float:
 
 
 def _study_of_settings(
-    settings: TunedSettings,
-    hands: list[str],
-    walls: list[float],
-    *,
-    seed: int = 0,
-    repeats: int = 1,
+    settings: TunedSettings, hands: list[str], walls: list[float], seed: int = 0, repeats: int = 1
 ) -> Study:
-    factors = [
-        Factor(field="method", words=[settings.method]),
-        Factor(field="gamma", values=[settings.gamma]),
-        Factor(field="sigma_inertia", values=[settings.sigma_inertia]),
-        Factor(field="low_pass_hz", values=[settings.low_pass_hz]),
-        Factor(field="hand", words=hands),
-        Factor(field="wall", values=walls),
-    ]
+    numbers = dataclasses.asdict(settings)
+    factors = [Factor(field="method", words=[numbers.pop("method")])]
+    factors += [Factor(field=name, values=[number]) for name, number in numbers.items()]
+    factors += [Factor(field="hand", words=hands), Factor(field="wall", values=walls)]
     return Study(factors=factors, measures=TRIAL_MEASURES, seed=seed, repeats=repeats)

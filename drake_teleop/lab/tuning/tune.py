@@ -84,10 +84,8 @@ def tune(
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
         files.write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
-        url = png_data_url(out / "trade_off.png")
-        page = render_page(
-            "drake_teleop.lab.tuning", "report.html.j2", summary=summary, picture=url
-        )
+        shown_in_page = {"summary": summary, "picture": png_data_url(out / "trade_off.png")}
+        page = render_page("drake_teleop.lab.tuning", "report.html.j2", **shown_in_page)
         files.write_text(out / "report.html", page)
         files.write_json(out / "summary.json", summary)
     if not quiet:
@@ -104,6 +102,10 @@ def _make_tuning_summary(
 ) -> dict[str, Any]:
     scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
     failed = [row for row in found.beyond_runs if not search.meets_requirements(row)]
+    fails_at: dict[str, Any] | None = None
+    if failed:
+        hand, wall, failing = (failed[0][name] for name in ("hand", "wall", "gamma"))
+        fails_at = {"hand": hand, "wall_N_per_m": wall, "gamma_factor": failing / gamma}
     shares = [row["share"] for row in found.inside_runs]
     edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
     holds = all(map(search.meets_requirements, found.given_runs))
@@ -115,13 +117,7 @@ def _make_tuning_summary(
         "given_threshold_N": worst_given if holds else None,
         "rest_force_N": max(row["rest_force_N"] for row in edge),
         "margin": stated.requirements.loop_gain_margin,
-        "fails_at": {
-            "hand": failed[0]["hand"],
-            "wall_N_per_m": failed[0]["wall"],
-            "gamma_factor": failed[0]["gamma"] / gamma,
-        }
-        if failed
-        else None,
+        "fails_at": fails_at,
         "beyond_N_per_m": max(row["wall"] for row in found.beyond_runs),
         "beyond_gamma_factor": max(row["gamma"] for row in found.beyond_runs) / gamma,
     }
