@@ -56,10 +56,13 @@ def scenario_text(
     wall = wall_of_plan(plan)
     wall_data = {"_tag": "!Wall", "position": wall.position, "stiffness": wall.stiffness}
     wall_data |= {} if wall.size == Wall().size else {"size": wall.size}
+    own = Master(model=device).sampling_period_if_slower_than_hand(Rates().hand_hz)
+    names = ("hand_hz", "joint_control_hz")
+    rates = {} if own is None else {"rates": dict.fromkeys(names, 1 / own)}
     data = {
         "description": f"{Path(slave['model']).stem} commanded by {device}",
         "simulation": {"duration": 5.0, "settle": 0.8},
-        **_device_rates(device),
+        **rates,
         "slave": slave,
         "master": {"model": device},
         **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
@@ -80,11 +83,6 @@ def wall_of_plan(plan: StationPlan) -> Wall:
         size=[plan.place.wall_edge_m, plan.place.wall_edge_m],
         stiffness=WALL_STIFFNESS_N_M,
     )
-
-
-def _device_rates(device: str) -> dict[str, Any]:
-    own = Master(model=device).sampling_period_if_slower_than_hand(Rates().hand_hz)
-    return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
 def round_to_four_significant_digits(values: Any) -> list[float]:

@@ -28,12 +28,14 @@ def scaling_figure(
     """
     time, time_unit = _time_axis(t)
     traces = [np.asarray(trace, float) for trace in values]
+    meanings = {1.0: "as measured", 0.0: "non-contact part eliminated"}
     with style.plot_style():
         figure = style.Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
         rows = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for axes, trace, sigma in zip(rows, traces, sigmas, strict=True):
             axes.plot(time, trace, color=style.BLUE if sigma else style.GREEN)
-            axes.set_title(_sigma_title(sigma))
+            meaning = meanings.get(sigma, f"{sigma:.0%} of the non-contact part")
+            axes.set_title(f"σ = {sigma:g}:  {meaning}")
             peak = float(np.abs(trace).max())
             slave, master = _format_number(peak), _format_number(peak / downscaling)
             note = f"peak {slave} {unit}   ·   {master} {unit} at the master"
@@ -101,11 +103,6 @@ def _common_value_range(traces: Sequence[Array]) -> tuple[float, float]:
     high = max(0.0, *(float(trace.max()) for trace in traces))
     margin = 0.1 * (high - low) or 1.0
     return low - margin, high + margin
-
-
-def _sigma_title(sigma: float) -> str:
-    meaning = {1.0: "as measured", 0.0: "non-contact part eliminated"}
-    return f"σ = {sigma:g}:  {meaning.get(sigma, f'{sigma:.0%} of the non-contact part')}"
 
 
 def _format_number(value: float) -> str:

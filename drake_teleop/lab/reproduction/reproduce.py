@@ -41,12 +41,9 @@ def reproduce_command(
         )
         load = identify_load(identification_scenario(force, seed), stage)
         estimate = load.estimate
-        force_run = experiments.simulate_free_motion(
-            force, estimate, stage("Fig. 6: vertical free motion")
-        )
-        torque_run = experiments.simulate_free_motion(
-            torque, estimate, stage("Fig. 7: horizontal free motion")
-        )
+        simulate_free = experiments.simulate_free_motion
+        force_run = simulate_free(force, estimate, stage("Fig. 6: vertical free motion"))
+        torque_run = simulate_free(torque, estimate, stage("Fig. 7: horizontal free motion"))
         about_all_axes = stage("Rotation about all axes, ideal sensor")
         ideal_run = experiments.simulate_ideal_motion(about_all_axes)
         contact_run = experiments.simulate_contact(contact, estimate, stage)

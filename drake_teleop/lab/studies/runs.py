@@ -151,13 +151,9 @@ class StudyProgress:
         if self._recent:
             at_once = min(self._processes, left) or 1
             seconds = float(np.median(self._recent)) * left / at_once
-            words = f"about {_format_duration(seconds)} left"
+            minutes, rest = divmod(round(seconds), 60)
+            words = f"about {minutes // 60}:{minutes % 60:02d}:{rest:02d} left"
         self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
-
-
-def _format_duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
 def _run_chunk(work: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:

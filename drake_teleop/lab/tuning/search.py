@@ -183,17 +183,14 @@ def _add_predicted_threshold(
     gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
     human = trial.base_scenario.operator.perception
     scale = trial.base_scenario.force_scaling.force_scale
-    masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
+    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # of the swing, as `delayed_contact`
+    rms_load_force = float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
+    masked = row["sigma_inertia"] * scale * rms_load_force
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noise_N_by_low_pass_hz[row["low_pass_hz"]] * gamma
     rendered = scale * gamma * row["share"]
     threshold = (smallest + noise) / rendered if rendered > 0.0 else np.inf
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
-
-
-def _rms_load_force_in_swing(trial: StationPressTrial) -> float:
-    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
-    return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
 def _study_of_settings(
