@@ -86,8 +86,8 @@ def _analyze_in_stages(
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    one_open = close_other_directions(free, linear, along)
-    with_hand = hybrid_along(one_open, omega, along.hand, along.tool)
+    one_loop_open = close_other_directions(free, linear, along)
+    with_hand = hybrid_along(one_loop_open, omega, along.hand, along.tool)
     H = absorb_impedances(with_hand, hand=-summary_values.S_AT_OMEGA * axis.hand_mass)
     closed_form = hybrid_matrix(axis, summary_values.S_AT_OMEGA)
     progress(0.3)
@@ -127,7 +127,7 @@ def _analyze_in_stages(
     summary["measured"] = None
     if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        summary["measured"] = summary_values.measure_free_impedance(linear, along, one_open)
+        summary["measured"] = summary_values.measure_free_impedance(linear, along, one_loop_open)
         measured(1.0)
     summary = to_json_data(summary)
     summary["verdict"] = report.verdict_sentences(summary)

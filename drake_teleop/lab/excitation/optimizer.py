@@ -247,9 +247,9 @@ class _DescentSearch:
     def descend_from(self, x: Array) -> None:
         self._evaluations, self._best_of_start = 0, float("inf")
         penalised = self._penalised_value_and_gradient
-        for *stage, iterations in _LBFGS_STAGES:
-            options = {"maxiter": iterations}
-            x = self._minimize(penalised, x, tuple(stage), "L-BFGS-B", jac=True, options=options).x
+        for *sharpness_and_weight, iterations in _LBFGS_STAGES:
+            given, options = tuple(sharpness_and_weight), {"maxiter": iterations}
+            x = self._minimize(penalised, x, given, "L-BFGS-B", jac=True, options=options).x
         is_bounded = self._problem.bounds(x) is not None
         for k, stage in enumerate(_SLSQP_STAGES):
             hopeless = self._best_of_start > _MAX_CRITERION_RATIO_TO_BEST * self._best
