@@ -138,7 +138,7 @@ def select_suitable_postures(
     in_region &= tool_height > _MIN_TOOL_HEIGHT_M
     in_region &= (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1)
     points_down = postures.R_WS[:, 2, 2] < -_MIN_COS_TOOL_TILT
-    above_plane = (postures.origins[:, raised, 2] > lowest_origin).all(axis=1)
+    above_plane: Any = (postures.origins[:, raised, 2] > lowest_origin).all(axis=1)
     rows, removed = np.arange(len(radius)), list[tuple[str, int]]()
     for name, met in (
         ("z_S is more than 40 degrees from downwards", points_down),

@@ -244,7 +244,7 @@ class _MeasureData:
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
         count = len(levels.names)
-        figures = np.full((4, count), np.nan)
+        mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
             is_compared, combinations, weights = self.model.comparison_weights(factor)
@@ -255,8 +255,11 @@ class _MeasureData:
                 compared = self._count_combinations(combinations, factor)
             why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        counts = compared, self._count_combinations(np.ones(1), factor) - compared
-        return MainEffect(levels.names, runs, *figures, why, *counts, self.is_fitted)
+        unused = self._count_combinations(np.ones(1), factor) - compared
+        return MainEffect(
+            levels.names, runs, mean, half, effect, effect_half, why, compared, unused,
+            self.is_fitted,
+        )  # fmt: skip
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
