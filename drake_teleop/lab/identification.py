@@ -40,8 +40,6 @@ from drake_teleop.station.slave.arm import ArmModel, accelerations_from_specific
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeIdentificationStation
 
-# The design depends on the arm, not on the seed of the run.
-_DESIGN_SEED = 0
 #: Designed trajectory and its criterion kappa_w10, by a hash of all inputs of the design.
 _TRAJECTORIES_AND_KAPPAS: dict[str, tuple[FourierTrajectory, float]] = {}
 
@@ -140,12 +138,10 @@ def identify_load(
     """
     check_scenario(scenario)
     if not scenario.load_estimator.enabled:
-        raise DrakeTeleopError(
-            "the load estimator is off, so it cannot identify the load",
-            where="scenario:load_estimator.enabled",
-            remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass "
-            'LoadScenario("identification")',
-        )
+        what = "the load estimator is off, so it cannot identify the load"
+        remedy = "call identified_load(scenario) of drake_teleop.lab.identified_load"
+        remedy += ', or pass LoadScenario("identification")'
+        raise DrakeTeleopError(what, where="scenario:load_estimator.enabled", remedy=remedy)
     if trajectory is not None:
         expect_type(FourierTrajectory, trajectory, "trajectory")
     simulation = scenario.simulation
@@ -187,8 +183,7 @@ def identify_by_batch(
         alpha=motion[6:],
         walk=walk / np.sqrt(rate_hz),
     )
-    found = identify_batch(wrench, s, omega, alpha, method="total", noise=noise)
-    return found.identification
+    return identify_batch(wrench, s, omega, alpha, method="total", noise=noise).identification
 
 
 def _trajectory_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
@@ -198,24 +193,19 @@ def _trajectory_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[Fourie
     # The environment's files may change.
     if key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment:
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
-        found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
+        found = excite(robot, period=period, progress=stage).trajectory
         _TRAJECTORIES_AND_KAPPAS[key] = found, criterion_values(robot, found)["kappa_w10"]
     return copy.deepcopy(_TRAJECTORIES_AND_KAPPAS[key])
 
 
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
-        raise DrakeTeleopError(
-            f"has {len(trajectory.q0)} joints, but the arm {robot.arm.num_joints}",
-            where="trajectory",
-            remedy="compute a trajectory for this arm",
-        )
+        what = f"has {len(trajectory.q0)} joints, but the arm {robot.arm.num_joints}"
+        raise DrakeTeleopError(what, where="trajectory", remedy="compute a trajectory for this arm")
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
-        raise DrakeTeleopError(
-            f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s",
-            where="trajectory",
-            remedy="set simulation.duration to the period",
-        )
+        what = f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s"
+        remedy = "set simulation.duration to the period"
+        raise DrakeTeleopError(what, where="trajectory", remedy=remedy)
     worst = check_trajectory(robot, trajectory)[0]
     if worst.used_share > 1:
         raise DrakeTeleopError(
@@ -235,9 +225,6 @@ def simulate_with_real_time_factor(
 
 def sensor_samples(result: SimulationResult) -> tuple[Array, Array, Array, Array]:
     """Return wrench (N, 6), specific force, angular velocity and acceleration (N, 3), all in S."""
-    return (
-        result["measured_wrench_S"],
-        result["specific_force_S"],
-        result["angular_velocity_S"],
-        result["angular_acceleration_S"],
-    )
+    signals = ("measured_wrench", "specific_force", "angular_velocity", "angular_acceleration")
+    wrench, s, omega, alpha = (result[f"{name}_S"] for name in signals)
+    return wrench, s, omega, alpha

@@ -29,8 +29,6 @@ CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 MAX_CACHED_FILES = 2000
 """Maximum number of cached files; each has 5 kB."""
 
-_LIBRARIES_IN_CACHE_KEY = ("drake", "numpy", "scipy", "numba")
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedLoad:
@@ -97,7 +95,7 @@ _SOURCES_HASH = _hash_source_files(Path(__file__).parents[1], models_dir())
 def _cache_key(identification: Scenario, with_noise_floor: bool) -> str:
     from llvmlite.binding import get_host_cpu_name
 
-    computed_by = [f"{name} {version(name)}" for name in _LIBRARIES_IN_CACHE_KEY]
+    computed_by = [f"{name} {version(name)}" for name in ("drake", "numpy", "scipy", "numba")]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
     models = [sha256(path.read_bytes()).hexdigest() for path in identification.slave.model_files()]
     what = (__version__, dataclasses.asdict(identification), with_noise_floor, computed_by, models)

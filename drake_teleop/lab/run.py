@@ -6,17 +6,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    CannotWrite,
-    output_folder,
-    refuse_to_replace_inputs,
-    remove_log,
-    wrap_write_errors,
-    write_json,
-    write_picture,
-    write_table,
-)
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identification import identify_load, simulate_with_real_time_factor
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
@@ -26,14 +17,9 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_LOAD_SOURCE_OF_RUN = "estimated during the run"
 _SCENARIO_FILE_NAME = "scenario.yaml"
 _RESULT_FILE_NAMES = (
-    "sensor_log.parquet",
-    "identification.json",
-    "overview.png",
-    "replay.html",
-    "session.json",
+    *("sensor_log.parquet", "identification.json", "overview.png", "replay.html", "session.json"),
 )
 
 
@@ -72,32 +58,29 @@ def run_command(
     contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
-        raise DrakeTeleopError(
-            "a recorded drive contains its seed and load, which cannot be replaced",
-            where="run --inputs",
-            remedy="remove --seed and --fresh",
-        )
-    refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario)
+        what = "a recorded drive contains its seed and load, which cannot be replaced"
+        raise DrakeTeleopError(what, where="run --inputs", remedy="remove --seed and --fresh")
+    files.refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario)
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
-    with output_folder(out):
+    with files.output_folder(out):
         with show_progress(progress and not quiet) as stage:
             run = _run_into_folder(setup, out, stage, fresh, drive)
             written = stage("Write pictures and 3D replay")
-            write_picture(out / "overview.png", draw_overview(run.result))
+            files.write_picture(out / "overview.png", draw_overview(run.result))
             written(0.3)
             write_replay(out / "replay.html", run.result, run.scenario)
             written(1.0)
         summary = {"scenario": str(scenario if drive is None else drive.folder)} | summarise(run)
         session = {"load_source": run.load_source, "real_time_factor": run.real_time_factor}
-        write_table(out / "sensor_log.parquet", run.result.sensor_log())
+        files.write_table(out / "sensor_log.parquet", run.result.sensor_log())
         if run.identification is not None:
             run.identification.save(out / "identification.json")
-        write_json(out / "session.json", session)
-        write_json(out / "summary.json", summary)
+        files.write_json(out / "session.json", session)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         _print_summary(summary | session, out)
     return summary | session
@@ -108,9 +91,9 @@ def _run_into_folder(
 ) -> ScenarioRun:
     log, scenario_file = out / "log.parquet", out / _SCENARIO_FILE_NAME
     # After an interruption, old files must not look like results of this run.
-    remove_log(log)
+    files.remove_log(log)
     for name in _RESULT_FILE_NAMES:
-        with wrap_write_errors(out / name):
+        with files.wrap_write_errors(out / name):
             (out / name).unlink(missing_ok=True)
     had_scenario = scenario_file.exists()
     write_scenario(scenario_file, setup)
@@ -125,7 +108,7 @@ def _run_into_folder(
             scenario_file.unlink(missing_ok=True)
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(_describe_unfinished_log(log)) from error
-        if isinstance(error, CannotWrite):
+        if isinstance(error, files.CannotWrite):
             raise DrakeTeleopError(str(error), remedy=_describe_unfinished_log(log)) from error
         raise
 
@@ -147,26 +130,20 @@ def run_scenario(
         fresh: True ignores the cached load.
     """
     check_scenario(scenario)
-    estimates_load = scenario.load_estimator.enabled
+    estimates_load, source = scenario.load_estimator.enabled, "estimated during the run"
     if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
-        return ScenarioRun(
-            scenario,
-            found.result,
-            found.identification,
-            _LOAD_SOURCE_OF_RUN,
-            found.real_time_factor,
-        )
-    identification, estimate, floor, source = None, None, None, _LOAD_SOURCE_OF_RUN
+        loaded = found.identification, source, found.real_time_factor
+        return ScenarioRun(scenario, found.result, *loaded)
+    identification, estimate, floor = None, None, None
     with show_progress(progress) as stage:
         if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
             identification, estimate, floor = load.identification, load.estimate, load.noise_floor
             source = "cache" if load.from_cache else "identified before the run"
         station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-        result, factor = simulate_with_real_time_factor(
-            station, scenario.simulation, stage("Run the scenario"), log
-        )
+        started = stage("Run the scenario")
+        result, factor = simulate_with_real_time_factor(station, scenario.simulation, started, log)
     return ScenarioRun(scenario, result, identification, source, factor)
 
 

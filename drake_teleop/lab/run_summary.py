@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -110,28 +111,23 @@ def draw_overview(result: SimulationResult) -> Figure:
 
 def _detection_delays(result: SimulationResult, spans: list[tuple[float, float]]) -> dict[str, Any]:
     t, summary = result.t, {}
+    starts = [start for start, _ in spans]
     for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
-        flagged = t[result[name][:, 0] > 0]
-        ends = [*(start for start, _ in spans[1:]), np.inf][: len(spans)]
-        found = [
-            flagged[(flagged >= start) & (flagged < end)]
-            for (start, _), end in zip(spans, ends, strict=True)
-        ]
-        summary[key] = [
-            1e3 * float(times[0] - start) if len(times) else None
-            for times, (start, _) in zip(found, spans, strict=True)
-        ]
+        flagged, delays = t[result[name][:, 0] > 0], list[float | None]()
+        for start, end in itertools.pairwise([*starts, np.inf]):
+            times = flagged[(flagged >= start) & (flagged < end)]
+            delays.append(1e3 * float(times[0] - start) if len(times) else None)
+        summary[key] = delays
     onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
     false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL_S for a, b in spans)]
     return summary | {"false_contacts": len(false)}
 
 
 def _describe_unmodelled_contact(scenario: Scenario) -> str:
-    surroundings = scenario.surroundings
-    if surroundings is None:
+    if scenario.surroundings is None:
         return ""
-    builder = DiagramBuilder()
-    return AddSlavePlant(builder, scenario.slave, surroundings).contact.drake_contact_reason
+    plant = AddSlavePlant(DiagramBuilder(), scenario.slave, scenario.surroundings)
+    return plant.contact.drake_contact_reason
 
 
 def _moving_body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
@@ -139,10 +135,8 @@ def _moving_body_displacements(result: SimulationResult) -> dict[str, dict[str, 
     for signal in (name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)):
         name, first, last = signal.removeprefix(MOVING_BODY_POSE_PREFIX), *result[signal][[0, -1]]
         displacements[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
-        rotation = quaternion_logarithm(
-            quaternion_product(tuple(last[:4]), conjugate_quaternion(tuple(first[:4])))
-        )
-        rotations[name] = float(np.degrees(np.linalg.norm(rotation)))
+        rotation = quaternion_product(tuple(last[:4]), conjugate_quaternion(tuple(first[:4])))
+        rotations[name] = float(np.degrees(np.linalg.norm(quaternion_logarithm(rotation))))
     return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 
 

@@ -30,9 +30,8 @@ pytestmark = pytest.mark.long
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALL_STIFFNESSES_N_M", (5100.0,))
     monkeypatch.setattr(study, "JITTER_AND_LOSS_PAIRS", ((0.0, 0.0),))
-    monkeypatch.setattr(
-        study, "LEAF_THICKNESSES_M", {"contact": study.LEAF_THICKNESSES_M["contact"]}
-    )
+    leaves = {"contact": delayed_contact.LEAF_THICKNESSES_M["contact"]}
+    monkeypatch.setattr(delayed_contact, "LEAF_THICKNESSES_M", leaves)
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study,

@@ -775,7 +775,7 @@ def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, m
     high = slave.limits.q_middle + 1.5 * slave.limits.q_half
     bad = FeasibleIterate(1.0, 10, 0, 3.0, dataclasses.replace(short.trajectory, q0=high))
     designs = [] if found == "none" else [bad]
-    monkeypatch.setattr(excite_module, "minimise_criterion", lambda *_, **__: designs)
+    monkeypatch.setattr(excite_module.optimizer, "minimise_criterion", lambda *_, **__: designs)
     small = excite(slave, period=2.4, harmonics=2, progress=False)
     np.testing.assert_array_equal(small.trajectory.q0, slave.home_posture)
     assert small.limit_uses[0].used_share <= 1.0 and small.criterion_history.shape == (

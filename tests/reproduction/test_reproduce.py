@@ -57,6 +57,11 @@ def results():
     return {name: [] for name in EXPERIMENTS}
 
 
+def module_of(experiment):
+    """Return the module in which `reproduce_command` looks up this function."""
+    return experiments if hasattr(experiments, experiment) else reproduce
+
+
 def recorded(function, results):
     def call(*arguments):
         results.append(function(*arguments))
@@ -71,7 +76,8 @@ def run(tmp_path_factory, results):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for name in EXPERIMENTS:
-            patch.setattr(reproduce, name, recorded(getattr(reproduce, name), results[name]))
+            module = module_of(name)
+            patch.setattr(module, name, recorded(getattr(module, name), results[name]))
         type_in("docs/start.md", ".venv/bin/drake-teleop reproduce")
     out = folder / "out" / "r"
     written = (json.loads((out / f"{name}.json").read_text()) for name in ("summary", "session"))
@@ -364,7 +370,7 @@ def test_reproduce_exits_with_status_1_for_a_wrong_sign(
     """The sign is wrong in the evaluation of the same experiments."""
     for name in EXPERIMENTS:
         found = iter(results[name])
-        monkeypatch.setattr(reproduce, name, lambda *_, found=found: next(found))
+        monkeypatch.setattr(module_of(name), name, lambda *_, found=found: next(found))
     mutant = next(iter(mutants_of_regressor().values()))
     monkeypatch.setattr(experiments, "regressor", per_sample(mutant))
     with pytest.raises(SystemExit, match="1"):

@@ -126,11 +126,9 @@ class ImpedanceRange:
         for name in ("mass", "damping", "stiffness"):
             low, high = getattr(self, name)
             if not -np.inf < low <= high < np.inf:
-                raise DrakeTeleopError(
-                    f"{low} to {high} is no range (both ends must be finite)",
-                    where=f"ImpedanceRange.{name}",
-                    remedy="give (smallest, largest)",
-                )
+                what = f"{low} to {high} is no range (both ends must be finite)"
+                remedy = "give (smallest, largest)"
+                raise DrakeTeleopError(what, where=f"ImpedanceRange.{name}", remedy=remedy)
 
     def corners(self, omega: Array) -> Complex:
         """Return the corners (..., 4) of the impedances at `omega` [rad/s] in the complex plane.
@@ -209,10 +207,8 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
-
-
 def _enclosing_discs(corners: Complex) -> tuple[Complex, Array]:
     half = (corners[..., 2:3] - corners[..., :1]) / 2
-    right = half.real + np.abs(half) * _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS
+    # Centres of the discs, from few to many half diagonals beside the range.
+    right = half.real + np.abs(half) * np.array([0.3, 1.0, 3.0, 10.0, 100.0])
     return corners[..., :1] + 1j * half.imag + right, np.hypot(right, half.imag)

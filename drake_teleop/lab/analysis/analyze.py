@@ -13,27 +13,20 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import summary_values
+from drake_teleop.lab.analysis import report, summary_values
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.report import (
-    ReportCurves,
-    print_tables,
-    verdict_sentences,
-    write_report,
-)
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
-from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.identification import true_load
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_TIP_DEPTH_IN_LEAF_M = 5e-3
 
 
 def analyze_command(
@@ -53,16 +46,16 @@ def analyze_command(
     summary, curves = analyze(setup, direction, progress and not quiet)
     summary = {"scenario": str(scenario), **summary}
     with output_folder(out):
-        write_report(summary, curves, out)
+        report.write_report(summary, curves, out)
         write_json(out / "summary.json", summary)
     if not quiet:
-        print_tables(summary, out)
+        report.print_tables(summary, out)
     return summary
 
 
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | StartStage = True
-) -> tuple[dict[str, Any], ReportCurves]:
+) -> tuple[dict[str, Any], report.ReportCurves]:
     """Analyse a scenario without its passivity method; return summary and curves of the report."""
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze_in_stages(scenario, direction, stage)
@@ -70,15 +63,14 @@ def analyze(
 
 def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
-) -> tuple[dict[str, Any], ReportCurves]:
+) -> tuple[dict[str, Any], report.ReportCurves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
-    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    estimate = true_load(scenario)
     along = task_direction(linear, UNIT_VECTORS[direction])
     sampling = sampling_of_scenario(linear)
-    wall = (5100.0, 0.0)
-    if along.axis.wall_stiffness > 0.0:
-        wall = (along.axis.wall_stiffness, along.axis.wall_damping)
+    is_wall_known, omega = along.axis.wall_stiffness > 0.0, summary_values.OMEGA
+    wall = (along.axis.wall_stiffness, along.axis.wall_damping) if is_wall_known else (5100.0, 0.0)
     axis = dataclasses.replace(along.axis, wall_stiffness=0.0, wall_damping=0.0)
     contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
 
@@ -94,9 +86,8 @@ def _analyze_in_stages(
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    with_hand = hybrid_along(
-        close_other_directions(free, linear, along), summary_values.OMEGA, along.hand, along.tool
-    )
+    one_loop_open = close_other_directions(free, linear, along)
+    with_hand = hybrid_along(one_loop_open, omega, along.hand, along.tool)
     H = absorb_impedances(with_hand, hand=-summary_values.S_AT_OMEGA * axis.hand_mass)
     closed_form = hybrid_matrix(axis, summary_values.S_AT_OMEGA)
     progress(0.3)
@@ -106,7 +97,7 @@ def _analyze_in_stages(
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": wall[0],
-        "wall_is": describe_wall_source(scenario, along.axis.wall_stiffness > 0.0),
+        "wall_is": describe_wall_source(scenario, is_wall_known),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
             summary_values.summarise_diagram_stability(
@@ -136,17 +127,15 @@ def _analyze_in_stages(
     summary["measured"] = None
     if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        summary["measured"] = summary_values.measure_free_impedance(
-            linear, along, close_other_directions(free, linear, along)
-        )
+        summary["measured"] = summary_values.measure_free_impedance(linear, along, one_loop_open)
         measured(1.0)
     summary = to_json_data(summary)
-    summary["verdict"] = verdict_sentences(summary)
+    summary["verdict"] = report.verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
         loop = cut_loop(summary_values.axis_with_grip(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, summary_values.OMEGA, axis.delay)
-    return summary, ReportCurves(axis, summary_values.OMEGA, H, closed_form, wall, nyquist, maps)
+        nyquist[grip] = -loop_response(loop, omega, axis.delay)
+    return summary, report.ReportCurves(axis, omega, H, closed_form, wall, nyquist, maps)
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
@@ -162,12 +151,8 @@ def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
 
 def sampling_of_scenario(scenario: Scenario) -> Sampling:
     rates, sensor = scenario.rates, scenario.wrist_sensor
-    return Sampling(
-        rates.hand_hz,
-        rates.joint_control_hz,
-        rates.sensor_hz,
-        None if sensor.ideal else sensor.bandwidth_hz,
-    )
+    low_pass_hz = None if sensor.ideal else sensor.bandwidth_hz
+    return Sampling(rates.hand_hz, rates.joint_control_hz, rates.sensor_hz, low_pass_hz)
 
 
 def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
@@ -175,12 +160,10 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
-        raise DrakeTeleopError(
-            "is 0, so that the slave cannot press on the sheet spring",
-            where="kinematic_scaling.translation_scale",
-            remedy="choose a scale above 0, or leave the sheet spring (sheet_spring) out",
-        )
-    goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _TIP_DEPTH_IN_LEAF_M]
+        what = "is 0, so that the slave cannot press on the sheet spring"
+        remedy = "choose a scale above 0, or leave the sheet spring (sheet_spring) out"
+        raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
+    goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).start_tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ displacement / scaling.translation_scale)

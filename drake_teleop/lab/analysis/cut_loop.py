@@ -14,20 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
+from drake_teleop.lab.analysis import period_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.period_map import (
-    RECEIVED_FORCE,
-    SAMPLED_FORCE,
-    Sampling,
-    period_map_of_cut_loop,
-)
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
 _ANGLE_OFFSETS_NEAR_POLES = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_GAIN_CROSSINGS = 32
-_MAX_GAIN_OF_NO_LOOP = 1e-9  # largest |L| that counts as no loop
 _DISTANCE_OF_MULTIPLIER_FROM_ONE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
@@ -59,12 +53,12 @@ class CutLoop:
         return cls(open_multipliers, closed_multipliers, np.broadcast_to(period_s, shape), *found)
 
 
-def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
+def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
     """Return the loop without delay, cut at the displayed force."""
-    M = period_map_of_cut_loop(axis, sampling)
+    M = period_map.period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
-    closed[..., :, SAMPLED_FORCE] += M[..., :n, n + 3 + RECEIVED_FORCE]
+    closed[..., :, period_map.SAMPLED_FORCE] += M[..., :n, n + 3 + period_map.RECEIVED_FORCE]
     opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
     zeros = np.linalg.eigvals(closed).astype(np.complex128)
     return CutLoop.from_multipliers(opened, zeros, 1 / np.asarray(sampling.hand_hz))
@@ -85,7 +79,7 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
 
     `response` (N,) is from `loop_response`, at increasing frequencies.
     """
-    if np.abs(response).max() < _MAX_GAIN_OF_NO_LOOP:
+    if np.abs(response).max() < 1e-9:  # no loop
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
     crossings = _zero_crossing_fractions(log_gain)

@@ -21,7 +21,6 @@ from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
 
 _NUM_PHASE_DRAWS = 300  # number of random phase sets; the one with the lowest peak is used
-_MASS_FIT_BAND_RAD_S = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass
 
 
 @dataclass(frozen=True)
@@ -85,8 +84,7 @@ class StationResponse:
     force_scale: float
 
     def response(self, output: str, input_: str) -> Complex:
-        ratio: Complex = self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
-        return ratio
+        return self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
 
     def coherence(self, output: str, input_: str) -> Array:
         """Return the fraction (n,) of the output's power that is linear in the input."""
@@ -97,13 +95,11 @@ class StationResponse:
 
     def apparent_mass(self) -> float:
         """Return the displayed tool mass at the slave's scale [kg], for delays far below 0.1 s."""
-        low = self.omega <= _MASS_FIT_BAND_RAD_S
-        if np.count_nonzero(low) < 3:
-            raise DrakeTeleopError(
-                f"{np.count_nonzero(low)} frequencies are below 10 Hz (the fit of a mass needs 3)",
-                where="MultiSine",
-                remedy="lower `lowest` or lengthen `period`",
-            )
+        low = self.omega <= 2 * np.pi * 10.0
+        if (count := np.count_nonzero(low)) < 3:
+            what = f"{count} frequencies are below 10 Hz (the fit of a mass needs 3)"
+            remedy = "lower `lowest` or lengthen `period`"
+            raise DrakeTeleopError(what, where="MultiSine", remedy=remedy)
         omega = self.omega[low]
         felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
         # The force noise is about equal at all lines, so that the weights are the accelerations.
@@ -127,38 +123,30 @@ def measure_frequency_response(
     `approach` contains motions to the operating point before the multi-sine.
     """
     check_scenario(scenario)
-    rate = scenario.rates.hand_hz
-    steps = round(excitation.period * rate)
-    if abs(steps - excitation.period * rate) > 1e-6:
-        raise DrakeTeleopError(
-            f"{excitation.period:g} s are not a whole number of the hand's periods at {rate:g} Hz",
-            where="MultiSine.period",
-            remedy=f"choose a multiple of {1 / rate:g} s",
-        )
+    rate, period = scenario.rates.hand_hz, excitation.period
+    steps = round(period * rate)
+    if abs(steps - period * rate) > 1e-6:
+        what = f"{period:g} s are not a whole number of the hand's periods at {rate:g} Hz"
+        remedy = f"choose a multiple of {1 / rate:g} s"
+        raise DrakeTeleopError(what, where="MultiSine.period", remedy=remedy)
     start = max((move.t_start + move.duration for move in approach), default=0.0)
     intent: list[MinimumJerk | Sine] = [*approach, *excitation.sines_along(task.hand, start)]
     drawing = replace(
         scenario,
         operator=OperatorConfig(grip=scenario.operator.grip, intent=intent),
         simulation__settle=start + excitation.settle,
-        simulation__duration=excitation.period * excitation.periods,
+        simulation__duration=period * excitation.periods,
         rates__log_hz=rate,
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
     result = simulate(diagram, drawing.simulation, progress=False)
-    odd_multiples_of_base_rate = excitation.odd_multiples_of_base_rate()
-    spectra: dict[str, Complex] = {
-        name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[
-            :, odd_multiples_of_base_rate
-        ]
-        * (2 / steps)
-        for name, signal in _forces_and_velocities_along_task(result, scenario, task).items()
-    }
-    return StationResponse(
-        np.asarray(2 * np.pi / excitation.period * odd_multiples_of_base_rate, dtype=float),
-        spectra,
-        scenario.force_scaling.force_scale,
-    )
+    odd_multiples = excitation.odd_multiples_of_base_rate()
+    spectra: dict[str, Complex] = {}
+    for name, signal in _forces_and_velocities_along_task(result, scenario, task).items():
+        periods = signal[: steps * excitation.periods].reshape(-1, steps)
+        spectra[name] = np.fft.rfft(periods)[:, odd_multiples] * (2 / steps)
+    omega = np.asarray(2 * np.pi / period * odd_multiples, dtype=float)
+    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
 
 
 def _forces_and_velocities_along_task(

@@ -16,7 +16,6 @@ from drake_teleop.lab.analysis.one_axis import Complex
 COMPONENT_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 _MAX_STATES_FOR_DENSE_EIGENVALUES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # limit of the sparse search
 _EIGENVALUES_PER_SHIFT = 40
 
 
@@ -74,15 +73,12 @@ class Linearization:
         if size <= _MAX_STATES_FOR_DENSE_EIGENVALUES:
             values = np.linalg.eigvals(A.toarray())
         elif size > MAX_STATES:
-            raise DrakeTeleopError(
-                f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})",
-                where="channel.delay",
-                remedy="shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)",
-            )
+            what = f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})"
+            remedy = "shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)"
+            raise DrakeTeleopError(what, where="channel.delay", remedy=remedy)
         else:
-            values = _find_eigenvalues_near_circle(
-                A.astype(complex).tocsc(), 2 * np.pi * _MAX_SEARCHED_EIGENVALUE_HZ * self.dt
-            )
+            highest = 2 * np.pi * 100.0 * self.dt
+            values = _find_eigenvalues_near_circle(A.astype(complex).tocsc(), highest)
         return values[np.argsort(-np.abs(values))].astype(complex)
 
     @property
@@ -136,11 +132,9 @@ class Linearization:
         parts = port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
-            raise DrakeTeleopError(
-                f"'{missing[0]}' is no port or component of this model",
-                where="close_loop",
-                remedy=f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']",
-            )
+            what = f"'{missing[0]}' is no port or component of this model"
+            remedy = f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']"
+            raise DrakeTeleopError(what, where="close_loop", remedy=remedy)
         return tuple(known.index(name) for name in parts)
 
 

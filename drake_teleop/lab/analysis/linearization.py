@@ -97,11 +97,9 @@ def linearize_station(
     """Return the linearised Diagram with all loops closed over the scenario's constant delays."""
     check_scenario(scenario)
     if scenario.passivity.method != "none":
-        raise DrakeTeleopError(
-            f"'{scenario.passivity.method}' cannot be linearised",
-            where="passivity.method",
-            remedy="set method: none, or use measure_frequency_response",
-        )
+        what = f"'{scenario.passivity.method}' cannot be linearised"
+        remedy = "set method: none, or use measure_frequency_response"
+        raise DrakeTeleopError(what, where="passivity.method", remedy=remedy)
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
     return close_network(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
 
@@ -167,11 +165,9 @@ class _PeriodSimulator:
         _check_rate_multiples(scenario)
         own_period = scenario.master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz)
         if own_period is not None:
-            raise DrakeTeleopError(
-                f"is above the device's own rate of {1 / own_period:g} Hz (must be equal)",
-                where="rates.hand_hz",
-                remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
-            )
+            what = f"is above the device's own rate of {1 / own_period:g} Hz (must be equal)"
+            remedy = f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0"
+            raise DrakeTeleopError(what, where="rates.hand_hz", remedy=remedy)
         self.dt = 1 / scenario.rates.hand_hz
         smooth = _without_nonlinear_parts(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
@@ -356,11 +352,8 @@ class _PeriodSimulator:
             x[slave] += moved[slave]
             self._set_state(x)
             x = self._balance_hand_force_and_get_state()
-        raise DrakeTeleopError(
-            f"the slave does not come to rest: {self.states[np.argmax(np.abs(moved))]} changes",
-            where="displacement",
-            remedy="choose another operating point",
-        )
+        what = f"the slave does not come to rest: {self.states[np.argmax(np.abs(moved))]} changes"
+        raise DrakeTeleopError(what, where="displacement", remedy="choose another operating point")
 
     def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
@@ -423,11 +416,9 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
 def _check_linear_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
-        raise DrakeTeleopError(
-            f"this environment cannot be linearised: {beyond}",
-            where="environment",
-            remedy="use only a leaf, a slot, walls and boxes, or none",
-        )
+        what = f"this environment cannot be linearised: {beyond}"
+        remedy = "use only a leaf, a slot, walls and boxes, or none"
+        raise DrakeTeleopError(what, where="environment", remedy=remedy)
 
 
 def _remove_contact_friction(diagram: Diagram) -> None:

@@ -60,14 +60,12 @@ def stability_map(
     """
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
-    def axis_and_loop_at(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
-        return _axis_and_loop_with_values(axis, sampling, {x_name: at_x, y_name: at_y})
-
     def is_stable(at_x: Array, at_y: Array) -> NDArray[np.bool_]:
-        moved, loop = axis_and_loop_at(at_x, at_y)
+        values = {x_name: at_x, y_name: at_y}
+        moved, loop = _axis_and_loop_with_values(axis, sampling, values)
         return count_unstable_multipliers(loop, moved.delay) == 0
 
-    moved, loop = axis_and_loop_at(xs, ys[:, None])
+    moved, loop = _axis_and_loop_with_values(axis, sampling, {x_name: xs, y_name: ys[:, None]})
     shape = len(ys), len(xs)
     unstable = np.broadcast_to(count_unstable_multipliers(loop, moved.delay), shape)
     stable = unstable == 0
@@ -107,18 +105,14 @@ def force_distortion(
 
 def _check_parameter_values(name: str, values: ArrayLike) -> Array:
     if name not in _PARAMETER_NAMES:
-        raise DrakeTeleopError(
-            f"'{name}' is no parameter of a stability map",
-            where="stability_map",
-            remedy=f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}",
-        )
+        what = f"'{name}' is no parameter of a stability map"
+        remedy = f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}"
+        raise DrakeTeleopError(what, where="stability_map", remedy=remedy)
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
-        raise DrakeTeleopError(
-            f"the values (shape {array.shape}) do not increase",
-            where=f"stability_map:{name}",
-            remedy="give at least one number, each above the one before",
-        )
+        what = f"the values (shape {array.shape}) do not increase"
+        remedy = "give at least one number, each above the one before"
+        raise DrakeTeleopError(what, where=f"stability_map:{name}", remedy=remedy)
     return array
 
 

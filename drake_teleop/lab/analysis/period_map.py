@@ -50,14 +50,11 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
     """
     if axis.ideal_servo:
-        raise DrakeTeleopError(
-            "the sampled model does not include an ideal servo",
-            where="axis.ideal_servo",
-            remedy="set it to False with high gains, or use two_port.hybrid_matrix",
-        )
-    servo_samples, sensor_samples = (
-        _samples_per_hand_period(sampling, name) for name in ("joint_control_hz", "sensor_hz")
-    )
+        what = "the sampled model does not include an ideal servo"
+        remedy = "set it to False with high gains, or use two_port.hybrid_matrix"
+        raise DrakeTeleopError(what, where="axis.ideal_servo", remedy=remedy)
+    servo_samples = _samples_per_hand_period(sampling, "joint_control_hz")
+    sensor_samples = _samples_per_hand_period(sampling, "sensor_hz")
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
     n = FIRST_FILTER_STATE + 2 * sections.shape[-2]
@@ -132,11 +129,9 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
     if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
-        raise DrakeTeleopError(
-            f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)",
-            where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand",
-        )
+        what = f"is {ratios.flat[0]:g} times hand_hz (must be a whole number)"
+        remedy = f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand"
+        raise DrakeTeleopError(what, where=f"sampling.{name}", remedy=remedy)
     return count
 
 
@@ -145,11 +140,9 @@ def _low_pass_sections(sampling: Sampling) -> Array:
         return np.zeros((0, 5))
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
     if not (cutoffs < rates / 2).all():
-        raise DrakeTeleopError(
-            "the cut-off frequency is not below half of the sensor's rate",
-            where="sampling.low_pass_hz",
-            remedy="choose less than half of sensor_hz",
-        )
+        what = "the cut-off frequency is not below half of the sensor's rate"
+        remedy = "choose less than half of sensor_hz"
+        raise DrakeTeleopError(what, where="sampling.low_pass_hz", remedy=remedy)
     pairs = zip(cutoffs.flat, rates.flat, strict=True)
     sections = np.array([butterworth_sections(cutoff, rate) for cutoff, rate in pairs])
     return sections.reshape(*rates.shape, 2, 5)
@@ -207,11 +200,9 @@ class _PeriodMapRows:
         return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
 
     def slave_rows(self, time: Array) -> Array:
-        axis = self._axis
-        mass = axis.slave_mass
-        x, v, push = mass_spring_responses_to_unit_x_v_u(
-            axis.wall_stiffness / mass, axis.wall_damping / mass, time
-        )
+        mass = self._axis.slave_mass
+        stiffness, damping = self._axis.wall_stiffness / mass, self._axis.wall_damping / mass
+        x, v, push = mass_spring_responses_to_unit_x_v_u(stiffness, damping, time)
         by_force = -push / np.asarray(mass)[..., None]
         ahead = {SLAVE_X: x, SLAVE_V: v, SERVO_A: push, _HELD_ENVIRONMENT_FORCE: by_force}
         rows = [self._make_row({k: y[..., i] for k, y in ahead.items()}) for i in range(2)]

@@ -15,16 +15,9 @@ from matplotlib.figure import Figure
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, VERMILION, Picture, plot_style
-from drake_teleop.lab.analysis import absolute_stability, transparency
+from drake_teleop.lab.analysis import absolute_stability, transparency, two_port
 from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.two_port import (
-    power_ratio,
-    reference_impedances,
-    scale_slave_power,
-    scattering_matrix,
-    transmitted_impedance,
-)
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
 #: Parameter of a map -> label of its axis, and the factor to its unit.
@@ -72,19 +65,13 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the parameters of the one-axis model as rows (name, value with unit)."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
+    hand = f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m"
+    loops = (f"{which} loop {axis[f'{which}_gain']:.4g} 1/s" for which in ("position", "velocity"))
     return [
-        (
-            "Hand",
-            f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m, "
-            f"{axis['hand_stiffness']:g} N/m",
-        ),
+        ("Hand", f"{hand}, {axis['hand_stiffness']:g} N/m"),
         ("Device", f"{axis['device_mass']:.4g} kg, {axis['device_damping']:.3g} N s/m"),
         ("Slave, with its tool", f"{axis['slave_mass']:.4g} kg at the tip"),
-        (
-            "Servo",
-            f"position loop {axis['position_gain']:.4g} 1/s, "
-            f"velocity loop {axis['velocity_gain']:.4g} 1/s",
-        ),
+        ("Servo", ", ".join(loops)),
         ("Tool beyond the sensor", f"{axis['tool_mass']:g} kg"),
         ("Scales", f"force {scale}, motion {axis['position_scale']:g}"),
         ("Elimination", f"σ = {axis['sigma']:g}, γ = {axis['gamma']:g}"),
@@ -96,14 +83,11 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
     wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
     if not row["stable"]:
         return (row["grip"], wall, "no", "", "", "")
-    return (
-        row["grip"],
-        wall,
-        "yes",
-        "any" if row["gain"] is None else f"{row['gain']:.3g}",
-        "any" if row["phase_deg"] is None else f"{row['phase_deg']:.0f}°",
-        "any" if row["round_trip_s"] is None else f"{1e3 * (row['round_trip_s'] - 2 * delay):.1f}",
-    )
+    trip = row["round_trip_s"]
+    gain = "any" if row["gain"] is None else f"{row['gain']:.3g}"
+    phase = "any" if row["phase_deg"] is None else f"{row['phase_deg']:.0f}°"
+    reserve = "any" if trip is None else f"{1e3 * (trip - 2 * delay):.1f}"
+    return (row["grip"], wall, "yes", gain, phase, reserve)
 
 
 def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
@@ -119,8 +103,8 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
         for column, (name, environment) in enumerate(environments.items()):
             shown = {
                 "ideal": transparency.ideal_impedance(curves.axis, s, environment),
-                "closed form": transmitted_impedance(curves.closed_form, environment),
-                "Diagram, linearised": transmitted_impedance(curves.H, environment),
+                "closed form": two_port.transmitted_impedance(curves.closed_form, environment),
+                "Diagram, linearised": two_port.transmitted_impedance(curves.H, environment),
             }
             styles = ((GREY, "--", 1.0), (COLOURS[3], "-", 2.4), (COLOURS[0], "-", 1.1))
             for (label, felt), (colour, line, width) in zip(shown.items(), styles, strict=True):
@@ -167,9 +151,9 @@ def draw_nyquist(curves: ReportCurves) -> Figure:
 def draw_absolute_stability(curves: ReportCurves) -> Figure:
     """Draw Llewellyn's parameter, the scattering norm, and structured singular values mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
-    ratio = power_ratio(axis)
-    scaled = scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
-    S = scattering_matrix(scaled, reference_impedances(axis))
+    ratio = two_port.power_ratio(axis)
+    scaled = two_port.scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
+    S = two_port.scattering_matrix(scaled, two_port.reference_impedances(axis))
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
     hands = absolute_stability.impedance_range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
@@ -324,10 +308,8 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
         "These limits exclude Coulomb friction, which dissipates energy.",
     ]
     if absolute["absolutely_stable"]:
-        return [
-            *sentences,
-            "It is absolutely stable: no passive hand and environment make it oscillate.",
-        ]
+        stable = "It is absolutely stable: no passive hand and environment make it oscillate."
+        return [*sentences, stable]
     lacking = absolute["lacking_damping_Ns_per_m"]
     remedy = "No damping" if lacking is None else f"{lacking:.3g} N s/m more damping"
     return [

@@ -62,11 +62,8 @@ def task_direction(
         raise DrakeTeleopError("has length zero", where="direction", remedy="give a vector in W")
     sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
-        raise DrakeTeleopError(
-            "sets different sigmas for gripper and object (one axis has one sigma)",
-            where="force_scaling.eta",
-            remedy="set eta: null",
-        )
+        what = "sets different sigmas for gripper and object (one axis has one sigma)"
+        raise DrakeTeleopError(what, where="force_scaling.eta", remedy="set eta: null")
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
@@ -146,10 +143,8 @@ def _find_displaced_posture(slave: SlavePlant, displacement_W: Array) -> Array:
     else:
         q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
-        raise DrakeTeleopError(
-            f"the arm cannot reach this displacement of {displacement_W} m "
-            f"({IkStatus(status).name})",
-            where="displacement",
-            remedy="choose a smaller displacement or another start posture",
-        )
+        reason = IkStatus(status).name
+        what = f"the arm cannot reach this displacement of {displacement_W} m ({reason})"
+        remedy = "choose a smaller displacement or another start posture"
+        raise DrakeTeleopError(what, where="displacement", remedy=remedy)
     return q

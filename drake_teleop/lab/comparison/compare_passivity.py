@@ -19,35 +19,17 @@ from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
+from drake_teleop.lab.comparison import delayed_contact, one_dof
 from drake_teleop.lab.comparison.decision import decision_table
-from drake_teleop.lab.comparison.delayed_contact import (
-    LEAF_THICKNESSES_M,
-    delayed_contact,
-    figures_of_station_run,
-    force_and_energy_traces,
-)
-from drake_teleop.lab.comparison.one_dof import (
-    ACTUAL,
-    OneDof,
-    RunMeasures,
-    Task,
-    covering_damping,
-    figures_of_run,
-    run_one_dof,
-)
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.oscillation import high_pass_above_5_hz
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, step_addresses
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
-from drake_teleop.station.simulation import (
-    MakeSimulator,
-    advance_without_garbage_collection,
-    read_recorded_signals,
-)
 from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
@@ -85,11 +67,10 @@ def compare_command(
     Rates, integrator and environment of the scenario are not used. Return the content of
     summary.json (docs/delay-figures.md).
     """
-    for name in networks:
-        if name not in PRESETS:
-            remedy = suggest_name(name, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
-            what = f"there is no network '{name}'"
-            raise DrakeTeleopError(what, where="networks", remedy=remedy)
+    if unknown := [name for name in networks if name not in PRESETS]:
+        remedy = suggest_name(unknown[0], tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
+        what = f"there is no network '{unknown[0]}'"
+        raise DrakeTeleopError(what, where="networks", remedy=remedy)
     methods = tuple(METHODS) if methods is None else methods
     for name in methods:
         METHODS.check(name, "methods")
@@ -135,7 +116,7 @@ def compare_command(
 
 
 def longest_round_trip(
-    method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
+    method: str, model: one_dof.OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
     """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
 
@@ -145,8 +126,8 @@ def longest_round_trip(
     for round_trip in ROUND_TRIPS_S:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
         for seed in seeds if jitter or loss else seeds[:1]:
-            run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
-            if not figures_of_run(run, model).stable:
+            run = one_dof.run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
+            if not one_dof.figures_of_run(run, model).stable:
                 return longest
         longest = round_trip
     return longest
@@ -167,18 +148,17 @@ def simulate_press(
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Simulate a press on a sheet spring; return its table row and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
-    names = [entry.name for entry in dataclasses.fields(RunMeasures)]
+    names = [entry.name for entry in dataclasses.fields(one_dof.RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
-    setup, task = delayed_contact(
-        scenario, Channel(network=network), PassivityConfig(method=method), leaf
-    )
+    channel, passivity = Channel(network=network), PassivityConfig(method=method)
+    setup, task = delayed_contact.delayed_contact(scenario, channel, passivity, leaf)
     setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    shown = force_and_energy_traces(result, setup)
+    shown = delayed_contact.force_and_energy_traces(result, setup)
     held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
@@ -194,17 +174,17 @@ def simulate_press(
 
 
 def _run_while_stable(
-    station: Diagram, scenario: Scenario, task: Task
-) -> tuple[SimulationResult, RunMeasures]:
+    station: Diagram, scenario: Scenario, task: one_dof.Task
+) -> tuple[SimulationResult, one_dof.RunMeasures]:
     settle = scenario.simulation.settle
-    simulator = MakeSimulator(station, scenario.simulation)
+    simulator = simulation.MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release_start)
     for part in (hold, task):
         end = 1e-3 * round(1e3 * (settle + part.end))  # exactly at the event
-        advance_without_garbage_collection(simulator, end)
-        result = read_recorded_signals(simulator, settle)
-        found = figures_of_station_run(result, scenario, part)
+        simulation.advance_without_garbage_collection(simulator, end)
+        result = simulation.read_recorded_signals(simulator, settle)
+        found = delayed_contact.figures_of_station_run(result, scenario, part)
         if not found.stable:
             break
     # Without rest in the hold the drift is not defined.
@@ -216,16 +196,15 @@ def _run_one_dof_study(
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS))
     # Compile here once, so that the parallel processes read the cache.
-    longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
+    longest_round_trip(methods[0], one_dof.OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
     seeds = range(seed, seed + 2)
-    found = _run_in_processes(
-        longest_round_trip,
-        [(m, OneDof(wall_stiffness=wall), *impairment, seeds) for m, wall, impairment in cases],
-        jobs,
-        stage("One degree of freedom"),
-    )
+    runs = [
+        (method, one_dof.OneDof(wall_stiffness=wall), *impairment, seeds)
+        for method, wall, impairment in cases
+    ]
+    found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
     return [
         {
             "method": method,
@@ -243,16 +222,10 @@ def _run_release_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
-    found = _run_in_processes(
-        simulate_release_and_taps,
-        [(method, network, seed) for network, method in cases],
-        jobs,
-        stage("Let go, and taps"),
-    )
+    runs = [(method, network, seed) for network, method in cases]
+    found = _run_in_processes(simulate_release_and_taps, runs, jobs, stage("Let go, and taps"))
     return [
-        {"method": method, "network": network}
-        | dataclasses.asdict(one)
-        | {"tap_shares": list(one.tap_shares)}
+        {"method": method, "network": network, **vars(one), "tap_shares": list(one.tap_shares)}
         for (network, method), one in zip(cases, found, strict=True)
     ]
 
@@ -263,18 +236,12 @@ def _run_station_study(
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
-    cases = list(itertools.product(slowest, LEAF_THICKNESSES_M, methods))
-    results = _run_in_processes(
-        simulate_press,
-        [(base, method, network, leaf, estimate) for network, leaf, method in cases],
-        jobs,
-        stage("The whole station"),
-    )
-    leaves = list(LEAF_THICKNESSES_M)
-    rows = sorted(
-        (row for row, _ in results),
-        key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])),
-    )
+    cases = list(itertools.product(slowest, delayed_contact.LEAF_THICKNESSES_M, methods))
+    runs = [(base, method, network, leaf, estimate) for network, leaf, method in cases]
+    results = _run_in_processes(simulate_press, runs, jobs, stage("The whole station"))
+    leaves = list(delayed_contact.LEAF_THICKNESSES_M)
+    rows = [row for row, _ in results]
+    rows.sort(key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results
@@ -286,17 +253,12 @@ def _run_station_study(
 def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
     for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
-        model = OneDof(sigma=sigma, wall_stiffness=wall)
-        run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
-        rows.append(
-            {
-                "sigma": sigma,
-                "round_trip_s": round_trip,
-                "wall_N_per_m": wall,
-                "injected_J": max(0.0, -run.least_energy_sum(ACTUAL)),
-                "damping_Ns_per_m": covering_damping(model, round_trip),
-            }
-        )
+        model = one_dof.OneDof(sigma=sigma, wall_stiffness=wall)
+        run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
+        row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
+        row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.ACTUAL))
+        row["damping_Ns_per_m"] = one_dof.covering_damping(model, round_trip)
+        rows.append(row)
         progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))
     return rows
 

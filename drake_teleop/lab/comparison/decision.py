@@ -9,10 +9,8 @@ from typing import Any
 from drake_teleop.lab.comparison.one_dof import WRIST_TO_TIP_DISTANCE_M
 from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N
 
-VERDICT_UNSTABLE = "unstable"
-VERDICT_POSITION_ERROR = "position error"
-VERDICT_CHATTERS = "chatters"
-VERDICT_LEAKS, VERDICT_HOLDS = "leaks", "holds"
+VERDICT_UNSTABLE, VERDICT_POSITION_ERROR = "unstable", "position error"
+VERDICT_CHATTERS, VERDICT_LEAKS, VERDICT_HOLDS = "chatters", "leaks", "holds"
 MAX_POSITION_ERROR_M, MIN_LEAKED_ENERGY_J = 5e-3, 1e-3  #: m; J
 
 
@@ -42,17 +40,12 @@ class MethodResult:
 
 def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
     """Return the result of each (method, network) in a summary."""
-    return {
-        (row["method"], row["network"]): _summarise_runs_of_method(
-            [
-                run
-                for run in summary["station"]
-                if (run["method"], run["network"]) == (row["method"], row["network"])
-            ],
-            row["leaked"],
-        )
-        for row in summary["hands"]
-    }
+    table = {}
+    for row in summary["hands"]:
+        key = row["method"], row["network"]
+        runs = [run for run in summary["station"] if (run["method"], run["network"]) == key]
+        table[key] = _summarise_runs_of_method(runs, row["leaked"])
+    return table
 
 
 def _summarise_runs_of_method(
@@ -67,9 +60,8 @@ def _summarise_runs_of_method(
         return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
     if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_RMS_AT_REST_N:
         return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
-    return MethodResult(
-        VERDICT_LEAKS if leaked > MIN_LEAKED_ENERGY_J else VERDICT_HOLDS, forces, leaked_J=leaked
-    )
+    verdict = VERDICT_LEAKS if leaked > MIN_LEAKED_ENERGY_J else VERDICT_HOLDS
+    return MethodResult(verdict, forces, leaked_J=leaked)
 
 
 def _describe_motion_in_hold(run: Mapping[str, Any]) -> str:

@@ -8,12 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.lab.comparison import station_accounts
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
-from drake_teleop.lab.comparison.station_accounts import (
-    start_energy,
-    station_accounts,
-    work_of_displayed_load_wrench,
-)
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.sheet_spring import SheetSpring
@@ -84,17 +80,15 @@ def delayed_contact(
         width=_LEAF_WIDTH_M,
         thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
-    return (
-        replace(
-            base.without_environment(),
-            simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
-            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
-            channel=channel,
-            passivity=passivity,
-            sheet_spring=sheet,
-        ),
-        task,
+    scenario = replace(
+        base.without_environment(),
+        simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
+        operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
+        channel=channel,
+        passivity=passivity,
+        sheet_spring=sheet,
     )
+    return scenario, task
 
 
 def leaf_thickness(stiffness: float) -> float:
@@ -127,10 +121,10 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
-    accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
+    accounts = station_accounts.station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
-        accounts += work_of_displayed_load_wrench(result, scenario)
-    return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
+        accounts += station_accounts.work_of_displayed_load_wrench(result, scenario)
+    return np.asarray(station_accounts.start_energy(scenario).sum() + accounts.sum(axis=1))
 
 
 def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> tuple[Array, Array]:

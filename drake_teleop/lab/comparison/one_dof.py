@@ -176,14 +176,12 @@ def run_one_dof(
     # The channel's command belongs to the next step; here it is used at once.
     playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
     forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD, playout=playout)
-    forward_delays, backward_delays = (
-        (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
-    )
+    ahead, back = (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
     lines = [
         network.network_parameters(line, seed, direction, PERIOD, min_steps=1, delays=travels)
         for line, direction, travels in (
-            (forward_line, network.FORWARD, forward_delays),
-            (forward if backward is None else backward, network.BACKWARD, backward_delays),
+            (forward_line, network.FORWARD, ahead),
+            (backward or forward, network.BACKWARD, back),
         )
     ]
     states = [network.initial_network_state(line, np.zeros(PACKET_SIZE)) for line in lines]
@@ -196,11 +194,8 @@ def run_one_dof(
         model.tool_mass, model.wall_damping, scale, model.sigma, model.gamma,
         model.master_resolution, model.slave_resolution, model.wrench_noise, seed % 2**53,
     )  # fmt: skip
-    defaults = (
-        (model.hand_mass, model.hand_damping, model.hand_stiffness),
-        (0.0, model.wall_stiffness),
-    )
-    inputs = intent, defaults[0] if grip is None else grip, defaults[1] if wall is None else wall
+    hand = (model.hand_mass, model.hand_damping, model.hand_stiffness) if grip is None else grip
+    inputs = intent, hand, (0.0, model.wall_stiffness) if wall is None else wall
     course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in inputs]
     # These methods use the motor's force, which is held over a period; the others interpolate the
     # command over it.

@@ -22,7 +22,6 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 
 TAP_RATES_HZ = (1.0, 1.5)  #: Hz
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
-_EVALUATED_TIME_AFTER_RELEASE_S = 2.0  # s, evaluated after letting go
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
         )
 
     release_time = 3.0 + 3 * round_trip
-    end = release_time + _EVALUATED_TIME_AFTER_RELEASE_S
+    end = release_time + 2.0
     task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, rest_window=0.1)
     pressing = operator_intent(task)
     release_row = round(release_time / PERIOD)

@@ -47,7 +47,6 @@ VERDICT_STYLES = {
     VERDICT_UNSTABLE: ("✗", "#565C66", "white"),
 }
 _NETWORK_MARKERS = "os^Dv"  # marks of the networks
-_CENTRED_TEXT: dict[str, Any] = {"ha": "center", "va": "center"}
 
 Traces = Mapping[tuple[str, str], Mapping[str, Array]]
 
@@ -91,18 +90,11 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
             lines += cell.motion_texts
             offset = 0.12 * len(lines)
-            axes.text(
-                x,
-                y - offset,
-                f"{mark} {cell.verdict_text}",
-                color=text_colour,
-                size=9.5,
-                weight="bold",
-                **_CENTRED_TEXT,
-            )
+            style: dict[str, Any] = {"color": text_colour, "ha": "center", "va": "center"}
+            title = f"{mark} {cell.verdict_text}"
+            axes.text(x, y - offset, title, size=9.5, weight="bold", **style)
             for place, line in enumerate(lines):
-                line_y = y - offset + 0.27 * (place + 1)
-                axes.text(x, line_y, line, color=text_colour, size=8.5, **_CENTRED_TEXT)
+                axes.text(x, y - offset + 0.27 * (place + 1), line, size=8.5, **style)
         axes.set_xlim(-0.5, len(networks) - 0.5)
         axes.set_ylim(len(methods) - 0.5, -0.5)
         names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
@@ -166,9 +158,8 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
 
     figure = _draw_trace_grid(summary, traces, draw_run_energy, "energy [J]")
-    figure.suptitle(
-        "Energy between hand and actual motion:\nbelow 0 the station is active", x=0.01, ha="left"
-    )
+    words = "Energy between hand and actual motion:\nbelow 0 the station is active"
+    figure.suptitle(words, x=0.01, ha="left")
     return figure
 
 
@@ -198,15 +189,11 @@ def draw_round_trip_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
     walls = sorted({row["wall_N_per_m"] for row in rows})
     with plot_style():
         figure = Picture(figsize=(3.6 * len(walls), 0.36 * len(methods) + 1.3))
-        for axes, wall in zip(
-            figure.subplots(1, len(walls), squeeze=False, sharey=True)[0], walls, strict=True
-        ):
+        panels = figure.subplots(1, len(walls), squeeze=False, sharey=True)[0]
+        for axes, wall in zip(panels, walls, strict=True):
+            at_wall = [row for row in rows if row["wall_N_per_m"] == wall]
             for place, method in enumerate(methods):
-                found = [
-                    1e3 * row["longest_s"]
-                    for row in rows
-                    if row["method"] == method and row["wall_N_per_m"] == wall
-                ]
+                found = [1e3 * row["longest_s"] for row in at_wall if row["method"] == method]
                 shortest, longest = max(min(found), 1.0), max(max(found), 1.0)
                 axes.plot([1.0, shortest], [place, place], color=COLOURS[0], linewidth=5)
                 axes.plot([shortest, longest], [place, place], color=COLOURS[5], linewidth=2)
@@ -231,9 +218,7 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
         grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")
     for method in summary["methods"]:
         cells = [table[method, network] for network in summary["networks"]]
-        grid.add_row(
-            method,
-            *(f"{cell.verdict_text} {cell.least_displayed_share_text}".strip() for cell in cells),
-        )
+        texts = (f"{cell.verdict_text} {cell.least_displayed_share_text}" for cell in cells)
+        grid.add_row(method, *map(str.strip, texts))
     console.print(grid)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -25,20 +25,17 @@ from drake_teleop.station.slave.arm import (
     sensor_motion,
 )
 
-_SIGNALS_FOR_ENERGY_BALANCES = ("ports", "slave_state", "joint_torque")
-
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energies (N, 4, 2) [J] at `HAND` to `ACTUAL`, for translation and rotation.
 
     `MOTOR` is NaN if the log is slower than the joint control.
     """
-    if missing := [name for name in _SIGNALS_FOR_ENERGY_BALANCES if name not in result]:
-        raise DrakeTeleopError(
-            f"lacks the signals {', '.join(missing)}, which the energy balances need",
-            where="result",
-            remedy="run a station with a network or a passivity method",
-        )
+    needed = ("ports", "slave_state", "joint_torque")
+    if missing := [name for name in needed if name not in result]:
+        what = f"lacks the signals {', '.join(missing)}, which the energy balances need"
+        remedy = "run a station with a network or a passivity method"
+        raise DrakeTeleopError(what, where="result", remedy=remedy)
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
     poses, motor = _poses_and_motor_wrenches(scenario, q, torque)

@@ -15,13 +15,9 @@ from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.plant import bodies_carried_by
 
-#: Sample rate of the check [Hz].
-CHECK_RATE_HZ = 1000.0
-_SENSOR_NORM_NAMES = ("force", "torque", "specific force", "angular acceleration")
+CHECK_RATE_HZ = 1000.0  #: sample rate of the check [Hz]
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
 _DIFFERENCE_STEP_S = 1e-4
-# Search distance beyond the clearance [m].
-_SHAPE_PAIR_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -71,12 +67,13 @@ def check_motion(
     names, limits = robot.arm.joint_names, robot.limits
     quantities = _evaluate_limited_quantities(robot, q, qd, qdd, progress)
     torque, sensor, workspace, clearance, nearest = quantities
+    sensor_names = ("force", "torque", "specific force", "angular acceleration")
     uses = [
         _largest_limit_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
         _largest_limit_use("velocity", np.abs(qd) / limits.velocity, t, names),
         _largest_limit_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
         _largest_limit_use("torque", np.abs(torque) / limits.max_torques, t, names),
-        _largest_limit_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
+        _largest_limit_use("sensor", sensor / limits.max_sensor_norms, t, sensor_names),
         _largest_limit_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
         _largest_limit_use("clearance", clearance[:, np.newaxis], t, ("",)),
     ]
@@ -127,8 +124,7 @@ def _evaluate_limited_quantities(
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = scene.scene_graph.get_query_output_port().Eval(scene_context)
-        reach = limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
-        distance, words = _nearest_shapes(scene, query, reach)
+        distance, words = _nearest_shapes(scene, query, limits.clearance + 0.01)
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:

@@ -2,53 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    Box,
-    CollisionFilterDeclaration,
-    CollisionFilterManager,
-    Cylinder,
-    Ellipsoid,
-    GeometryId,
-    GeometrySet,
-    HalfSpace,
-    ProximityProperties,
-    Role,
-    SceneGraph,
-    Shape,
-    Sphere,
-)
+from pydrake import geometry
 from pydrake.geometry import Capsule as CapsuleShape
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody import tree
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Frame,
-    ModelInstanceIndex,
-    RigidBody,
-    SpatialInertia,
-    UnitInertia,
-    WeldJoint,
-)
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import (
-    allocate_link_motions,
-    capsule_distances,
-    write_link_motions,
-)
+from drake_teleop.lab.excitation import limits
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize_without_limit_warnings
 
-# Vertices of the circumscribed polygon of a cylinder.
-_NUM_CYLINDER_RIM_POINTS = 24
+_NUM_CYLINDER_RIM_POINTS = 24  # of the circumscribed polygon of a cylinder
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +40,8 @@ class Capsule:
         return bool(np.all(distances + other.radius <= self.radius + 1e-9))
 
 
-def bounding_capsule(shape: Shape) -> Capsule:
-    if isinstance(shape, Sphere):
+def bounding_capsule(shape: geometry.Shape) -> Capsule:
+    if isinstance(shape, geometry.Sphere):
         return Capsule(np.zeros((2, 3)), shape.radius())
     if isinstance(shape, CapsuleShape):
         end = np.array([0.0, 0.0, shape.length() / 2])
@@ -87,20 +61,18 @@ def bounding_capsule(shape: Shape) -> Capsule:
     return Capsule(ends, radius)
 
 
-def _convex_hull_points(shape: Shape) -> Array:
-    if isinstance(shape, Box):
+def _convex_hull_points(shape: geometry.Shape) -> Array:
+    if isinstance(shape, geometry.Box):
         corners = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, 8).T
         return corners * shape.size()
-    if isinstance(shape, Ellipsoid):
+    if isinstance(shape, geometry.Ellipsoid):
         corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
         return corners * [shape.a(), shape.b(), shape.c()]
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, geometry.Cylinder):
         angle = 2 * np.pi * np.arange(_NUM_CYLINDER_RIM_POINTS) / _NUM_CYLINDER_RIM_POINTS
-        radius = shape.radius() / np.cos(np.pi / _NUM_CYLINDER_RIM_POINTS)
-        rim = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-        half = shape.length() / 2
-        ends = [np.column_stack([rim, np.full(_NUM_CYLINDER_RIM_POINTS, z)]) for z in (-half, half)]
-        return np.concatenate(ends)
+        radius, half = shape.radius() / np.cos(np.pi / len(angle)), shape.length() / 2
+        x, y = radius * np.cos(angle), radius * np.sin(angle)
+        return np.vstack([np.column_stack([x, y, np.full(len(x), z)]) for z in (-half, half)])
     hull = shape.GetConvexHull()
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
 
@@ -122,20 +94,20 @@ _NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
 _NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.02, 0.05), 0.25, 0.1
-# Smallest number of postures near contact for a correction.
-_MIN_POSTURES_NEAR_CONTACT = 5
+_MIN_POSTURES_NEAR_CONTACT = 5  # for a correction
 # Share of postures below which near capsules count although their shapes were never near.
 _MAX_SHARE_OF_RARE_CAPSULE_CONTACT = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
-_BOX_FOR_HALF_SPACE, _POSE_OF_BOX_FOR_HALF_SPACE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
+_BOX_FOR_HALF_SPACE = geometry.Box(10, 10, 1)
+_POSE_OF_BOX_FOR_HALF_SPACE = RigidTransform([0, 0, -0.5])
 _MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
 
-_ShapePair = tuple[GeometryId, GeometryId]
-ParseArm = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
+_ShapePair = tuple[geometry.GeometryId, geometry.GeometryId]
+ParseArm = Callable[[MultibodyPlant], tuple[tree.ModelInstanceIndex, tree.Frame]]
 
 
 class CollisionScene:
@@ -155,11 +127,12 @@ class CollisionScene:
         _add_load(self.plant, instance, self.sensor_frame, reserve)
         _complete_collision_shapes(self.plant, self.scene_graph, visuals_collide)
         _check_shape_sizes(self.plant, self.scene_graph, where)
-        _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE_NAME)
+        world, table = self.plant.world_body(), geometry.HalfSpace()
+        _add_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)
         finalize_without_limit_warnings(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
-        self._rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
+        self._rows = {tree.BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
             for body in self.plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
@@ -174,13 +147,10 @@ class CollisionScene:
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
-            together = [
-                shape
-                for body, row in self._rows.items()
-                if row == link
-                for shape in self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
-            ]
-            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(together)))
+            bodies = [self.plant.get_body(body) for body, row in self._rows.items() if row == link]
+            together = itertools.chain(*map(self.plant.GetCollisionGeometriesForBody, bodies))
+            shapes = geometry.GeometrySet(list(together))
+            manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(shapes))
         candidates = self.scene_graph.model_inspector().GetCollisionCandidates()
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
@@ -210,8 +180,7 @@ class CollisionScene:
                 names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
                 touching.append(" and ".join(names))
             if touch or neighbours:
-                exclude = CollisionFilterDeclaration().ExcludeBetween
-                manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
+                _exclude_pair(manager, a, b)
                 del distances[a, b]
         return distances, sorted(set(touching))
 
@@ -220,14 +189,14 @@ class CollisionScene:
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
         """Return capsules around the shapes, as the fields of `Limits` from `capsule_links` on."""
         inspector = self.scene_graph.model_inspector()
-        motions = allocate_link_motions(1, self.arm.num_joints)
+        motions = limits.allocate_link_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
-        write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
-        capsules: dict[GeometryId, tuple[int, Capsule]] = {}
+        limits.write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
+        capsules: dict[geometry.GeometryId, tuple[int, Capsule]] = {}
         shapes = {shape for pair in candidates for shape in pair}
-        for shape in sorted(shapes, key=GeometryId.get_value):
+        for shape in sorted(shapes, key=geometry.GeometryId.get_value):
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
@@ -240,7 +209,7 @@ class CollisionScene:
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
-        outer_shapes = sorted(set(outer.values()), key=GeometryId.get_value)
+        outer_shapes = sorted(set(outer.values()), key=geometry.GeometryId.get_value)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
             first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
@@ -249,11 +218,11 @@ class CollisionScene:
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         outer_capsules = [capsules[shape][1] for shape in outer_shapes]
-        motions = allocate_link_motions(len(postures), self.arm.num_joints)
-        write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
+        motions = limits.allocate_link_motions(len(postures), self.arm.num_joints)
+        limits.write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in outer_capsules]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in outer_capsules])
-        capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
+        capsules_apart = limits.capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
             distance = _required_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
@@ -283,20 +252,26 @@ def _required_capsule_distance(shape_distances: Array, capsules_apart: Array) ->
 
 
 def _exclude_coaxial_pairs(
-    manager: CollisionFilterManager, distances: dict[_ShapePair, Array]
+    manager: geometry.CollisionFilterManager, distances: dict[_ShapePair, Array]
 ) -> None:
     # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
         first = of_pair[:_NUM_COAXIALITY_POSTURES]
         if first.max() < min(MIN_CLEARANCE_M, first.min() + _MIN_PAIR_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
-            exclude = CollisionFilterDeclaration().ExcludeBetween
-            manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
+            _exclude_pair(manager, a, b)
+
+
+def _exclude_pair(
+    manager: geometry.CollisionFilterManager, a: geometry.GeometryId, b: geometry.GeometryId
+) -> None:
+    exclude = geometry.CollisionFilterDeclaration().ExcludeBetween
+    manager.Apply(exclude(geometry.GeometrySet(a), geometry.GeometrySet(b)))
 
 
 def _shape_with_enclosing_capsule(
-    shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]
-) -> GeometryId:
+    shape: geometry.GeometryId, capsules: dict[geometry.GeometryId, tuple[int, Capsule]]
+) -> geometry.GeometryId:
     row, capsule = capsules[shape]
     holding = [
         (other.radius, -name.get_value(), name)
@@ -307,26 +282,26 @@ def _shape_with_enclosing_capsule(
 
 
 def _add_load(
-    plant: MultibodyPlant, instance: ModelInstanceIndex, frame: Frame, phi: Array
+    plant: MultibodyPlant, instance: tree.ModelInstanceIndex, frame: tree.Frame, phi: Array
 ) -> None:
-    mass = float(phi[0])
-    unit = inertia_about_origin(phi) / mass
+    mass, unit = float(phi[0]), inertia_about_origin(phi) / phi[0]
     moments, products = np.diag(unit), unit[np.triu_indices(3, 1)]
-    inertia = SpatialInertia(mass, phi[1:4] / mass, UnitInertia(*moments, *products))
+    inertia = tree.SpatialInertia(mass, phi[1:4] / mass, tree.UnitInertia(*moments, *products))
     body = plant.AddRigidBody("drake_teleop_reserve", instance, inertia)
-    plant.AddJoint(WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform()))
+    weld = tree.WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform())
+    plant.AddJoint(weld)
 
 
 def _complete_collision_shapes(
-    plant: MultibodyPlant, scene_graph: SceneGraph, visuals_collide: bool
+    plant: MultibodyPlant, scene_graph: geometry.SceneGraph, visuals_collide: bool
 ) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
-        body = plant.get_body(BodyIndex(index))
+        body = plant.get_body(tree.BodyIndex(index))
         for k, solid in enumerate(plant.GetCollisionGeometriesForBody(body)):
-            if isinstance(shape := inspector.GetShape(solid), HalfSpace):
+            if isinstance(shape := inspector.GetShape(solid), geometry.HalfSpace):
                 X_BG = inspector.GetPoseInFrame(solid)
-                scene_graph.RemoveRole(plant.get_source_id(), solid, Role.kProximity)
+                scene_graph.RemoveRole(plant.get_source_id(), solid, geometry.Role.kProximity)
                 _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
         if plant.GetCollisionGeometriesForBody(body) and not visuals_collide:
             continue
@@ -335,27 +310,28 @@ def _complete_collision_shapes(
             _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
 
 
-def _check_shape_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> None:
+def _check_shape_sizes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph, where: str) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
-        body = plant.get_body(BodyIndex(index))
-        for solid in plant.GetCollisionGeometriesForBody(body):
-            shape = inspector.GetShape(solid)
-            if isinstance(shape, HalfSpace):  # replaced by a plate
+        body = plant.get_body(tree.BodyIndex(index))
+        for shape in map(inspector.GetShape, plant.GetCollisionGeometriesForBody(body)):
+            if isinstance(shape, geometry.HalfSpace):  # replaced by a plate
                 continue
             capsule = bounding_capsule(shape)
             size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
             if not size <= _MAX_SHAPE_SIZE_M:
-                raise DrakeTeleopError(
-                    f"{body.name()} has a shape of {size:.3g} m (at most {_MAX_SHAPE_SIZE_M:g} m)",
-                    where=where,
-                    remedy="give all lengths in metres",
-                )
+                limit = f"(at most {_MAX_SHAPE_SIZE_M:g} m)"
+                what = f"{body.name()} has a shape of {size:.3g} m {limit}"
+                raise DrakeTeleopError(what, where=where, remedy="give all lengths in metres")
 
 
 def _add_shape(
-    plant: MultibodyPlant, body: RigidBody, X_BG: RigidTransform, shape: Shape, name: str
+    plant: MultibodyPlant,
+    body: tree.RigidBody,
+    X_BG: RigidTransform,
+    shape: geometry.Shape,
+    name: str,
 ) -> None:
-    if isinstance(shape, HalfSpace):
+    if isinstance(shape, geometry.HalfSpace):
         X_BG, shape = X_BG @ _POSE_OF_BOX_FOR_HALF_SPACE, _BOX_FOR_HALF_SPACE
-    plant.RegisterCollisionGeometry(body, X_BG, shape, name, ProximityProperties())
+    plant.RegisterCollisionGeometry(body, X_BG, shape, name, geometry.ProximityProperties())

@@ -21,9 +21,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.regressor import regressor
 
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
-
-#: Sample rate of A16 and D16 [Hz].
-INFORMATION_SAMPLE_RATE_HZ = 1000.0
+INFORMATION_SAMPLE_RATE_HZ = 1000.0  #: sample rate of A16 and D16 [Hz]
 
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
 _MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
@@ -49,8 +47,7 @@ class CriterionScales(NamedTuple):
 
 def limited_gyration_radius(phi: Array) -> float:
     """Return the load's radius of gyration about So [m], at most 0.1."""
-    trace = phi[4] + phi[7] + phi[9]
-    return float(min(0.1, np.sqrt(trace / (2 * phi[0]))))
+    return float(min(0.1, np.sqrt((phi[4] + phi[7] + phi[9]) / (2 * phi[0]))))
 
 
 class Criterion:
@@ -58,11 +55,9 @@ class Criterion:
 
     def __init__(self, name: str, scales: CriterionScales) -> None:
         if name not in CRITERIA:
-            raise DrakeTeleopError(
-                f"there is no criterion '{name}'",
-                where="criterion",
-                remedy=f"choose one of {', '.join(CRITERIA)}",
-            )
+            what = f"there is no criterion '{name}'"
+            remedy = f"choose one of {', '.join(CRITERIA)}"
+            raise DrakeTeleopError(what, where="criterion", remedy=remedy)
         self.name = name
         self.with_offsets = name.endswith("16")
         whitened = name in ("kappa_w10", "A16", "D16")
@@ -105,9 +100,7 @@ class Criterion:
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
-        g_gram = (vectors * weights) @ vectors.T
-        if self.name == "A16":
-            g_gram = weights
+        g_gram = weights if self.name == "A16" else (vectors * weights) @ vectors.T
         g_rows = (2 / len(s)) * (rows @ g_gram).reshape(len(s), 6, -1)
         g_V = g_rows * self._rows[:, np.newaxis] * self._columns
         return value, np.ascontiguousarray(g_V[:, :, -10:])

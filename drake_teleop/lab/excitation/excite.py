@@ -11,21 +11,9 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
+from drake_teleop.lab.excitation import limits, optimizer
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ, LimitUse, check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
-from drake_teleop.lab.excitation.limits import (
-    LIMIT_NAMES,
-    allocate_link_motions,
-    write_limit_uses,
-    write_link_motions,
-    write_sensor_motion,
-)
-from drake_teleop.lab.excitation.optimizer import (
-    DesignProblem,
-    DesignTask,
-    FeasibleIterate,
-    minimise_criterion,
-)
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -36,15 +24,10 @@ _MOTION_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 _MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKED_CANDIDATES = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
 _FALLBACK_AMPLITUDE_FACTORS, _NUM_FALLBACK_MOTIONS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
-_CONVEX_HULL_ADVICE = (
-    "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
-    " touch in its start posture are ignored"
-)
-_LIGHTER_LOAD_ADVICE = "; or a smaller --payload, or another sensor or start"
 _ADVICE_BY_LIMIT = {
-    "clearance": _CONVEX_HULL_ADVICE,
-    "sensor": _LIGHTER_LOAD_ADVICE,
-    "torque": _LIGHTER_LOAD_ADVICE,
+    "clearance": "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): "
+    "shapes that touch in its start posture are ignored",
+    **dict.fromkeys(("sensor", "torque"), "; or a smaller --payload, or another sensor or start"),
 }
 
 
@@ -85,22 +68,16 @@ def excite(
 
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
-    task = DesignTask(
-        robot.arm.table,
-        robot.limits,
-        Criterion(criterion, robot.criterion_scales),
-        robot.home_posture,
-        period,
-        harmonics,
-    )
+    scaled, start = Criterion(criterion, robot.criterion_scales), robot.home_posture
+    task = optimizer.DesignTask(robot.arm.table, robot.limits, scaled, start, period, harmonics)
     with show_progress(progress) as stage:
         report = stage("Design the trajectory")
 
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        problem = DesignProblem(task)
-        found = minimise_criterion(
+        problem = optimizer.DesignProblem(task)
+        found = optimizer.minimise_criterion(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.criterion_value for iterate in found), default=np.inf))
@@ -108,19 +85,16 @@ def excite(
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
     excitation = assemble_excitation(robot, criterion, found, trajectory, uses)
     if not np.isfinite(excitation.values[criterion]):
-        raise DrakeTeleopError(
-            "the largest motion that was found within all limits does not excite all parameters;"
-            f" it uses {uses[0]}",
-            where=robot.name,
-            remedy="raise this limit, or take more time, a longer period or another seed",
-        )
+        what = "the largest motion that was found within all limits does not excite all parameters"
+        remedy = "raise this limit, or take more time, a longer period or another seed"
+        raise DrakeTeleopError(f"{what}; it uses {uses[0]}", where=robot.name, remedy=remedy)
     return excitation
 
 
 def assemble_excitation(
     robot: Robot,
     criterion: str,
-    iterates: list[FeasibleIterate],
+    iterates: list[optimizer.FeasibleIterate],
     trajectory: FourierTrajectory,
     uses: list[LimitUse],
 ) -> Excitation:
@@ -142,7 +116,7 @@ def assemble_excitation(
 
 def find_best_within_limits(
     robot: Robot,
-    iterates: list[FeasibleIterate],
+    iterates: list[optimizer.FeasibleIterate],
     progress: Callable[[float], None] = lambda done: None,
     fallback_trajectories: Iterable[FourierTrajectory] = (),
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
@@ -157,13 +131,12 @@ def find_best_within_limits(
             return trajectory, uses
         if worst is None or uses[0].used_share < worst.used_share:
             worst = uses[0]
-    raise DrakeTeleopError(
-        "no trajectory was found that respects all limits"
-        + (f": the best uses {worst}" if worst else ""),
-        where=robot.name,
-        remedy="take more time, a longer period or another seed"
-        + (_ADVICE_BY_LIMIT.get(worst.limit_name, "") if worst is not None else ""),
-    )
+    what = "no trajectory was found that respects all limits"
+    remedy = "take more time, a longer period or another seed"
+    if worst is not None:
+        what += f": the best uses {worst}"
+        remedy += _ADVICE_BY_LIMIT.get(worst.limit_name, "")
+    raise DrakeTeleopError(what, where=robot.name, remedy=remedy)
 
 
 def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
@@ -179,17 +152,24 @@ def trajectory_sensor_motion(
     robot: Robot, trajectory: FourierTrajectory
 ) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
-    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = allocate_link_motions(*joints[0].shape)
-    write_link_motions(robot.arm.table, *joints, motions)
+    _, motions = _joint_and_link_motions(robot, trajectory)
     out = np.empty((3, len(motions), 3))
-    write_sensor_motion(motions, out)
+    limits.write_sensor_motion(motions, out)
     s, omega, alpha = out
     return s, omega, alpha
 
 
+def _joint_and_link_motions(
+    robot: Robot, trajectory: FourierTrajectory
+) -> tuple[tuple[Array, Array, Array], Array]:
+    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
+    motions = limits.allocate_link_motions(*joints[0].shape)
+    limits.write_link_motions(robot.arm.table, *joints, motions)
+    return joints, motions
+
+
 def _feasible_candidates(
-    iterates: list[FeasibleIterate], robot: Robot
+    iterates: list[optimizer.FeasibleIterate], robot: Robot
 ) -> Iterator[FourierTrajectory]:
     ranked = sorted(iterates, key=lambda iterate: iterate.criterion_value)
     last = dict.fromkeys((iterate.start_index for iterate in ranked), 0.0)
@@ -209,7 +189,10 @@ def _feasible_candidates(
 
 
 def _shrinking_motions_about_start_posture(
-    robot: Robot, iterates: list[FeasibleIterate], problem: DesignProblem, seed: int
+    robot: Robot,
+    iterates: list[optimizer.FeasibleIterate],
+    problem: optimizer.DesignProblem,
+    seed: int,
 ) -> Iterator[FourierTrajectory]:
     best = sorted(iterates, key=lambda iterate: iterate.criterion_value)[:_NUM_FALLBACK_MOTIONS]
     motions = [iterate.trajectory for iterate in best]
@@ -226,12 +209,10 @@ def _shrinking_motions_about_start_posture(
 
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
-    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = allocate_link_motions(*joints[0].shape)
-    write_link_motions(robot.arm.table, *joints, motions)
-    smooth, largest = np.empty((2, len(LIMIT_NAMES)))
-    gradients = np.empty((len(LIMIT_NAMES), 3, *joints[0].shape))
-    write_limit_uses(
+    joints, motions = _joint_and_link_motions(robot, trajectory)
+    smooth, largest = np.empty((2, len(limits.LIMIT_NAMES)))
+    gradients = np.empty((len(limits.LIMIT_NAMES), 3, *joints[0].shape))
+    limits.write_limit_uses(
         robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
     )
     return largest

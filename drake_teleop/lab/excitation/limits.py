@@ -27,10 +27,8 @@ LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "work
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
 ZERO_USE_CLEARANCE_MARGIN_M = 0.1
-# Smallest weight in the gradient of a smooth maximum.
-_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7
-# Value that replaces all distances above clearance plus scale [m].
-_DISTANCE_OF_FAR_CAPSULES_M = 1.0
+_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7  # in the gradient of a smooth maximum
+_DISTANCE_OF_FAR_CAPSULES_M = 1.0  # replaces all distances above clearance plus scale [m]
 
 
 class Limits(NamedTuple):
@@ -165,8 +163,7 @@ def _write_torque_use(
 ):
     seeds, c, virtual = work
     T, n = q.shape
-    tau = np.empty((T, n))
-    use = np.empty((T, n))
+    tau, use = np.empty((T, n)), np.empty((T, n))
     for t in range(T):
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
         for j in range(n):

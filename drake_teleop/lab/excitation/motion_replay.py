@@ -17,26 +17,15 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, trajectory_sensor_motion
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.station.replay_file import (
-    DisplayedNumber,
-    ReplayFile,
-    ShowFrame,
-    add_shapes,
-    colour_to_rgba,
-    frame_times,
-    set_plain_background,
-)
+from drake_teleop.station import replay_file
 
 _TABLE_COLOUR, _LINK_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
 _TABLE_THICKNESS_M = 0.03
-_LINK_RADIUS_TO_LENGTH = 0.04  # radius of a bone over its length
-# Camera position from the middle of the motion, in sizes of the arm.
-_CAMERA_OFFSET_IN_ARM_SIZES = np.array([0.55, -0.75, 0.3])
 
 
 def write_motion_replay(path: Path, excitation: Excitation) -> None:
     robot, trajectory = excitation.robot, excitation.trajectory
-    times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
+    times, slow_motion = replay_file.frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]
     root = robot.scene.diagram.CreateDefaultContext()
     context = robot.scene.plant.GetMyMutableContextFromRoot(root)
@@ -46,20 +35,20 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
     motion = trajectory_sensor_motion(robot, trajectory)
     force = np.linalg.norm(non_contact_wrench(*motion, robot.limits.heaviest_phi)[:, :3], axis=1)
     samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
-    film = ReplayFile(
+    film = replay_file.ReplayFile(
         f"Excitation of {robot.name}",
         times,
         slow_motion,
         displayed_numbers=[
-            DisplayedNumber("Force of the heaviest load", "N", force[samples], BLUE),
-            DisplayedNumber("Speed of the sensor", "m/s", speed),
+            replay_file.DisplayedNumber("Force of the heaviest load", "N", force[samples], BLUE),
+            replay_file.DisplayedNumber("Speed of the sensor", "m/s", speed),
         ],
         notes=("Line: path of the sensor, from rest to rest.",),
         clock_label="of the motion",
         curves_label="force at the sensor, 0 to {top} N",
     )
 
-    def make_scene(meshcat: Meshcat) -> ShowFrame:
+    def make_scene(meshcat: Meshcat) -> replay_file.ShowFrame:
         bodies = np.array([X_WB.translation() for X_WB in poses[0][0].values()])
         _add_table_and_sensor_path(meshcat, path_S, bodies)
         _AddLinkVisuals(meshcat, robot, context)
@@ -91,12 +80,11 @@ def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
         body = plant.get_body(BodyIndex(k))
         visuals = plant.GetVisualGeometriesForBody(body)
         shapes = visuals or plant.GetCollisionGeometriesForBody(body)
-        add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _LINK_COLOUR)
-        for number, p_BJ in enumerate(
-            () if visuals else _outboard_joint_points(robot, context, body)
-        ):
+        replay_file.add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _LINK_COLOUR)
+        points = () if visuals else _outboard_joint_points(robot, context, body)
+        for number, p_BJ in enumerate(points):
             name, length = f"/arm/{k}/bone_{number}", float(np.linalg.norm(p_BJ))
-            meshcat.SetObject(name, Cylinder(_LINK_RADIUS_TO_LENGTH * length, length), _LINK_COLOUR)
+            meshcat.SetObject(name, Cylinder(0.04 * length, length), _LINK_COLOUR)
             along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
             meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 
@@ -114,11 +102,11 @@ def _outboard_joint_points(robot: Robot, context: Context, body: RigidBody) -> I
 
 
 def _add_table_and_sensor_path(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
-    set_plain_background(meshcat)
+    replay_file.set_plain_background(meshcat)
     visuals = np.vstack([path_S, bodies, np.zeros((1, 3))])
     low, high = visuals.min(axis=0), visuals.max(axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     meshcat.SetObject("/room/table", Box(2 * size, 2 * size, _TABLE_THICKNESS_M), _TABLE_COLOUR)
     meshcat.SetTransform("/room/table", RigidTransform([0.0, 0.0, -_TABLE_THICKNESS_M / 2]))
-    meshcat.SetLine("/way", path_S.T, 3.0, colour_to_rgba(BLUE))
-    meshcat.SetCameraPose(middle + size * _CAMERA_OFFSET_IN_ARM_SIZES, middle)
+    meshcat.SetLine("/way", path_S.T, 3.0, replay_file.colour_to_rgba(BLUE))
+    meshcat.SetCameraPose(middle + size * np.array([0.55, -0.75, 0.3]), middle)

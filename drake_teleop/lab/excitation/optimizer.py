@@ -29,10 +29,8 @@ from drake_teleop.load.trajectory import FourierTrajectory
 Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 
-# Samples of a period per harmonic.
 _SAMPLES_PER_PERIOD_AND_HARMONIC = 24
-# Size of random motions, as a share of the speed and acceleration limits.
-_RANDOM_MOTION_LIMIT_SHARE = 0.35
+_RANDOM_MOTION_LIMIT_SHARE = 0.35  # size of random motions over speed and acceleration limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +76,8 @@ class DesignProblem:
         self.task = task
         n, free = len(task.home_posture), 2 * (task.num_harmonics - 1)
         samples = _SAMPLES_PER_PERIOD_AND_HARMONIC * task.num_harmonics
-        unit = np.eye(free)
-        basis = FourierTrajectory.at_rest(
-            np.zeros(free), unit[:, : free // 2], unit[:, free // 2 :], 1 / task.period_s
-        )
+        sine, cosine = np.hsplit(np.eye(free), 2)
+        basis = FourierTrajectory.at_rest(np.zeros(free), sine, cosine, 1 / task.period_s)
         #: (3, T, free): q, qd, qdd of unit coefficients.
         self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period_s / samples))
         self._motions = allocate_link_motions(samples, n)
@@ -158,8 +154,7 @@ class DesignProblem:
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
 USABLE_LIMIT_SHARE = 0.985
-# Largest use of a feasible iterate on the grid.
-_MAX_LIMIT_USE_OF_FEASIBLE_MOTION = 0.9885
+_MAX_LIMIT_USE_OF_FEASIBLE_MOTION = 0.9885  # on the grid
 
 # Number of candidates in a batch, and number of them from which a descent starts.
 _START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8
@@ -167,7 +162,6 @@ _START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8
 _LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
 _SLSQP_STAGES = ((12.0, 200.0, 80), (40.0, 400.0, 120))
-_SLSQP_TOLERANCE = 1e-5
 # A start ends without a feasible iterate after so many evaluations, or after the first stage of
 # SLSQP outside this factor of the best.
 _MAX_INFEASIBLE_EVALUATIONS, _MAX_CRITERION_RATIO_TO_BEST = 250, 1.08
@@ -234,16 +228,14 @@ class _DescentSearch:
 
         self._minimize = minimize
         # Compile before the clock starts.
-        self._last = problem.evaluate(
-            self._problem.candidate(np.random.default_rng(0), near_home=True), 1.0, 1.0
-        )
+        first = problem.candidate(np.random.default_rng(0), near_home=True)
+        self._last = problem.evaluate(first, 1.0, 1.0)
         self._start_time = time.thread_time()
 
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
         while True:
-            batch = [
-                self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_START_BATCH_SIZE)
-            ]
+            sides = [k % 2 == 0 for k in range(_START_BATCH_SIZE)]
+            batch = [self._problem.candidate(rng, near_home=near) for near in sides]
             merit = []
             for x in batch:
                 self._count_evaluation()
@@ -254,12 +246,10 @@ class _DescentSearch:
 
     def descend_from(self, x: Array) -> None:
         self._evaluations, self._best_of_start = 0, float("inf")
-        for criterion_sharpness, limit_sharpness, weight, iterations in _LBFGS_STAGES:
-            options = {"maxiter": iterations}
-            stage = (criterion_sharpness, limit_sharpness, weight)
-            x = self._minimize(
-                self._penalised_value_and_gradient, x, stage, "L-BFGS-B", jac=True, options=options
-            ).x
+        penalised = self._penalised_value_and_gradient
+        for *sharpness_and_weight, iterations in _LBFGS_STAGES:
+            given, options = tuple(sharpness_and_weight), {"maxiter": iterations}
+            x = self._minimize(penalised, x, given, "L-BFGS-B", jac=True, options=options).x
         is_bounded = self._problem.bounds(x) is not None
         for k, stage in enumerate(_SLSQP_STAGES):
             hopeless = self._best_of_start > _MAX_CRITERION_RATIO_TO_BEST * self._best
@@ -277,7 +267,7 @@ class _DescentSearch:
         def evaluate(x: Array) -> Evaluation:
             return self._evaluate_once(x, criterion_sharpness, limit_sharpness)
 
-        found: Array = self._minimize(
+        return self._minimize(
             lambda x: evaluate(x).log_criterion,
             x,
             method="SLSQP",
@@ -288,9 +278,8 @@ class _DescentSearch:
                 "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).smooth_limit_uses,
                 "jac": lambda x: -evaluate(x).gradients[1:],
             },
-            options={"maxiter": iterations, "ftol": _SLSQP_TOLERANCE},
+            options={"maxiter": iterations, "ftol": 1e-5},
         ).x
-        return found
 
     def _penalised_value_and_gradient(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float

@@ -47,10 +47,8 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = fusion_gains(estimation, sensor, num_joints, period)
-        filters = (
-            _motion_error_polynomials(linear, period),
-            _motion_error_polynomials(angular, period),
-        )
+        polynomials = _motion_error_polynomials
+        filters = polynomials(linear, period), polynomials(angular, period)
     place = sensor.accelerometer_pose()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
@@ -97,8 +95,7 @@ def _covariance_from_noise_influence(influence: Array, variances: Array) -> Arra
 
 def _motion_error_polynomials(gains: Array, period: float) -> tuple[Array, Array]:
     denominator = np.array([1.0, *(gains / period)])
-    numerator = denominator * [1.0, 1.0, 1.0, 0.0]
-    return numerator, denominator
+    return denominator * [1.0, 1.0, 1.0, 0.0], denominator
 
 
 def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:

@@ -80,9 +80,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
-    scene = CollisionScene(
-        parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_collide=not own
-    )
+    reserve = (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
+    scene = CollisionScene(parse, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
@@ -129,28 +128,23 @@ def RobotFromModel(
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
-            raise DrakeTeleopError(
-                f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg",
-                where="--payload",
-                remedy="give the mass beyond the sensor in kg",
-            )
+            what = f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg"
+            remedy = "give the mass beyond the sensor in kg"
+            raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         if payload is None:
             assumptions.append(f"a load of {mass:g} kg (--payload)")
         if mass <= load[0]:
-            raise DrakeTeleopError(
-                f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor",
-                where="--payload",
-                remedy="give the total mass beyond the sensor, or remove the option",
-            )
+            what = f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor"
+            remedy = "give the total mass beyond the sensor, or remove the option"
+            raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         missing_mass, com = mass - load[0], np.array([0.0, 0.0, _ASSUMED_PAYLOAD_COM_ALONG_Z_S_M])
         inertia = missing_mass * _ASSUMED_PAYLOAD_GYRATION_RADIUS_M**2 * np.eye(3) * 2 / 3
         reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
         scene = CollisionScene(parse, reserve, visuals_collide=False, where=str(path))
     assumptions += missing
-    scene.arm, completed = fill_missing_joint_limits(
-        scene.arm, str(path), acceleration, hint=" (--acceleration)"
-    )
+    hint = " (--acceleration)"
+    scene.arm, completed = fill_missing_joint_limits(scene.arm, str(path), acceleration, hint=hint)
     return _make_robot(
         scene,
         path.name,

@@ -18,27 +18,9 @@ from scipy.special import ndtri
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.lab.excitation import excite, limits, optimizer, prediction
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.excite import (
-    Excitation,
-    assemble_excitation,
-    find_best_within_limits,
-    trajectory_sensor_motion,
-)
-from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_gradient_by_joints
-from drake_teleop.lab.excitation.optimizer import (
-    Bounds,
-    DesignProblem,
-    DesignTask,
-    Evaluation,
-    minimise_criterion,
-)
-from drake_teleop.lab.excitation.prediction import (
-    SensorNoise,
-    predicted_covariance,
-    spatial_inertia_matrix,
-)
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import (
@@ -56,27 +38,22 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 _MAX_LOG_PERIOD_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
-# Additional margin after a round that missed the tolerance.
-_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005
-# Number of rounds without any motion before the search fails.
-_MAX_ROUNDS_WITHOUT_MOTION = 3
+_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005  # after a round that missed the tolerance
+_MAX_ROUNDS_WITHOUT_MOTION = 3  # before the search fails
 # Largest misfit of a motion that later rounds vary, and number of such starts.
 _MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
-# Difference between the seeds of rounds.
 _SEED_STEP_BETWEEN_ROUNDS = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
 _MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
-# Sharpness of the maximum over tolerances, relative to that over eigenvalues.
-_TOLERANCE_SHARPNESS_RATIO = 4.0
-# Regularisation of the balanced information; it is singular without motion.
-_INFORMATION_REGULARISATION = 1e-11
+_TOLERANCE_SHARPNESS_RATIO = 4.0  # sharpness over tolerances to that over eigenvalues
+_INFORMATION_REGULARISATION = 1e-11  # of balanced information, which is singular without motion
 
 
 @dataclass(frozen=True, eq=False)
 class ShortestMotion:
     """Checked motion; `errors_over_tolerances` (k,) are predicted errors, at most 1."""
 
-    excitation: Excitation
+    excitation: excite.Excitation
     errors_over_tolerances: Array
 
 
@@ -97,21 +74,14 @@ def design_shortest_motion(
     errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
     errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
-    task = DesignTask(
-        robot.arm.table,
-        robot.limits,
-        Criterion("A16", robot.criterion_scales),
-        robot.home_posture,
-        1.0,
-        harmonics,
-    )
-    worst, around = np.inf, None
+    unused, start = Criterion("A16", robot.criterion_scales), robot.home_posture
+    task = optimizer.DesignTask(robot.arm.table, robot.limits, unused, start, 1.0, harmonics)
+    worst, around, vain_rounds, empty_rounds = np.inf, None, 0, 0
     best: ShortestMotion | None = None
-    vain_rounds, empty_rounds = 0, 0
     for k in range(_MAX_DESIGN_ROUNDS):
         problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
-        found = minimise_criterion(
+        found = optimizer.minimise_criterion(
             problem, seed=seed + _SEED_STEP_BETWEEN_ROUNDS * k, starts=num_starts, progress=progress
         )
         found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
@@ -120,11 +90,10 @@ def design_shortest_motion(
                 break
             around = None
             continue
-        trajectory, uses = find_best_within_limits(robot, found)
-        motion = trajectory_sensor_motion(robot, trajectory)
-        covariance = predicted_covariance(
-            *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
-        )
+        trajectory, uses = excite.find_best_within_limits(robot, found)
+        motion = excite.trajectory_sensor_motion(robot, trajectory)
+        noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
+        covariance = prediction.predicted_covariance(*motion, 1 / CHECK_RATE_HZ, noise, phi)
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
@@ -133,7 +102,7 @@ def design_shortest_motion(
             progressed = trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
             vain_rounds = 0 if progressed else vain_rounds + 1
             if trajectory.period < shortest_period:
-                excitation = assemble_excitation(robot, "period", found, trajectory, uses)
+                excitation = excite.assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
             if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
@@ -144,12 +113,11 @@ def design_shortest_motion(
             factor = _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(factor, last_factor)
     if best is not None:
         return best
-    raise DrakeTeleopError(
-        "no motion within the limits reaches the tolerance"
-        + (f": the best one exceeds it by a factor of {worst:.3g}" if np.isfinite(worst) else ""),
-        where=f"{robot.name}: {tolerance}",
-        remedy="give larger tolerances, or repeat the motion of `excite`",
-    )
+    what = "no motion within the limits reaches the tolerance"
+    if np.isfinite(worst):
+        what += f": the best one exceeds it by a factor of {worst:.3g}"
+    remedy = "give larger tolerances, or repeat the motion of `excite`"
+    raise DrakeTeleopError(what, where=f"{robot.name}: {tolerance}", remedy=remedy)
 
 
 def sidak_factor(count: int) -> float:
@@ -157,7 +125,7 @@ def sidak_factor(count: int) -> float:
     return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / count)))
 
 
-class ShortestMotionProblem(DesignProblem):
+class ShortestMotionProblem(optimizer.DesignProblem):
     """Design problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
@@ -169,16 +137,17 @@ class ShortestMotionProblem(DesignProblem):
         best: unknowns of the shortest period passed to `value`.
     """
 
-    def __init__(self, task: DesignTask, errors: Array, robot: Robot, around: Array | None) -> None:
+    def __init__(
+        self, task: optimizer.DesignTask, errors: Array, robot: Robot, around: Array | None
+    ) -> None:
         super().__init__(task)
         self._around, self._at, self.best = around, np.empty(0), around
-        self._least = np.inf
-        self._errors = errors
+        self._errors, self._least = errors, np.inf
         noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
         self._noise = white_noise_densities_over_wrench_noise(noise, phi)
         self._roots = np.sqrt(noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
-        self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
+        self._gradients = np.empty((2 + len(limits.LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
@@ -198,13 +167,15 @@ class ShortestMotionProblem(DesignProblem):
         self.task = task
         return np.append(x, np.log(period))
 
-    def bounds(self, x: Array) -> Bounds:
+    def bounds(self, x: Array) -> optimizer.Bounds:
         """Return bounds of the unknowns; only log T is bounded, near that of x."""
         ends = x[-1] + np.array([-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP])
         low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
-    def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
+    def evaluate(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float
+    ) -> optimizer.Evaluation:
         """Evaluate log T and eight limits: the tolerance, then those of the arm."""
         self._at = x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
@@ -213,7 +184,7 @@ class ShortestMotionProblem(DesignProblem):
         g[:2] = 0.0
         sharpness = _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
         use, worst, g_V = self._largest_error_over_tolerance(sharpness)
-        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
+        limits.add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
@@ -222,7 +193,9 @@ class ShortestMotionProblem(DesignProblem):
         g[:, 1] /= T
         g[:, 2] /= T**2
         gradients = np.hstack([self._gradients_by_unknowns(), by_log_period[:, np.newaxis]])
-        return Evaluation(float(x[-1]), np.append(use, smooth), gradients, max(worst, largest))
+        return optimizer.Evaluation(
+            float(x[-1]), np.append(use, smooth), gradients, max(worst, largest)
+        )
 
     def value(self) -> float:
         """Return the period of the last evaluated point [s]."""
@@ -267,13 +240,13 @@ class ShortestMotionProblem(DesignProblem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise_densities_over_wrench_noise(noise: SensorNoise, phi: Array) -> Array:
+def white_noise_densities_over_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)
         at_So[:3, 3:] = cross_matrix(noise.p_SoAo_S)
-        through = spatial_inertia_matrix(phi) @ at_So
+        through = prediction.spatial_inertia_matrix(phi) @ at_So
         density = density + through @ np.diag(noise.white_noise_densities[6:]) @ through.T
     roots = np.sqrt(noise.white_noise_densities[:6])
     return density / np.outer(roots, roots)

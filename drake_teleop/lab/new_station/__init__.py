@@ -76,11 +76,9 @@ def new_command(
             read += [slave.tool.path] if tool and slave.tool else []
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
-                raise DrakeTeleopError(
-                    "does not describe the given models, whose names YAML cannot contain",
-                    where=str(scenario),
-                    remedy="use simpler names of files and frames",
-                )
+                what = "does not describe the given models, whose names YAML cannot contain"
+                remedy = "use simpler names of files and frames"
+                raise DrakeTeleopError(what, where=str(scenario), remedy=remedy)
     except BaseException:
         for each in made:
             with suppress(OSError):
@@ -103,13 +101,11 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
 
     table = Table(title=f"A station: {scenario}", title_justify="left", show_header=False)
     tool = "of the model" if plan.has_own_tool else "on the sensor"
+    position = round_to_four_significant_digits(plan.place.position)
     for name, value in (
         ("Joints", f"{len(plan.joint_names)}: {', '.join(plan.joint_names)}"),
         ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
-        (
-            "Start",
-            f"sensor at {round_to_four_significant_digits(plan.place.position)} m, tool down",
-        ),
+        ("Start", f"sensor at {position} m, tool down"),
         ("Reachable around it", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
@@ -119,9 +115,6 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     notes = [f"note: {plan.tool_axis_advice}"] if plan.tool_axis_advice else []
     notes += [f"assumed: {assumed}" for assumed in plan.assumptions]
     notes += [f"warning: {overlap}" for overlap in plan.overlap_warnings]
-    for line in (
-        *notes,
-        f"picture of the start: {picture}",
-        "the first run takes about a minute on an idle computer",
-    ):
+    notes += [f"picture of the start: {picture}"]
+    for line in (*notes, "the first run takes about a minute on an idle computer"):
         console.print(line, highlight=False, markup=False, soft_wrap=True)

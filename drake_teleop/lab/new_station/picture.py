@@ -23,17 +23,13 @@ _WALL_THICKNESS_M = 0.1
 _LIGHT_DIRECTION = np.array([0.35, -0.5, 0.8])
 _VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from the tool
 _NUM_WALL_DIVISIONS = 8  # divisions of the wall in the picture
-_SENSOR_AXES_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
 _HULL_SPIRAL_INDICES = np.arange(0.5, 250.0)
-_HULL_SPIRAL_RADII = np.sqrt(1.0 - (1.0 - _HULL_SPIRAL_INDICES / 125.0) ** 2)
+_HULL_SPIRAL_HEIGHTS = 1.0 - _HULL_SPIRAL_INDICES / 125.0
 _HULL_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _HULL_SPIRAL_INDICES
+_HULL_SPIRAL_CIRCLE = np.array([np.cos(_HULL_SPIRAL_ANGLES_RAD), np.sin(_HULL_SPIRAL_ANGLES_RAD)])
 _HULL_SAMPLE_DIRECTIONS = np.column_stack(
-    [
-        _HULL_SPIRAL_RADII * np.cos(_HULL_SPIRAL_ANGLES_RAD),
-        _HULL_SPIRAL_RADII * np.sin(_HULL_SPIRAL_ANGLES_RAD),
-        1.0 - _HULL_SPIRAL_INDICES / 125.0,
-    ]
+    [*(np.sqrt(1.0 - _HULL_SPIRAL_HEIGHTS**2) * _HULL_SPIRAL_CIRCLE), _HULL_SPIRAL_HEIGHTS]
 )
 
 
@@ -55,13 +51,11 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
         side = np.degrees(np.arctan2(y, x))
         for k, (elevation, azimuth) in enumerate(_VIEW_ANGLES_DEG):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
-            collection = Poly3DCollection(
-                surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4
-            )
-            axes.add_collection3d(collection)
+            paint = {"facecolors": face_colours, "edgecolors": face_colours, "linewidths": 0.4}
+            axes.add_collection3d(Poly3DCollection(surfaces, **paint))
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
             _draw_base_plane_grid(axes, lower, upper, plan.base_plane_height)
-            _draw_triad(axes, shapes, _SENSOR_AXES_LENGTH_SHARE * float(max(upper - lower)))
+            _draw_triad(axes, shapes, 0.12 * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
             _fit_view(axes, lower, upper, plan.base_plane_height)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
@@ -114,11 +108,9 @@ def _box_triangles(top: Array, size: Array) -> Array:
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
     counts = [_NUM_WALL_DIVISIONS, _NUM_WALL_DIVISIONS, 2]
     cells = np.array(list(product(*map(range, counts)))) / counts
-    pieces = [_hull_triangles(cell + corners / counts) for cell in cells]
-    unit = np.concatenate(pieces)
+    unit = np.concatenate([_hull_triangles(cell + corners / counts) for cell in cells])
     is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
-    triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
-    return triangles
+    return top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
 
 
 def _shade_triangles(triangles: Array, colour: tuple[float, float, float]) -> Array:

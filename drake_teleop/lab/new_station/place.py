@@ -169,18 +169,18 @@ def find_start_place(
     best = None
     for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
         if best is None or best.cube_half_m == 0.0:
-            cubes = [
-                _with_reachable_cube(pointed, place, has_six_dof, vertical)
-                for place in places[:_MAX_TESTED_CUBES]
-            ]
+            tested = places[:_MAX_TESTED_CUBES]
+            cubes = [_with_reachable_cube(pointed, each, has_six_dof, vertical) for each in tested]
             best = max(cubes, key=_merit_of_start_place, default=None)
     if best is None or best.cube_half_m == 0.0:
-        raise DrakeTeleopError(
+        causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
+        what = (
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
-            f" ({_describe_removed_postures(region, len(postures.q))})",
-            where="new",
-            remedy="check joint limits and the orientation of sensor_frame",
+            f" (of {NUM_RANDOM_POSTURES} random postures, {causes}; {len(postures.q)} are left on"
+            " the best side)"
         )
+        remedy = "check joint limits and the orientation of sensor_frame"
+        raise DrakeTeleopError(what, where="new", remedy=remedy)
     pose = best.pose if axis == "z" else _sensor_pose_at(arm, best.q)
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
@@ -195,11 +195,6 @@ def _find_roomy_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
         if (roomy & strong).any():
             return np.flatnonzero(roomy & strong)
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
-
-
-def _describe_removed_postures(region: StartRegion, left: int) -> str:
-    causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
-    return f"of {NUM_RANDOM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
 def _order_postures_to_solve(
@@ -227,11 +222,8 @@ def _solved_starts(
     if not has_six_dof:  # position and orientation are coupled
         solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
-        solved = [
-            start
-            for q, position in zip(postures.q, postures.p_WS, strict=True)
-            for start in _starts_at_rounded_position(arm, q, position)
-        ]
+        pairs = zip(postures.q, postures.p_WS, strict=True)
+        solved = [s for q, p_WS in pairs for s in _starts_at_rounded_position(arm, q, p_WS)]
     if not solved:
         return
     rows = _find_roomy_holdable_postures(arm, np.array([q for q, _, _ in solved]))
@@ -275,12 +267,8 @@ def _with_largest_wall(
     shapes.move_to(place.q)
     walls = _move_walls_below_tool_and_get_edges(shapes)
     depths = dict.fromkeys(walls, 0.0)
-    cost = max(
-        region.plane_height
-        - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
-        0.0,
-    )
-    overlaps = False
+    lowest = shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf)
+    cost, overlaps = max(region.plane_height - lowest, 0.0), False
     for first, second, distance in shapes.overlaps():
         pair = {first.index(), second.index()}
         if wall := pair & walls.keys():
@@ -300,13 +288,12 @@ def _with_largest_wall(
 
 
 def _move_walls_below_tool_and_get_edges(shapes: PostureShapes) -> dict[BodyIndex, float]:
-    plant, walls = shapes.plant, {}
     x, y, z = lowest_tool_point(shapes)
     offset = (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0
-    middle = RigidTransform([x, y, z + offset])
+    middle, walls = RigidTransform([x, y, z + offset]), {}
     for edge in WALL_EDGES_M:
-        body = plant.GetBodyByName(_trial_wall_name(edge))
-        plant.SetFreeBodyPose(shapes.context, body, middle)
+        body = shapes.plant.GetBodyByName(_trial_wall_name(edge))
+        shapes.plant.SetFreeBodyPose(shapes.context, body, middle)
         walls[body.index()] = edge
     return walls
 

@@ -42,8 +42,7 @@ _STAND_IN_FREE_LENGTH_M = 0.05
 _STAND_IN_TOOL_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
 _SUFFICIENT_POSTURE_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
 _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
-# Contact force [N] that the device displays in addition to 1.5 times the weight.
-_DISPLAYABLE_CONTACT_FORCE_N = 30.0
+_DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
 # 680 N/m with medium grip.
 WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
@@ -114,15 +113,13 @@ def plan_station(
     room = _PHANTOM_WORKSPACE_HALF_EDGE_M if figures is None else min(figures.size) / 2.0
     peak = PEAK_FORCE_N if figures is None else figures.peak_force
     translation_scale = _floor_to_two_significant_digits(min(place.cube_half_m / room, 1.0))
-    force_scale = min(
-        peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N),
-        _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS_N_M * translation_scale),
-        1.0,
-    )
+    by_force = peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N)
+    by_stiffness = _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS_N_M * translation_scale)
     shapes.move_to(place.q)
     lowest = lowest_tool_point(shapes)
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
+    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_use(model, place, swing))
     return StationPlan(
         joint_names=tuple(model.joint_names),
         stand_in_tool=on_sensor,
@@ -130,10 +127,8 @@ def plan_station(
         has_own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
-        force_scale=_floor_to_two_significant_digits(force_scale),
-        swing_amplitude_m=_floor_to_two_significant_digits(
-            swing * min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_use(model, place, swing))
-        ),
+        force_scale=_floor_to_two_significant_digits(min(by_force, by_stiffness, 1.0)),
+        swing_amplitude_m=_floor_to_two_significant_digits(swing),
         lowest_tool_point_W=lowest,
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),

@@ -134,25 +134,18 @@ def select_suitable_postures(
     lowest_origin = plane + _MIN_JOINT_ORIGIN_HEIGHT_M
     raised = postures.origins[:, :, 2].max(axis=0) > lowest_origin
     raised[0] = False
-    conditions: tuple[tuple[str, Any], ...] = (
-        (
-            "z_S is more than 40 degrees from downwards",
-            postures.R_WS[:, 2, 2] < -_MIN_COS_TOOL_TILT,
-        ),
-        (
-            "S is too near to the first joint, too far, too low or too high",
-            _is_within_limits(radius / reach, _SENSOR_RADIUS_RANGE_OVER_REACH)
-            & _is_within_limits(from_first[:, 2] / reach, _SENSOR_HEIGHT_RANGE_OVER_REACH)
-            & (tool_height > _MIN_TOOL_HEIGHT_M)
-            & (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1),
-        ),
-        (
-            "a joint is below the base plane",
-            (postures.origins[:, raised, 2] > lowest_origin).all(axis=1),
-        ),
-    )
+    in_region = _is_within_limits(radius / reach, _SENSOR_RADIUS_RANGE_OVER_REACH)
+    in_region &= _is_within_limits(from_first[:, 2] / reach, _SENSOR_HEIGHT_RANGE_OVER_REACH)
+    in_region &= tool_height > _MIN_TOOL_HEIGHT_M
+    in_region &= (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1)
+    points_down = postures.R_WS[:, 2, 2] < -_MIN_COS_TOOL_TILT
+    above_plane: Any = (postures.origins[:, raised, 2] > lowest_origin).all(axis=1)
     rows, removed = np.arange(len(radius)), list[tuple[str, int]]()
-    for name, met in conditions:
+    for name, met in (
+        ("z_S is more than 40 degrees from downwards", points_down),
+        ("S is too near to the first joint, too far, too low or too high", in_region),
+        ("a joint is below the base plane", above_plane),
+    ):
         removed.append((name, int((~met[rows]).sum())))
         rows = rows[met[rows]]
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
@@ -165,13 +158,11 @@ def select_suitable_postures(
 
 
 def _is_within_limits(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = (values > limits[0]) & (values < limits[1])
-    return inside
+    return (values > limits[0]) & (values < limits[1])
 
 
 def _is_angle_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_HALF_ANGLE_OF_SIDE_RAD)
-    return near
+    return np.cos(angle - side) > np.cos(_HALF_ANGLE_OF_SIDE_RAD)
 
 
 def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Array:
@@ -190,8 +181,7 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     origins = postures.origins[:, region.is_joint_above_plane, 2]
     low = np.maximum(region.plane_height + _MIN_JOINT_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach
-    total: Array = margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
-    return total
+    return margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
 
 
 def least_joint_margins(arm: ArmModel, q: Array) -> Array:
@@ -199,8 +189,7 @@ def least_joint_margins(arm: ArmModel, q: Array) -> Array:
     limited = np.isfinite(arm.lower) & np.isfinite(arm.upper)
     lower, upper, inner = arm.lower[limited], arm.upper[limited], q[:, limited]
     shares = 2.0 * np.minimum(inner - lower, upper - inner) / (upper - lower)
-    margins: Array = shares.min(axis=1, initial=1.0)
-    return margins
+    return shares.min(axis=1, initial=1.0)
 
 
 def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
@@ -209,8 +198,7 @@ def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
     arms = postures.p_WS[:, None] - postures.origins
     linear = np.where(slides, postures.axes, np.cross(postures.axes, arms))
     angular = np.where(slides, 0.0, orientation_length(arm) * postures.axes)
-    values: Array = np.linalg.svd(np.concatenate([linear, angular], 2), compute_uv=False)
-    return values
+    return np.linalg.svd(np.concatenate([linear, angular], 2), compute_uv=False)
 
 
 def sensor_degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
@@ -231,8 +219,7 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     offsets = postures.origins - shoulder[:, None]
     offsets = offsets - (offsets * along[:, None]).sum(axis=2, keepdims=True) * along[:, None]
     sizes = np.linalg.norm(offsets, axis=2)
-    rows = np.arange(len(sizes))
-    farthest = sizes.argmax(axis=1)
+    rows, farthest = np.arange(len(sizes)), sizes.argmax(axis=1)
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
     return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)

@@ -11,8 +11,6 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import Rates
 
-_MAX_PRESS_DEPTH_INTO_WALL_M = 0.01  # largest depth in the wall
-
 
 def scenario_text(
     plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
@@ -24,7 +22,7 @@ def scenario_text(
         sensor: preset of the wrist sensor, or None.
     """
     s, swing = plan.translation_scale, plan.swing_amplitude_m
-    down = 1.5 * swing + min(_MAX_PRESS_DEPTH_INTO_WALL_M, swing / 4.0)
+    down = 1.5 * swing + min(0.01, swing / 4.0)  # at most 10 mm into the wall
     if plan.place.is_set_by_position:
         slave["position"] = round_to_four_significant_digits(plan.place.position)
     else:
@@ -51,27 +49,26 @@ def scenario_text(
         slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
     if plan.tip_S:
         slave["tip"] = round_to_four_significant_digits(plan.tip_S)
+    up, press = (round_to_four_significant_digits([0.0, 0.0, z / s]) for z in (swing, -down))
     swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
-    swing_motion |= {
-        "frequency": SWING_HZ,
-        "translation": round_to_four_significant_digits([0.0, 0.0, swing / s]),
-    }
-    press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
-    press_motion |= {"translation": round_to_four_significant_digits([0.0, 0.0, -down / s])}
+    swing_motion |= {"frequency": SWING_HZ, "translation": up}
+    press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2, "translation": press}
     wall = wall_of_plan(plan)
-    size = {} if wall.size == Wall().size else {"size": wall.size}
+    wall_data = {"_tag": "!Wall", "position": wall.position, "stiffness": wall.stiffness}
+    wall_data |= {} if wall.size == Wall().size else {"size": wall.size}
+    own = Master(model=device).sampling_period_if_slower_than_hand(Rates().hand_hz)
+    names = ("hand_hz", "joint_control_hz")
+    rates = {} if own is None else {"rates": dict.fromkeys(names, 1 / own)}
     data = {
         "description": f"{Path(slave['model']).stem} commanded by {device}",
         "simulation": {"duration": 5.0, "settle": 0.8},
-        **_device_rates(device),
+        **rates,
         "slave": slave,
         "master": {"model": device},
         **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
         "kinematic_scaling": {"translation_scale": s},
         "force_scaling": {"sigma": 0.0, "force_scale": plan.force_scale},
-        "environment": [
-            {"_tag": "!Wall", "position": wall.position, "stiffness": wall.stiffness} | size
-        ],
+        "environment": [wall_data],
         "operator": {"grip": "medium", "intent": [swing_motion, press_motion]},
     }
     head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
@@ -86,11 +83,6 @@ def wall_of_plan(plan: StationPlan) -> Wall:
         size=[plan.place.wall_edge_m, plan.place.wall_edge_m],
         stiffness=WALL_STIFFNESS_N_M,
     )
-
-
-def _device_rates(device: str) -> dict[str, Any]:
-    own = Master(model=device).sampling_period_if_slower_than_hand(Rates().hand_hz)
-    return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
 def round_to_four_significant_digits(values: Any) -> list[float]:

@@ -29,9 +29,6 @@ NamedValues = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
 _CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
-_ALL_AXES_MOTION = Sine(
-    duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +112,10 @@ def simulate_contact(
 
 def simulate_ideal_motion(progress: UpdateProgress) -> IdealSensorRun:
     """Simulate a movement along and about all axes."""
-    scenario = replace(
-        LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES_MOTION], simulation__duration=0.4
-    )
+    move, turn = [0.02] * 3, [0.3, 0.4, 0.5]
+    motion = Sine(duration=5.0, ramp=0.4, frequency=2.0, translation=move, rotation=turn)
+    scenario = LoadScenario("ideal_sensor")
+    scenario = replace(scenario, operator__intent=[motion], simulation__duration=0.4)
     rate, simulation = scenario.rates.log_hz, scenario.simulation
     phi = slave_arm(scenario).phi_load
     ideal = replace(scenario, rates__sensor_hz=rate)
@@ -146,12 +144,8 @@ def simulate_ideal_motion(progress: UpdateProgress) -> IdealSensorRun:
 def wrench_errors_of_ideal_run(run: IdealSensorRun) -> NamedValues:
     """Return peak wrenches and the errors of the calculated load wrench, by name."""
     load = regressor(*run.sensor_motion) @ run.phi
-    left = np.concatenate(
-        [
-            contact_wrench(run.weld_reaction, np.zeros(6), *run.sensor_motion, run.phi),
-            run.weld_reaction - load,
-        ]
-    )
+    left = contact_wrench(run.weld_reaction, np.zeros(6), *run.sensor_motion, run.phi)
+    left = np.concatenate([left, run.weld_reaction - load])
     return {
         "peak_raw_N": _largest_norm(run.weld_reaction[:, :3]),
         "peak_raw_Nm": _largest_norm(run.weld_reaction[:, 3:]),

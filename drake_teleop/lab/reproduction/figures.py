@@ -9,16 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from drake_teleop.common import style
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    VERMILION,
-    Picture,
-    plot_style,
-    shade_contact,
-)
 
 
 def scaling_figure(
@@ -36,12 +28,14 @@ def scaling_figure(
     """
     time, time_unit = _time_axis(t)
     traces = [np.asarray(trace, float) for trace in values]
-    with plot_style():
-        figure = Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
+    meanings = {1.0: "as measured", 0.0: "non-contact part eliminated"}
+    with style.plot_style():
+        figure = style.Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
         rows = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for axes, trace, sigma in zip(rows, traces, sigmas, strict=True):
-            axes.plot(time, trace, color=BLUE if sigma else GREEN)
-            axes.set_title(_sigma_title(sigma))
+            axes.plot(time, trace, color=style.BLUE if sigma else style.GREEN)
+            meaning = meanings.get(sigma, f"{sigma:.0%} of the non-contact part")
+            axes.set_title(f"σ = {sigma:g}:  {meaning}")
             peak = float(np.abs(trace).max())
             slave, master = _format_number(peak), _format_number(peak / downscaling)
             note = f"peak {slave} {unit}   ·   {master} {unit} at the master"
@@ -73,22 +67,23 @@ def contact_figure(
     per_second = 1e3 if time_unit == "ms" else 1.0
     traces = [np.asarray(trace, float) for trace in (measured, contact_force)]
     touched = np.asarray(contact, bool)
-    with plot_style():
-        figure = Picture(figsize=(7.6, 5.0))
+    with style.plot_style():
+        figure = style.Picture(figsize=(7.6, 5.0))
         rows = figure.subplots(2, 1, sharex=True, sharey=True)
         titles = ("Measured force", "Calculated contact force, σ = 0")
-        for axes, trace, title, colour in zip(rows, traces, titles, (BLUE, GREEN), strict=True):
-            shade_contact(axes, time, touched)
+        colours = (style.BLUE, style.GREEN)
+        for axes, trace, title, colour in zip(rows, traces, titles, colours, strict=True):
+            style.shade_contact(axes, time, touched)
             axes.plot(time, trace, color=colour)
             axes.set_title(title)
             axes.set_ylabel(f"{symbol} [N]")
             if turning_s is not None:
-                _draw_time_mark(axes, turning_s * per_second, "no contact", GREY)
+                _draw_time_mark(axes, turning_s * per_second, "no contact", style.GREY)
         if touched.any():
-            _draw_time_mark(rows[0], time[np.argmax(touched)], "contact", VERMILION)
-        _draw_time_mark(rows[1], detected_s * per_second, "detected", VERMILION)
+            _draw_time_mark(rows[0], time[np.argmax(touched)], "contact", style.VERMILION)
+        _draw_time_mark(rows[1], detected_s * per_second, "detected", style.VERMILION)
         for level in (-threshold, threshold):
-            rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
+            rows[1].axhline(level, color=style.VERMILION, linewidth=0.8, linestyle=":")
         peaks = [f"peak {_format_number(np.abs(trace).max())} N" for trace in traces]
         _write_note_above_axes(rows[0], peaks[0])
         _write_note_above_axes(rows[1], f"{peaks[1]}   ·   threshold {_format_number(threshold)} N")
@@ -110,11 +105,6 @@ def _common_value_range(traces: Sequence[Array]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _sigma_title(sigma: float) -> str:
-    meaning = {1.0: "as measured", 0.0: "non-contact part eliminated"}
-    return f"σ = {sigma:g}:  {meaning.get(sigma, f'{sigma:.0%} of the non-contact part')}"
-
-
 def _format_number(value: float) -> str:
     rounded = float(f"{value:.3g}")
     decimals = max(0, 2 - int(np.floor(np.log10(abs(rounded))))) if rounded else 0
@@ -122,26 +112,19 @@ def _format_number(value: float) -> str:
 
 
 def _write_note_above_axes(axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="right", color=GREY, fontsize=8.5)
+    axes.set_title(text, loc="right", color=style.GREY, fontsize=8.5)
 
 
 def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> None:
-    right = axes.secondary_yaxis(
-        "right",
-        functions=(lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling),
-    )
-    right.set_ylabel(label, color=GREY)
+    scales = (lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling)
+    right = axes.secondary_yaxis("right", functions=scales)
+    right.set_ylabel(label, color=style.GREY)
     right.spines["right"].set_visible(True)
 
 
 def _draw_time_mark(axes: Axes, time: float, text: str, colour: str) -> None:
     axes.axvline(time, color=colour, linewidth=0.9, linestyle="--")
     axes.annotate(
-        text,
-        (time, 0.03),
-        xycoords=("data", "axes fraction"),
-        xytext=(4, 0),
-        textcoords="offset points",
-        color=colour,
-        fontsize=8.5,
-    )
+        text, (time, 0.03), xycoords=("data", "axes fraction"), xytext=(4, 0),
+        textcoords="offset points", color=colour, fontsize=8.5,
+    )  # fmt: skip

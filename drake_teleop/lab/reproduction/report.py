@@ -30,10 +30,6 @@ _FIGURE_TITLES = {
     "fig8": "Fig. 8: contact transition",
 }
 _NOT_REPORTED = "not reported"
-# Pairs of verdicts: for an accepted value, for an unaccepted value.
-_VERDICTS_OF_SET_VALUES = ("as set", "not as set")
-_VERDICTS_OF_OUR_BOUND = ("within our bound", "beyond our bound")
-_VERDICTS_OF_FOUND_VALUES = ("agrees", "differs")
 
 
 @dataclass(frozen=True)
@@ -57,10 +53,11 @@ class Comparison:
     def verdict(self) -> str:
         if self.is_accepted is None:
             return "for the record"
-        words = _VERDICTS_OF_SET_VALUES if self.set_or_found == "set" else _VERDICTS_OF_FOUND_VALUES
         if self.paper_value == _NOT_REPORTED:
-            words = _VERDICTS_OF_OUR_BOUND
-        return words[0] if self.is_accepted else words[1]
+            return "within our bound" if self.is_accepted else "beyond our bound"
+        if self.set_or_found == "set":
+            return "as set" if self.is_accepted else "not as set"
+        return "agrees" if self.is_accepted else "differs"
 
     @property
     def css_class(self) -> str:
@@ -198,13 +195,13 @@ def write_report(
 ) -> None:
     """Write the figures (fig6 to fig8), and report.html with them and a link to replay.html."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
+    versions = {"Python": platform.python_version()} | {n: metadata.version(n) for n in names}
     write_report_page_and_pictures(
         out,
         "drake_teleop.lab.reproduction",
         pictures,
         setup=dict(setup),
-        versions={"Python": platform.python_version()}
-        | {name: metadata.version(name) for name in names},
+        versions=versions,
         tiles=_summary_tiles(summary),
         comparisons=compare_with_paper(summary),
         titles=_FIGURE_TITLES,
@@ -216,13 +213,10 @@ def write_report(
 
 def _summary_tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
+    left = f"{s['free_force.residual_max_N']:.2f} N, {s['free_torque.residual_max_Nm']:.2f}"
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),
-        (
-            f"{s['free_force.residual_max_N']:.2f} N, {s['free_torque.residual_max_Nm']:.2f}",
-            "N m",
-            "at most left of force and torque after elimination",
-        ),
+        (left, "N m", "at most left of force and torque after elimination"),
         (f"{lag:.1f}", "ms", "from the touch to its detection"),
         (f"{s['identification.mass_error_percent']:.3f}", "%", "error of the identified mass"),
     ]

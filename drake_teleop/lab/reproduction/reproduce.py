@@ -7,66 +7,31 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    write_json,
-    write_table,
-    write_text,
-)
+from drake_teleop.common import files
 from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.lab.identification import (
     LoadIdentification,
     identification_scenario,
     identify_load,
 )
-from drake_teleop.lab.reproduction.experiments import (
-    SIGMAS,
-    FreeMotionRun,
-    NamedValues,
-    RunsWithAndWithoutContact,
-    detection_and_peaks_of_contact_run,
-    errors_of_identification,
-    peaks_and_residuals_of_free_run,
-    simulate_contact,
-    simulate_free_motion,
-    simulate_ideal_motion,
-    time_of_largest_raw_force_after_contact,
-    true_offsets_and_phi,
-    without_leaf_spring_with_next_seed,
-    wrench_errors_of_ideal_run,
-)
+from drake_teleop.lab.reproduction import experiments, report, speed
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
-from drake_teleop.lab.reproduction.report import (
-    Comparison,
-    compare_with_paper,
-    parameter_rows,
-    values_by_full_name,
-    write_report,
-)
-from drake_teleop.lab.reproduction.speed import (
-    MakeBarePlantSimulator,
-    MakeSettledStationSimulator,
-    cpu_time_per_simulated_second,
-)
 from drake_teleop.station.replay import write_replay
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
 
-# Slow motion of the replay; the contact lasts 40 ms.
-_REPLAY_SLOWDOWN = 8.0
 _FORCE_Z_INDEX, _TORQUE_X_INDEX = 2, 3
 
 
 def reproduce_command(
     out: Path, *, seed: int | None = None, quiet: bool = False, progress: bool = True
-) -> NamedValues:
+) -> experiments.NamedValues:
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
     Return the summary, and the measured speed, which differs between equal runs.
     """
     seed = seed or 0
-    make_folder(out)  # fail early for a bad path
+    files.make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
         names = ("free_motion_force", "free_motion_torque", "contact_transition")
         # Each run has another seed.
@@ -76,41 +41,44 @@ def reproduce_command(
         )
         load = identify_load(identification_scenario(force, seed), stage)
         estimate = load.estimate
-        force_run = simulate_free_motion(force, estimate, stage("Fig. 6: vertical free motion"))
-        torque_run = simulate_free_motion(torque, estimate, stage("Fig. 7: horizontal free motion"))
-        ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
-        contact_run = simulate_contact(contact, estimate, stage)
+        simulate_free = experiments.simulate_free_motion
+        force_run = simulate_free(force, estimate, stage("Fig. 6: vertical free motion"))
+        torque_run = simulate_free(torque, estimate, stage("Fig. 7: horizontal free motion"))
+        about_all_axes = stage("Rotation about all axes, ideal sensor")
+        ideal_run = experiments.simulate_ideal_motion(about_all_axes)
+        contact_run = experiments.simulate_contact(contact, estimate, stage)
+        measure_free_run = experiments.peaks_and_residuals_of_free_run
         summary = {
-            "free_force": peaks_and_residuals_of_free_run(force_run, _FORCE_Z_INDEX, "N"),
-            "free_torque": peaks_and_residuals_of_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
-            "ideal": wrench_errors_of_ideal_run(ideal_run),
-            "contact": detection_and_peaks_of_contact_run(contact_run),
-            "identification": errors_of_identification(load, force),
+            "free_force": measure_free_run(force_run, _FORCE_Z_INDEX, "N"),
+            "free_torque": measure_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
+            "ideal": experiments.wrench_errors_of_ideal_run(ideal_run),
+            "contact": experiments.detection_and_peaks_of_contact_run(contact_run),
+            "identification": experiments.errors_of_identification(load, force),
         }
         session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
         pictures = draw_figures(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
-        with output_folder(out):
+        with files.output_folder(out):
             _write_results(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
-            write_json(out / "session.json", session)
-            write_json(out / "summary.json", summary)
+            files.write_json(out / "session.json", session)
+            files.write_json(out / "summary.json", summary)
         written(1.0)
     if not quiet:
-        _print_comparison(compare_with_paper(values_by_full_name(summary)), out)
+        _print_comparison(report.compare_with_paper(report.values_by_full_name(summary)), out)
     return summary | session
 
 
 def draw_figures(
-    force: FreeMotionRun,
-    torque: FreeMotionRun,
-    contact: RunsWithAndWithoutContact,
-    summary: NamedValues,
+    force: experiments.FreeMotionRun,
+    torque: experiments.FreeMotionRun,
+    contact: experiments.RunsWithAndWithoutContact,
+    summary: experiments.NamedValues,
 ) -> dict[str, Figure]:
     pictures = {
         name: scaling_figure(
             run.result.t,
-            [run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS],
-            SIGMAS,
+            [run.scaled_wrenches[sigma][:, component] for sigma in experiments.SIGMAS],
+            experiments.SIGMAS,
             symbol=symbol,
             unit=unit,
             downscaling=1 / run.scenario.force_scaling.force_scale,
@@ -129,16 +97,16 @@ def draw_figures(
         contact=contact.in_contact,
         detected_s=math.nan if detected is None else detected,
         threshold=contact.threshold_N,
-        turning_s=time_of_largest_raw_force_after_contact(contact),
+        turning_s=experiments.time_of_largest_raw_force_after_contact(contact),
     )
     return pictures
 
 
-def _measure_simulation_speed(progress: UpdateProgress) -> NamedValues:
+def _measure_simulation_speed(progress: UpdateProgress) -> experiments.NamedValues:
     scenario = LoadScenario("free_motion_force")
-    bare, station = MakeBarePlantSimulator(scenario), MakeSettledStationSimulator(scenario)
-    simulators = {"bare": bare, "station": station}
-    cost = cpu_time_per_simulated_second(simulators, progress=progress)
+    simulators = {"bare": speed.MakeBarePlantSimulator(scenario)}
+    simulators["station"] = speed.MakeSettledStationSimulator(scenario)
+    cost = speed.cpu_time_per_simulated_second(simulators, progress=progress)
     return {
         "real_time_factor": 1 / cost["station"],
         "cost_over_bare_plant": cost["station"] / cost["bare"],
@@ -148,42 +116,35 @@ def _measure_simulation_speed(progress: UpdateProgress) -> NamedValues:
 def _write_results(
     out: Path,
     seed: int,
-    summary: NamedValues,
+    summary: experiments.NamedValues,
     load: LoadIdentification,
-    runs: tuple[FreeMotionRun, FreeMotionRun, RunsWithAndWithoutContact],
+    runs: tuple[
+        experiments.FreeMotionRun, experiments.FreeMotionRun, experiments.RunsWithAndWithoutContact
+    ],
     pictures: dict[str, Figure],
 ) -> None:
     force, torque, contact = runs
-    make_folder(out / "logs")
+    without_sheet = experiments.without_leaf_spring_with_next_seed(contact.scenario)
+    files.make_folder(out / "logs")
     for name, result, scenario in (
         ("identification", load.result, identification_scenario(force.scenario, seed)),
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
         ("contact_transition", contact.contact_result, contact.scenario),
-        (
-            "contact_transition_without_sheet",
-            contact.free_result,
-            without_leaf_spring_with_next_seed(contact.scenario),
-        ),
+        ("contact_transition_without_sheet", contact.free_result, without_sheet),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
-    write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
+    files.write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
-    write_replay(
-        out / "replay.html", contact.contact_result, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
-    )
-    figures = values_by_full_name(summary)
-    write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
-    write_report(
-        out,
-        pictures,
-        setup=_describe_setup(seed, force.scenario, load),
-        summary=figures,
-        parameters=parameter_rows(
-            true_offsets_and_phi(force.scenario), load.estimate, load.batch.standard_deviations
-        ),
-    )
+    # The contact lasts 40 ms.
+    write_replay(out / "replay.html", contact.contact_result, contact.scenario, slow_motion=8.0)
+    figures = report.values_by_full_name(summary)
+    files.write_text(out / "table.md", _markdown_table(report.compare_with_paper(figures)))
+    true = experiments.true_offsets_and_phi(force.scenario)
+    rows = report.parameter_rows(true, load.estimate, load.batch.standard_deviations)
+    setup = _describe_setup(seed, force.scenario, load)
+    report.write_report(out, pictures, setup=setup, summary=figures, parameters=rows)
 
 
 def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
@@ -206,7 +167,7 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
     }
 
 
-def _markdown_table(rows: list[Comparison]) -> str:
+def _markdown_table(rows: list[report.Comparison]) -> str:
     lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
         f"| {row.quantity.replace('|', '&#124;')} | {row.paper_value} | {row.reproduced_value} "
@@ -216,14 +177,12 @@ def _markdown_table(rows: list[Comparison]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _print_comparison(rows: list[Comparison], out: Path) -> None:
+def _print_comparison(rows: list[report.Comparison], out: Path) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("What")
-    table.add_column("Paper")
+    table = Table("What", "Paper", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("This run", justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     table.add_column("Verdict", no_wrap=True)

@@ -73,5 +73,4 @@ def _predict_points(places: Array, y: Array, queries: Array, noise: float) -> tu
 
 def _matern_kernel(a: Array, b: Array) -> Array:
     r = np.sqrt(5.0 * ((a[:, None] - b[None]) ** 2).sum(axis=-1))
-    kernel: Array = (1.0 + r + r * r / 3.0) * np.exp(-r)
-    return kernel
+    return (1.0 + r + r * r / 3.0) * np.exp(-r)

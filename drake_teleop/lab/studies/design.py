@@ -22,9 +22,6 @@ MAX_RUNS_WITHOUT_CONSENT = 10**5
 MAX_RUNS = 10**6
 """Maximum number of runs; their design needs 1 GB of memory."""
 
-# Number of candidates of an adaptive design (a power of two).
-_NUM_ADAPTIVE_CANDIDATES = 1024
-
 
 @settings
 @dataclass
@@ -113,15 +110,13 @@ class Study:
 
     def check(self, where: str) -> None:
         check_all_field_values(self, where)
-        for name in self.measures:
-            if name not in MEASURES:
-                what = f"there is no measure '{name}'"
-                remedy = suggest_name(name, MEASURES, f"choose among {', '.join(MEASURES)}")
-                raise DrakeTeleopError(what, where=f"{where}:measures", remedy=remedy)
-        for index, factor in enumerate(self.factors):
-            factor.check(f"{where}:factors[{index}]")
+        if unknown := [name for name in self.measures if name not in MEASURES]:
+            remedy = suggest_name(unknown[0], MEASURES, f"choose among {', '.join(MEASURES)}")
+            what = f"there is no measure '{unknown[0]}'"
+            raise DrakeTeleopError(what, where=f"{where}:measures", remedy=remedy)
         fields = [factor.field for factor in self.factors]
-        for index, name in enumerate(fields):
+        for index, (name, factor) in enumerate(zip(fields, self.factors, strict=True)):
+            factor.check(f"{where}:factors[{index}]")
             place = f"{where}:factors[{index}].field"
             if name in fields[:index]:
                 remedy = "remove one factor"
@@ -182,7 +177,7 @@ class Study:
 
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
-        drawn = self._draw_sobol_points(_NUM_ADAPTIVE_CANDIDATES, self.seed + len(points))
+        drawn = self._draw_sobol_points(1024, self.seed + len(points))
         candidates = list({str(p): p for p in drawn if str(p) not in tried}.values())
         if len(candidates) <= count:
             return candidates

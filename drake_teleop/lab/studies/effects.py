@@ -321,8 +321,8 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return whether each point is complete and not dominated; columns are minimised."""
     found = complete.copy()
+    other = values[complete]
     for index in np.flatnonzero(complete):
-        other = values[complete]
         dominated = np.all(other <= values[index], axis=1) & np.any(other < values[index], axis=1)
         found[index] = not dominated.any()
     return found
@@ -336,5 +336,4 @@ def measure_values(rows: pl.DataFrame, measure: str) -> Array:
     """Return the values (N,) of a measure in all rows; nan where missing."""
     import polars as pl
 
-    column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    return column
+    return rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()

@@ -34,8 +34,7 @@ def largest_complete_block(there: BooleanArray) -> tuple[BooleanArray, BooleanAr
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
     rows = patterns[:, np.argmax(times)]
-    columns: BooleanArray = np.logical_and.reduce(there[rows], axis=0)
-    return rows, columns
+    return rows, np.logical_and.reduce(there[rows], axis=0)
 
 
 def missing_value_reasons(
@@ -52,10 +51,8 @@ def missing_value_reasons(
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_PARTS_AND_PRODUCTS = (
-    *((parts, True) for parts in (5, 4, 3)),
-    *((parts, False) for parts in (5, 4, 3, 2)),
-)
+_PARTS_AND_PRODUCTS = [(parts, True) for parts in (5, 4, 3)]
+_PARTS_AND_PRODUCTS += [(parts, False) for parts in (5, 4, 3, 2)]
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_LEVEL_COMBINATIONS = 50_000
 

@@ -34,7 +34,6 @@ from drake_teleop.lab.studies.level_model import (
 if TYPE_CHECKING:
     import polars as pl
 
-_MAX_LABELLED_POINTS = 24  # largest number of labelled points
 _MAX_UNROTATED_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
 _HATCH_OF_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
@@ -62,8 +61,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
     factors, fitted, reasons = varied_factors(study), False, set[str]()
     with plot_style():
-        size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
-        figure = Picture(figsize=size)
+        figure = Picture(figsize=(1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures)))
         grid = figure.subplots(len(measures), len(factors), squeeze=False, sharey="row")
         for line, measure in zip(grid, measures, strict=True):
             found = effects.main_effects(study, rows, measure)
@@ -106,10 +104,8 @@ def _label_levels(axes: Axes, levels: list[str]) -> None:
 
 
 def _describe_used_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
-    if not found.num_unused_combinations:
-        return ""
     used, unused = found.num_used_combinations, found.num_unused_combinations
-    return f"over {used} of {used + unused} combinations of the rest"
+    return f"over {used} of {used + unused} combinations of the rest" if unused else ""
 
 
 def _hatched_cell_without_value(why: str, corner: tuple[float, float]) -> Rectangle:
@@ -168,16 +164,14 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
             _draw_pareto_intervals(axes, on_front, name)
             axes.set_xlabel(name)
             axes.set_ylabel(PARETO_MEASURES[0])
-        if on_front.height <= _MAX_LABELLED_POINTS:
+        if on_front.height <= 24:  # more labels would overlap
+            lines = []
             for place, point in enumerate(on_front.iter_rows(named=True), 1):
                 for axes, name in zip(figure.axes, PARETO_MEASURES[1:], strict=True):
                     axes.annotate(str(place), (point[name], point[PARETO_MEASURES[0]]), (4, 4),
                                   textcoords="offset points", fontsize=8)  # fmt: skip
-            lines = [
-                f"{place}: "
-                + ", ".join(f"{field.split('.')[-1]} {point[field]}" for field in factors)
-                for place, point in enumerate(on_front.iter_rows(named=True), 1)
-            ]
+                values = (f"{field.split('.')[-1]} {point[field]}" for field in factors)
+                lines.append(f"{place}: {', '.join(values)}")
             figure.text(1.0, 0.5, "\n".join(lines), fontsize=7.5, va="center")
         left = rows["point"].n_unique() - points.height
         words = f"; points left out for failures: {left}" if left else ""

@@ -27,7 +27,6 @@ RunRows: TypeAlias = Callable[[Chunk], Chunk]
 RunChunks: TypeAlias = Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
 """Function that runs chunks in parallel and yields each one when it is finished."""
 PROCESS_ENDED_ERROR = "the run has ended its process"
-_PARENT_CHECK_PERIOD_S = 0.5  # period of the check for the parent process [s]
 
 
 @contextmanager
@@ -127,7 +126,7 @@ def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
 def _exit_when_parent_ends(parent: int) -> None:
     def wait_for_parent() -> None:
         while os.getppid() == parent:
-            time.sleep(_PARENT_CHECK_PERIOD_S)
+            time.sleep(0.5)
         os._exit(1)
 
     threading.Thread(target=wait_for_parent, daemon=True).start()
@@ -141,18 +140,11 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
     except ImportError:
         remedy = remedy_to_install_extra("cluster")
         raise DrakeTeleopError("Dask is not installed", where="--cluster", remedy=remedy) from None
-    local = {
-        "n_workers": jobs if jobs > 0 else None,
-        "threads_per_worker": 1,
-        "host": "127.0.0.1",
-        "dashboard_address": "127.0.0.1:0",
-    }
-    settings = {
-        # A worker that dies must hold no waiting chunks.
-        "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.scheduler.allowed-failures": 1,
-    }
-    with dask.config.set(settings):
+    local: dict[str, Any] = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    local |= {"n_workers": jobs if jobs > 0 else None, "threads_per_worker": 1}
+    # A worker that dies must hold no waiting chunks.
+    scheduler = {"worker-saturation": 1.0, "allowed-failures": 1}
+    with dask.config.set({f"distributed.scheduler.{key}": v for key, v in scheduler.items()}):
         try:
             client = Client(**local) if address == "local" else Client(address)
         except (OSError, ValueError) as error:
@@ -194,11 +186,9 @@ def _make_version_reader() -> Callable[[], str]:
 
 
 def _version_error(worker: str, found: Any, expected: str) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        f"worker {worker} has drake_teleop {found}, this process has {expected}",
-        where="--cluster",
-        remedy="install the same version on all workers and start them again",
-    )
+    what = f"worker {worker} has drake_teleop {found}, this process has {expected}"
+    remedy = "install the same version on all workers and start them again"
+    return DrakeTeleopError(what, where="--cluster", remedy=remedy)
 
 
 def _check_version_before_run(run: RunRows) -> RunRows:

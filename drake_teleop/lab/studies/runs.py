@@ -37,11 +37,8 @@ _RUN_SECONDS_KEY = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
 # waits at the end. The first chunks have one run, for early results and time estimates.
-_MAX_RUNS_PER_CHUNK = 8
-_TARGET_NUM_CHUNKS = 512
-_NUM_SINGLE_RUNS = 64
-# Number of latest runs for the estimate of the remaining time.
-_NUM_RUNS_FOR_TIME_ESTIMATE = 16
+_MAX_RUNS_PER_CHUNK, _TARGET_NUM_CHUNKS, _NUM_SINGLE_RUNS = 8, 512, 64
+_NUM_RUNS_FOR_TIME_ESTIMATE = 16  # latest runs, for the estimate of the remaining time
 
 
 def run_study(
@@ -76,8 +73,7 @@ def run_study(
     schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = _group_into_chunks(first_rows)
-    if part is not None:
-        chunks = part.chunks(chunks)
+    chunks = chunks if part is None else part.chunks(chunks)
     total = sum(map(len, chunks)) if part else study.num_points() * study.repeats
     with open_store(part.folder(out) if part else out, identity) as store:
         if merge:
@@ -155,13 +151,9 @@ class StudyProgress:
         if self._recent:
             at_once = min(self._processes, left) or 1
             seconds = float(np.median(self._recent)) * left / at_once
-            words = f"about {_format_duration(seconds)} left"
+            minutes, rest = divmod(round(seconds), 60)
+            words = f"about {minutes // 60}:{minutes % 60:02d}:{rest:02d} left"
         self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
-
-
-def _format_duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
 def _run_chunk(work: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:

@@ -16,21 +16,10 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    write_json,
-    write_picture,
-    write_table,
-)
+from drake_teleop.common import files
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import COLOURS, Picture, plot_style
-from drake_teleop.lab.studies.effects import (
-    effect_half_widths_over_seeds,
-    means_and_half_widths_over_seeds,
-    measure_values,
-    values_by_seed,
-)
+from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 
@@ -41,10 +30,9 @@ if TYPE_CHECKING:
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
 CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
-TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
-    ("touch", "press", "insert"), tuple(CRITERIA)
-)
+TASK_CRITERIA = dict.fromkeys(("reach", "touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
+TASK_CRITERIA["reach"] = ("effort", "time")
 _ETA_STUDY_NAME = "scaling_object"
 _SIGMA_KEY, _GAMMA_KEY, _ETA_KEY = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
 _NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
@@ -76,7 +64,7 @@ def scaling_study_command(
 
     The other options are those of `study_command`.
     """
-    make_folder(out)
+    files.make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
@@ -88,11 +76,11 @@ def scaling_study_command(
         "choice": {selection: _find_best_scales(found) for selection, found in answers.items()},
         "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
-    with output_folder(out, "answer.json"):
-        write_table(out / "answer.csv", _merit_table(answers))
-        write_picture(out / "answer.png", draw_criteria(rows))
-        write_picture(out / "choice.png", draw_best_scales(answers, *_sigmas_and_gammas()))
-        write_json(out / "answer.json", summary)
+    with files.output_folder(out, "answer.json"):
+        files.write_table(out / "answer.csv", _merit_table(answers))
+        files.write_picture(out / "answer.png", draw_criteria(rows))
+        files.write_picture(out / "choice.png", draw_best_scales(answers, *_sigmas_and_gammas()))
+        files.write_json(out / "answer.json", summary)
     if not quiet:
         _print_best_scales(summary, out)
     return summary
@@ -106,9 +94,8 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_BOOTSTRAP_SEED).multinomial(
-        count, np.full(count, 1 / count), _NUM_BOOTSTRAP_DRAWS
-    )
+    generator, equal = np.random.default_rng(_BOOTSTRAP_SEED), np.full(count, 1 / count)
+    draws = generator.multinomial(count, equal, _NUM_BOOTSTRAP_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
         np.mean([_means_over_unscaled(tables[task][name], weights) for name in names], axis=0)
@@ -152,9 +139,8 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
     tables = {}
     for name, measure in measures.items():
-        values = measure_values(rows, measure)
-        if name == "success":
-            values = np.nan_to_num(values)
+        values = effects.measure_values(rows, measure)
+        values = np.nan_to_num(values) if name == "success" else values
         shaped = values.reshape(len(sigmas), count, seeds)
         tables[name] = np.broadcast_to(shaped, (len(sigmas), len(gammas), seeds))
     return tables
@@ -184,30 +170,30 @@ def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
     import polars as pl
 
     sigmas, gammas = _sigmas_and_gammas()
-    return pl.DataFrame(
-        [
-            {
-                "way": selection,
-                "sigma": sigma,
-                "gamma": gamma,
-                "merit": found.merit[i, j],
-                "low": found.merit_low[i, j],
-                "high": found.merit_high[i, j],
-                "best_in": found.best_share[i, j],
-            }
-            for selection, found in answers.items()
-            for i, sigma in enumerate(sigmas)
-            for j, gamma in enumerate(gammas)
-        ]
-    )
+    rows = [
+        {
+            "way": selection,
+            "sigma": sigma,
+            "gamma": gamma,
+            "merit": found.merit[i, j],
+            "low": found.merit_low[i, j],
+            "high": found.merit_high[i, j],
+            "best_in": found.best_share[i, j],
+        }
+        for selection, found in answers.items()
+        for i, sigma in enumerate(sigmas)
+        for j, gamma in enumerate(gammas)
+    ]
+    return pl.DataFrame(rows)
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA_KEY].unique().to_list())
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
-        values = values_by_seed(rows, measure, by=_ETA_KEY)
-        figures = *means_and_half_widths_over_seeds(values), effect_half_widths_over_seeds(values)
+        values = effects.values_by_seed(rows, measure, by=_ETA_KEY)
+        of_effect = effects.effect_half_widths_over_seeds(values)
+        figures = *effects.means_and_half_widths_over_seeds(values), of_effect
         names = (measure, f"{measure}_half", f"{measure}_effect_half")
         for row, at_eta in zip(table, np.column_stack(figures), strict=True):
             row |= {n: v if np.isfinite(v) else None for n, v in zip(names, at_eta, strict=True)}
@@ -223,9 +209,9 @@ def draw_criteria(rows: dict[str, pl.DataFrame]) -> Figure:
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]
             for axes, measure in zip(line, CRITERIA.values(), strict=True):
-                values = values_by_seed(table, measure)
-                means = means_and_half_widths_over_seeds(values)[0].reshape(-1, len(gammas))
-                bars = effect_half_widths_over_seeds(values).reshape(means.shape)
+                values = effects.values_by_seed(table, measure)
+                means = effects.means_and_half_widths_over_seeds(values)[0].reshape(-1, len(gammas))
+                bars = effects.effect_half_widths_over_seeds(values).reshape(means.shape)
                 for j, gamma in enumerate(gammas):
                     axes.errorbar(
                         sigmas, means[:, j], np.nan_to_num(bars[:, j]), color=COLOURS[j],

@@ -17,7 +17,6 @@ from drake_teleop.common.files import replace_file_on_success
 from drake_teleop.lab.studies.processes import Chunk
 from drake_teleop.lab.studies.store import Store, write_or_check_identity
 
-_SHARD_FOLDER_PATTERN = re.compile(r"([1-9]\d*)-of-([1-9]\d*)")
 _MAX_SHARDS_IN_MESSAGE = 20
 
 
@@ -48,7 +47,7 @@ def parse_shard(text: str) -> Shard:
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
     """Link the result files of all shards in `out` into its table; raise if runs are missing."""
-    names = [_SHARD_FOLDER_PATTERN.fullmatch(path.name) for path in (out / "shards").glob("*")]
+    names = (re.fullmatch(r"([1-9]\d*)-of-([1-9]\d*)", p.name) for p in out.glob("shards/*"))
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:
         raise DrakeTeleopError("has no shards", where=str(out), remedy="run study --shard K/N")

@@ -141,8 +141,7 @@ def _set_fields(data: Any, changes: dict[str, Any]) -> Any:
         *blocks, last = name.split(".")
         inner = data
         for block in blocks:
-            if not isinstance(inner.get(block), dict):
-                inner[block] = {}
+            inner[block] = inner[block] if isinstance(inner.get(block), dict) else {}
             inner = inner[block]
         # Integer fields reject 3.0; float fields accept 3.
         whole = isinstance(value, float) and value.is_integer()

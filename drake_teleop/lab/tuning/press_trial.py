@@ -79,9 +79,8 @@ class TunedSettings:
             sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
         scaling = dataclasses.replace(base.force_scaling, sigma=0.0, eta=None, sigma_weight=0.0)
         scaling = dataclasses.replace(scaling, gamma=self.gamma, sigma_inertia=self.sigma_inertia)
-        return replace(
-            base, wrist_sensor=sensor, force_scaling=scaling, passivity=self.passivity(stated)
-        )
+        method = self.passivity(stated)
+        return replace(base, wrist_sensor=sensor, force_scaling=scaling, passivity=method)
 
 
 def settings_from_values(values: FactorValues) -> TunedSettings:
@@ -113,9 +112,8 @@ class StationPressTrial:
         channel = self.base_scenario.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         depth = renderable_press_depth(self.base_scenario, grip)
-        setup, _ = delayed_contact(
-            scenario, channel, scenario.passivity, wall, task=task, depth=depth
-        )
+        method = scenario.passivity
+        setup, _ = delayed_contact(scenario, channel, method, wall, task=task, depth=depth)
         setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
@@ -130,11 +128,8 @@ class StationPressTrial:
         felt = result["force_to_master"][hold, 2]
         free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
         period = result.t[1] - result.t[0]
-        free_felt = result["force_to_master"][free, :3].T
-        rest_force = max(
-            rms_above_hz(felt, period, MIN_REST_FORCE_FREQUENCY_HZ),
-            *(rms_above_hz(force, period, MIN_REST_FORCE_FREQUENCY_HZ) for force in free_felt),
-        )
+        forces = (felt, *result["force_to_master"][free, :3].T)
+        rest_force = max(rms_above_hz(f, period, MIN_REST_FORCE_FREQUENCY_HZ) for f in forces)
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
         human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)

@@ -86,14 +86,12 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = margin / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
     caps = {f: min(MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
-    study = Study(
-        factors=[
-            Factor(field="method", words=list(CANDIDATE_METHODS)),
-            Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
-            Factor(field="low_pass_hz", values=low_passes),
-        ],
-        measures=SEARCH_MEASURES,
-    )
+    factors = [
+        Factor(field="method", words=list(CANDIDATE_METHODS)),
+        Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
+        Factor(field="low_pass_hz", values=low_passes),
+    ]
+    study = Study(factors=factors, measures=SEARCH_MEASURES)
     rows = execute("search", study, OneAxisGammaSearch(base, stated, caps))
     search = [_add_predicted_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
@@ -185,7 +183,9 @@ def _add_predicted_threshold(
     gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
     human = trial.base_scenario.operator.perception
     scale = trial.base_scenario.force_scaling.force_scale
-    masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
+    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # of the swing, as `delayed_contact`
+    rms_load_force = float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
+    masked = row["sigma_inertia"] * scale * rms_load_force
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noise_N_by_low_pass_hz[row["low_pass_hz"]] * gamma
     rendered = scale * gamma * row["share"]
@@ -193,25 +193,11 @@ def _add_predicted_threshold(
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
 
 
-def _rms_load_force_in_swing(trial: StationPressTrial) -> float:
-    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
-    return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
-
-
 def _study_of_settings(
-    settings: TunedSettings,
-    hands: list[str],
-    walls: list[float],
-    *,
-    seed: int = 0,
-    repeats: int = 1,
+    settings: TunedSettings, hands: list[str], walls: list[float], seed: int = 0, repeats: int = 1
 ) -> Study:
-    factors = [
-        Factor(field="method", words=[settings.method]),
-        Factor(field="gamma", values=[settings.gamma]),
-        Factor(field="sigma_inertia", values=[settings.sigma_inertia]),
-        Factor(field="low_pass_hz", values=[settings.low_pass_hz]),
-        Factor(field="hand", words=hands),
-        Factor(field="wall", values=walls),
-    ]
+    numbers = dataclasses.asdict(settings)
+    factors = [Factor(field="method", words=[numbers.pop("method")])]
+    factors += [Factor(field=name, values=[number]) for name, number in numbers.items()]
+    factors += [Factor(field="hand", words=hands), Factor(field="wall", values=walls)]
     return Study(factors=factors, measures=TRIAL_MEASURES, seed=seed, repeats=repeats)

@@ -102,9 +102,8 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
         raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
     grips = list(GRIP_IMPEDANCES)
     places = sorted(map(grips.index, hands))
-    return StatedSet(
-        tuple(grips[places[0] : places[-1] + 1]), (1e3 * min(walls), 1e3 * max(walls)), task
-    )
+    between = tuple(grips[places[0] : places[-1] + 1])
+    return StatedSet(between, (1e3 * min(walls), 1e3 * max(walls)), task)
 
 
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
@@ -117,12 +116,10 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
     channel = scenario.channel if network is None else Channel(network=network)
     if replace(scenario, channel=channel).has_no_network_or_passivity:
-        raise DrakeTeleopError(
-            "the scenario has neither network nor passivity method, which the energy balances of"
-            " the runs need",
-            where="network",
-            remedy=f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}",
-        )
+        what = "the scenario has neither network nor passivity method"
+        what += ", which the energy balances of the runs need"
+        remedy = f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}"
+        raise DrakeTeleopError(what, where="network", remedy=remedy)
     scaling = scenario.force_scaling
     simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
     return replace(

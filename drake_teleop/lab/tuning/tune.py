@@ -10,25 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    refuse_to_replace_inputs,
-    write_json,
-    write_picture,
-    write_text,
-)
+from drake_teleop.common import files
 from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.lab.tuning import search
 from drake_teleop.lab.tuning.press_trial import StationPressTrial, TunedSettings
-from drake_teleop.lab.tuning.search import (
-    SearchResult,
-    make_study_executor,
-    meets_requirements,
-    search_settings,
-)
 from drake_teleop.lab.tuning.stated_set import StatedSet, make_stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
@@ -67,9 +55,9 @@ def tune(
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), make_stated_set(hands, walls, task)
     if not isinstance(scenario, Scenario):
-        refuse_to_replace_inputs(out / "tuned.yaml", scenario)
+        files.refuse_to_replace_inputs(out / "tuned.yaml", scenario)
     base = without_task_and_method(given, network)
-    make_folder(out)
+    files.make_folder(out)
     shown = progress and not quiet
     with show_progress(shown) as stage:
         load = identified_load(base, stage)
@@ -82,7 +70,7 @@ def tune(
         "stated": dataclasses.asdict(stated),
         "estimate": load.estimate.tolist(),
     }
-    found = search_settings(trial, make_study_executor(out, basis, jobs, shown))
+    found = search.search_settings(trial, search.make_study_executor(out, basis, jobs, shown))
     tuned = dataclasses.replace(
         replace(found.settings.apply(base, stated), simulation=given.simulation),
         operator=given.operator,
@@ -92,16 +80,14 @@ def tune(
         contact_detection=given.contact_detection,
     )
     summary = _make_tuning_summary(found, tuned, stated, network)
-    with output_folder(out):
+    with files.output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
-        write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
-        url = png_data_url(out / "trade_off.png")
-        page = render_page(
-            "drake_teleop.lab.tuning", "report.html.j2", summary=summary, picture=url
-        )
-        write_text(out / "report.html", page)
-        write_json(out / "summary.json", summary)
+        files.write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
+        shown_in_page = {"summary": summary, "picture": png_data_url(out / "trade_off.png")}
+        page = render_page("drake_teleop.lab.tuning", "report.html.j2", **shown_in_page)
+        files.write_text(out / "report.html", page)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         from rich.console import Console
 
@@ -112,13 +98,17 @@ def tune(
 
 
 def _make_tuning_summary(
-    found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
+    found: search.SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
     scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
-    failed = [row for row in found.beyond_runs if not meets_requirements(row)]
+    failed = [row for row in found.beyond_runs if not search.meets_requirements(row)]
+    fails_at: dict[str, Any] | None = None
+    if failed:
+        hand, wall, failing = (failed[0][name] for name in ("hand", "wall", "gamma"))
+        fails_at = {"hand": hand, "wall_N_per_m": wall, "gamma_factor": failing / gamma}
     shares = [row["share"] for row in found.inside_runs]
     edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
-    holds = all(map(meets_requirements, found.given_runs))
+    holds = all(map(search.meets_requirements, found.given_runs))
     worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
         "share": min(shares),
@@ -127,13 +117,7 @@ def _make_tuning_summary(
         "given_threshold_N": worst_given if holds else None,
         "rest_force_N": max(row["rest_force_N"] for row in edge),
         "margin": stated.requirements.loop_gain_margin,
-        "fails_at": {
-            "hand": failed[0]["hand"],
-            "wall_N_per_m": failed[0]["wall"],
-            "gamma_factor": failed[0]["gamma"] / gamma,
-        }
-        if failed
-        else None,
+        "fails_at": fails_at,
         "beyond_N_per_m": max(row["wall"] for row in found.beyond_runs),
         "beyond_gamma_factor": max(row["gamma"] for row in found.beyond_runs) / gamma,
     }
@@ -189,7 +173,7 @@ def _tuning_result_sentences(
     return [*lines, last]
 
 
-def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
+def draw_trade_off(found: search.SearchResult, summary: dict[str, Any]) -> Figure:
     """Draw the detection threshold against the margin of gamma for each method."""
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
