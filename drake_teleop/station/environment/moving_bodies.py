@@ -9,15 +9,8 @@ from collections.abc import Iterable
 from math import cos, sin
 
 import numpy as np
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Joint,
-    JointIndex,
-    PrismaticJoint,
-    QuaternionFloatingJoint,
-    RevoluteJoint,
-)
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
@@ -43,7 +36,7 @@ BODY_STATE_SIZE = 13
 
 
 def MakeJointTableAndRowBodies(
-    plant: MultibodyPlant, bodies: Iterable[BodyIndex]
+    plant: MultibodyPlant, bodies: Iterable[tree.BodyIndex]
 ) -> tuple[Array, list[int]]:
     """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
 
@@ -71,22 +64,22 @@ def MakeJointTableAndRowBodies(
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_table_row(plant, context, plant.get_joint(JointIndex(index)), row))
+        rows.append(_joint_table_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
 def _joint_table_row(
-    plant: MultibodyPlant, context: Context, joint: Joint, parent_row: int
+    plant: MultibodyPlant, context: Context, joint: tree.Joint, parent_row: int
 ) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if parent_row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _FIXED_JOINT, np.zeros(3)
-    if isinstance(joint, RevoluteJoint):
+    if isinstance(joint, tree.RevoluteJoint):
         kind, axis = _REVOLUTE_JOINT, joint.revolute_axis()
-    elif isinstance(joint, PrismaticJoint):
+    elif isinstance(joint, tree.PrismaticJoint):
         kind, axis = _PRISMATIC_JOINT, joint.translation_axis()
-    elif isinstance(joint, QuaternionFloatingJoint):
+    elif isinstance(joint, tree.QuaternionFloatingJoint):
         kind = _FREE_JOINT
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]

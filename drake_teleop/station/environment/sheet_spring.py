@@ -12,19 +12,14 @@ from pydrake.multibody.tree import BodyIndex, PrismaticSpring
 
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.files import models_dir
-from drake_teleop.station.environment.environment import (
-    BodiesWeldedToTool,
-    Environment,
-    ExcludeContact,
-    FloorStand,
-)
+from drake_teleop.station.environment import environment
 
 _BENCH_BASE_TO_LEAF_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
 @dataclass
-class SheetSpring(Environment):
+class SheetSpring(environment.Environment):
     """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
@@ -65,9 +60,9 @@ class SheetSpring(Environment):
         return self.effective_mass, self.stiffness, self.damping
 
     @property
-    def floor_stand(self) -> FloorStand:
+    def floor_stand(self) -> environment.FloorStand:
         x, y, z = self.position
-        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BASE_TO_LEAF_M)
+        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BASE_TO_LEAF_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""
@@ -90,7 +85,7 @@ class SheetSpring(Environment):
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
         leaf = plant.GetBodyByName("leaf")
-        tool_bodies = BodiesWeldedToTool(plant, tool)
+        tool_bodies = environment.BodiesWeldedToTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
         shapes = plant.GetCollisionGeometriesForBody(leaf)
-        ExcludeContact(plant, scene_graph, shapes, others)
+        environment.ExcludeContact(plant, scene_graph, shapes, others)

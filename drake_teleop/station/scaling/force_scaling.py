@@ -19,24 +19,12 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
+from drake_teleop.load import regressor
 from drake_teleop.load.compensation import (
     add_excess_weight_into,
     scaled_wrench_into,
     scales_from_eta,
     weight_scales_and_inertia_scales,
-)
-from drake_teleop.load.regressor import (
-    FIRST_JOINT_INDEX,
-    LOST_SAMPLE_FLAG,
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_TIME_INDEX,
-    SAMPLE_WRENCH,
-    SATURATION_FLAG_INDEX,
-    non_contact_wrench_into,
-    sample_size,
 )
 from drake_teleop.station.slave.arm import (
     ArmModel,
@@ -170,14 +158,14 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
     scaled_wrench_into(
-        sample[SAMPLE_WRENCH], estimate[:6],
-        sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
+        sample[regressor.SAMPLE_WRENCH], estimate[:6],
+        sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY],
+        sample[regressor.SAMPLE_ANGULAR_ACCELERATION],
         phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
     )  # fmt: skip
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
-        q, gravity = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.empty(3)
+        q, gravity = sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX], np.empty(3)
         acceleration_from_specific_force_into(arm, q, np.zeros(3), gravity)
         add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
@@ -188,15 +176,17 @@ def find_sample_fault(sample, estimate, time, valid_range):
 
     `valid_range` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
     """
-    if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
+    if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG
-    reading = reading and are_finite_and_in_range(sample[SAMPLE_MOTION])
+    reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.LOST_SAMPLE_FLAG
+    reading = reading and are_finite_and_in_range(sample[regressor.SAMPLE_MOTION])
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
         return _BAD_READING_FAULT
-    if not are_finite_and_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
+    if not are_finite_and_in_range(
+        sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX]
+    ):
         return _BAD_JOINTS_FAULT
     return _NO_FAULT if are_finite_and_in_range(estimate) else _BAD_LOAD_FAULT
 
@@ -228,7 +218,9 @@ def _rendered_wrench_into(
     blend_scales_at(change, time, scales)
     scales[2] *= contact_share
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
-    forward_kinematics(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], R_WS, p_WS)
+    forward_kinematics(
+        arm, sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX], R_WS, p_WS
+    )
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 
@@ -281,7 +273,9 @@ class ForceScaling(LeafSystem):
         found = config.scales()
         scales = [*found[:3], config.force_scale, *found[3:]]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
-        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+        self._sample = self.DeclareVectorInputPort(
+            "sample", regressor.sample_size(arm.num_joints) + 1
+        )
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         # Without time: a change of scales advances with each new sample.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
@@ -344,10 +338,10 @@ class ForceScaling(LeafSystem):
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
-        non_contact_wrench_into(
-            sample[SAMPLE_SPECIFIC_FORCE],
-            sample[SAMPLE_ANGULAR_VELOCITY],
-            sample[SAMPLE_ANGULAR_ACCELERATION],
+        regressor.non_contact_wrench_into(
+            sample[regressor.SAMPLE_SPECIFIC_FORCE],
+            sample[regressor.SAMPLE_ANGULAR_VELOCITY],
+            sample[regressor.SAMPLE_ANGULAR_ACCELERATION],
             phi,
             output.get_mutable_value(),
         )

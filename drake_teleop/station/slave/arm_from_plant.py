@@ -9,18 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Frame,
-    Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    RevoluteJoint,
-    RigidBody,
-    SpatialInertia,
-    WeldJoint,
-)
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -46,7 +36,9 @@ _DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
 
 
 def ArmModelFromPlant(
-    plant: MultibodyPlant, model_instance: ModelInstanceIndex, sensor_frame_name: str = "sensor"
+    plant: MultibodyPlant,
+    model_instance: tree.ModelInstanceIndex,
+    sensor_frame_name: str = "sensor",
 ) -> ArmModel:
     """Return the arm between the world and the sensor frame of a finalized plant.
 
@@ -71,7 +63,7 @@ def ArmModelFromPlant(
     for row, joint in enumerate(joints):
         table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
-        table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
+        table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, tree.PrismaticJoint)
     gravity = plant.gravity_field()
     table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = (
         gravity.gravity_vector() * gravity.is_enabled(model_instance)
@@ -113,10 +105,10 @@ def ArmModelFromPlant(
     )
 
 
-def _joint_position_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
+def _joint_position_limits(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> tuple[float, float]:
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
-    if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
+    if isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
     return (
         -np.inf if lower < -_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else lower,
@@ -124,21 +116,21 @@ def _joint_position_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float
     )
 
 
-def _joint_axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
-    slides = isinstance(joint, PrismaticJoint)
+def _joint_axis(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> Array:
+    slides = isinstance(joint, tree.PrismaticJoint)
     axis: Array = joint.translation_axis() if slides else joint.revolute_axis()
     return axis
 
 
 def _moving_joints_to_sensor(
-    inboard_joints: dict[BodyIndex, Joint], frame_S: Frame
-) -> list[RevoluteJoint | PrismaticJoint]:
-    body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
+    inboard_joints: dict[tree.BodyIndex, tree.Joint], frame_S: tree.Frame
+) -> list[tree.RevoluteJoint | tree.PrismaticJoint]:
+    body, joints = frame_S.body(), list[tree.RevoluteJoint | tree.PrismaticJoint]()
     while body.index() in inboard_joints:
         joint = inboard_joints[body.index()]
-        if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+        if isinstance(joint, (tree.RevoluteJoint, tree.PrismaticJoint)):
             joints.append(joint)
-        elif not isinstance(joint, WeldJoint):
+        elif not isinstance(joint, tree.WeldJoint):
             what = f"the arm up to the sensor contains an unsupported {joint.type_name()} joint"
             remedy = "weld the arm's base to the world; up to the sensor, use joints of one axis"
             raise DrakeTeleopError(what, where=joint.name(), remedy=remedy)
@@ -151,10 +143,10 @@ def _moving_joints_to_sensor(
 
 
 def _table_row_of_body(
-    body: RigidBody,
-    inboard_joints: dict[BodyIndex, Joint],
-    rows: dict[BodyIndex, int],
-    sensor_body: RigidBody,
+    body: tree.RigidBody,
+    inboard_joints: dict[tree.BodyIndex, tree.Joint],
+    rows: dict[tree.BodyIndex, int],
+    sensor_body: tree.RigidBody,
 ) -> int | None:
     moving, outermost = None, body
     while True:
@@ -165,7 +157,7 @@ def _table_row_of_body(
         if body.index() not in inboard_joints:
             return None
         joint = inboard_joints[body.index()]
-        if not isinstance(joint, WeldJoint):
+        if not isinstance(joint, tree.WeldJoint):
             moving = joint
         body = joint.parent_body()
     if moving is not None:
@@ -174,7 +166,7 @@ def _table_row_of_body(
     return rows[body.index()]
 
 
-def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
+def _phi_about_link_origin(M_BBo_B: tree.SpatialInertia, X_LB: RigidTransform) -> Array:
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()

@@ -20,23 +20,7 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoi
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
-from drake_teleop.station.slave.chain_joints import (
-    assume_rotor_inertias,
-    check_chain,
-    check_joints_form_tree,
-    is_joint_moving,
-    set_one_actuator_per_joint,
-    weld_base_and_find_chain,
-    weld_free_bodies,
-    weld_held_joints,
-    weld_joints_outside_chain,
-)
-from drake_teleop.station.slave.drake_errors import (
-    ROBOT_ERROR_TEXTS,
-    SCENE_ERROR_TEXTS,
-    raise_logged_errors,
-    translate_drake_errors,
-)
+from drake_teleop.station.slave import chain_joints, drake_errors
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import (
@@ -77,11 +61,13 @@ def repair_and_parse_model(
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
-    expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
-    with translate_drake_errors(path, expected, folder.name):
+    expected = (
+        drake_errors.SCENE_ERROR_TEXTS if purpose.is_scene else drake_errors.ROBOT_ERROR_TEXTS
+    )
+    with drake_errors.translate_drake_errors(path, expected, folder.name):
         read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
         instances, repaired = read(parser, path, files, purpose, Path(folder.name))
-        check_joints_form_tree(plant, str(path))
+        chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         what = "the model has springs or other force elements, which are not supported"
         remedy = "remove them; only motors, gravity and contact move the arm"
@@ -94,7 +80,7 @@ def _add_repaired_file(
     parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     repaired = _repair_file(path, files, purpose, folder)
-    with raise_logged_errors():
+    with drake_errors.raise_logged_errors():
         if repaired.text:
             kind = path.suffix.lower().removeprefix(".")
             instances = parser.AddModelsFromString(repaired.text, kind)
@@ -106,7 +92,7 @@ def _add_repaired_file(
 def _add_files_of_directives(
     parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    with raise_logged_errors():
+    with drake_errors.raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
     for added in (each.add_model for each in directives.directives if each.add_model):
@@ -119,7 +105,7 @@ def _add_files_of_directives(
             copy = folder / f"{len(repaired)}_{file.name}"
             copy.write_text(repaired[file].text, encoding="utf-8")
             added.file = f"file://{copy}"
-    with raise_logged_errors():
+    with drake_errors.raise_logged_errors():
         models = ProcessModelDirectives(directives, parser)
     return [each.model_instance for each in models], list(repaired.values())
 
@@ -163,16 +149,18 @@ def ParseModel(
     added_instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
     frame = _find_sensor_frame(plant, added_instances, sensor_frame, where)
     added = set(plant.GetJointIndices()) - before
-    held = weld_held_joints(plant, hold, added)
-    chain = weld_base_and_find_chain(plant, frame, X_WBase, where)
-    check_chain(plant, chain, repaired.dependence_reasons, where)
-    free = weld_free_bodies(plant, added_instances)
-    with translate_drake_errors(path):
-        held += weld_joints_outside_chain(plant, before, chain)
+    held = chain_joints.weld_held_joints(plant, hold, added)
+    chain = chain_joints.weld_base_and_find_chain(plant, frame, X_WBase, where)
+    chain_joints.check_chain(plant, chain, repaired.dependence_reasons, where)
+    free = chain_joints.weld_free_bodies(plant, added_instances)
+    with drake_errors.translate_drake_errors(path):
+        held += chain_joints.weld_joints_outside_chain(plant, before, chain)
         limits = repaired.effort_limits if repaired.text else None
-        set_one_actuator_per_joint(plant, chain, limits)
-        rotors = assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
-    instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
+        chain_joints.set_one_actuator_per_joint(plant, chain, limits)
+        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
+    instances = {
+        plant.get_joint(k).model_instance() for k in chain if chain_joints.is_joint_moving(plant, k)
+    }
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
         what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
@@ -199,8 +187,11 @@ def ParseTool(
         what = f"the tool must have one root link, but has {len(roots)}: {names}"
         remedy = "give one tree of links; its root is welded to the sensor frame"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-    with translate_drake_errors(path):
-        assumptions = [*repaired.assumptions, *weld_joints_outside_chain(plant, before, [])]
+    with drake_errors.translate_drake_errors(path):
+        assumptions = [
+            *repaired.assumptions,
+            *chain_joints.weld_joints_outside_chain(plant, before, []),
+        ]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     return roots[0], assumptions

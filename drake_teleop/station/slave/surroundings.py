@@ -10,16 +10,8 @@ import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import GeometryId, SceneGraph
 from pydrake.math import RigidTransform
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Frame,
-    Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    QuaternionFloatingJoint,
-    RevoluteJoint,
-)
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
@@ -45,8 +37,8 @@ _MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue o
 class AddedEnvironment(NamedTuple):
     """Model instances of an environment; `leaf_instance`: of a leaf or `moving_part`, or None."""
 
-    instances: Collection[ModelInstanceIndex]
-    leaf_instance: ModelInstanceIndex | None
+    instances: Collection[tree.ModelInstanceIndex]
+    leaf_instance: tree.ModelInstanceIndex | None
 
 
 class ToolContactModel(NamedTuple):
@@ -72,25 +64,25 @@ class ToolContactModel(NamedTuple):
     tool_bodies: frozenset[int] = frozenset()
     tool_shapes: frozenset[int] = frozenset()
     leaf_parameters: Array = np.array([1.0, 0.0, 0.0, 0.0])
-    leaf_instance: ModelInstanceIndex | None = None
-    moving_bodies: dict[str, BodyIndex] = {}  # noqa: RUF012  (never changed)
+    leaf_instance: tree.ModelInstanceIndex | None = None
+    moving_bodies: dict[str, tree.BodyIndex] = {}  # noqa: RUF012  (never changed)
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvironment:
     before, leaf_instance = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
-            leaf_instance = ModelInstanceIndex(plant.num_model_instances())
+            leaf_instance = tree.ModelInstanceIndex(plant.num_model_instances())
         part.AddTo(plant)
     added = range(before, plant.num_model_instances())
-    return AddedEnvironment([ModelInstanceIndex(index) for index in added], leaf_instance)
+    return AddedEnvironment([tree.ModelInstanceIndex(index) for index in added], leaf_instance)
 
 
 def MakeToolContactModel(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
-    sensor_frame: Frame,
-    tool: BodyIndex,
+    sensor_frame: tree.Frame,
+    tool: tree.BodyIndex,
     environment: Environment,
     touched: AddedEnvironment,
 ) -> ToolContactModel:
@@ -157,7 +149,7 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
 
 def MovingBodiesExceptLeaf(
     plant: MultibodyPlant, touched: AddedEnvironment
-) -> dict[str, BodyIndex]:
+) -> dict[str, tree.BodyIndex]:
     """Return the moving bodies of the environment, except the leaf, by unique name."""
     bodies = [
         plant.get_body(index)
@@ -174,17 +166,17 @@ def MovingBodiesExceptLeaf(
     }
 
 
-def supports_pose_conversion(joint: Joint) -> bool:
+def supports_pose_conversion(joint: tree.Joint) -> bool:
     """Return whether `joint_positions_of_pose` supports the type of the joint."""
-    kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
+    kinds = (tree.RevoluteJoint, tree.PrismaticJoint, tree.QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
-def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> Array:
-    if isinstance(joint, RevoluteJoint):
+def joint_positions_of_pose(joint: tree.Joint, X_FM: RigidTransform) -> Array:
+    if isinstance(joint, tree.RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
-    if isinstance(joint, PrismaticJoint):
+    if isinstance(joint, tree.PrismaticJoint):
         return np.array([X_FM.translation() @ joint.translation_axis()])
     turned = X_FM.rotation().ToQuaternion().wxyz()
     return np.concatenate([turned, X_FM.translation()])[: joint.num_positions()]
@@ -195,7 +187,7 @@ class MovingBodyPose(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
+    def __init__(self, plant: MultibodyPlant, body: tree.BodyIndex) -> None:
         super().__init__()
         self._joints, order = MakeJointTableAndRowBodies(plant, [body])
         self._bodies = np.empty((len(order), BODY_STATE_SIZE))

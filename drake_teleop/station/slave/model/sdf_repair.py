@@ -6,6 +6,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.model import urdf_repair
 from drake_teleop.station.slave.model.model_references import (
     PACKAGE_FOLDER_SETTINGS,
     ModelFiles,
@@ -16,12 +17,6 @@ from drake_teleop.station.slave.model.repair_report import (
     RepairedModel,
     RepairReport,
     merge_repaired_models,
-)
-from drake_teleop.station.slave.model.urdf_repair import (
-    ModelPurpose,
-    convert_meshes_and_write_text,
-    repair_links_and_joints,
-    repair_urdf,
 )
 
 # Children that Drake reads; it also reads elements with its own prefix.
@@ -34,7 +29,7 @@ _CHILD_TAGS_READ_BY_DRAKE = {
 
 
 def repair_sdf(
-    root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+    root: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
 ) -> RepairedModel:
     """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
@@ -45,7 +40,7 @@ def repair_sdf(
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
-    repair_links_and_joints(root, purpose, report, is_sdf=True)
+    urdf_repair.repair_links_and_joints(root, purpose, report, is_sdf=True)
     for model in root.findall("model"):
         model.set("name", model.get("name") or file.stem)
     report.raise_faults(file)
@@ -54,12 +49,12 @@ def repair_sdf(
         for uri in root.iterfind(".//include/uri")
     ]
     mesh_folder = folder if purpose.plant_has_shapes else None
-    own = convert_meshes_and_write_text(root, file, files, report, mesh_folder)
+    own = urdf_repair.convert_meshes_and_write_text(root, file, files, report, mesh_folder)
     return merge_repaired_models(own.text, [own, *filter(None, inner)])
 
 
 def _repair_included_file(
-    uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+    uri: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
 ) -> RepairedModel | None:
     """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
     address = (uri.text or "").strip()
@@ -71,7 +66,7 @@ def _repair_included_file(
             remedy=f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}",
         )
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
-    repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
+    repair = {".urdf": urdf_repair.repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():
         return None
     part = purpose._replace(is_in_directives=True)
