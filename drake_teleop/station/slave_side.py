@@ -277,12 +277,10 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
     if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
         shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
-        raise DrakeTeleopError(
-            f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
-            f"{1e3 * step:g} ms",
-            where="slave.friction",
-            remedy=f"reduce the friction, or set simulation.max_step: {shorter:.2g}",
-        )
+        steps = f"too fast for steps of {1e3 * step:g} ms"
+        what = f"the friction stops a joint within {1e3 / rate:.2g} ms, {steps}"
+        remedy = f"reduce the friction, or set simulation.max_step: {shorter:.2g}"
+        raise DrakeTeleopError(what, where="slave.friction", remedy=remedy)
 
 
 def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant) -> None:

@@ -130,15 +130,11 @@ def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
     """Return the shapes with contact properties of `tool` and of each body welded to it."""
-    properties = scene_graph.model_inspector().GetProximityProperties
-    return {
-        index: [
-            shape
-            for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index))
-            if properties(shape) is not None
-        ]
-        for index in BodiesWeldedToTool(plant, tool)
-    }
+    inspector, shapes = scene_graph.model_inspector(), dict[BodyIndex, list[GeometryId]]()
+    for index in BodiesWeldedToTool(plant, tool):
+        own = plant.GetCollisionGeometriesForBody(plant.get_body(index))
+        shapes[index] = [x for x in own if inspector.GetProximityProperties(x) is not None]
+    return shapes
 
 
 def ExcludeContact(
@@ -147,16 +143,12 @@ def ExcludeContact(
     shapes: Iterable[GeometryId],
     bodies: Iterable[BodyIndex],
 ) -> None:
-    others = [
-        shape
-        for body in bodies
-        for shape in plant.GetCollisionGeometriesForBody(plant.get_body(body))
-    ]
-    if not others:
-        return
-    sets = GeometrySet(list(shapes)), GeometrySet(others)
-    between = CollisionFilterDeclaration().ExcludeBetween(*sets)
-    scene_graph.collision_filter_manager().Apply(between)
+    shapes_of = plant.GetCollisionGeometriesForBody
+    others = [shape for body in bodies for shape in shapes_of(plant.get_body(body))]
+    if others:
+        sets = GeometrySet(list(shapes)), GeometrySet(others)
+        between = CollisionFilterDeclaration().ExcludeBetween(*sets)
+        scene_graph.collision_filter_manager().Apply(between)
 
 
 def ContactMaterial(stiffness: float, dissipation: float, friction: float) -> ProximityProperties:

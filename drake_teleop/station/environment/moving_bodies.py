@@ -45,15 +45,13 @@ def MakeJointTableAndRowBodies(
     parent) and 14-20 X_MB, a quaternion and a position each. Parents precede children.
     """
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
-    above: dict[int, tuple[int, int]] = {}
-    anchored: set[int] = set()
+    above, anchored, order = dict[int, tuple[int, int]](), set[int](), list[int]()
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         child, parent = int(joint.child_body().index()), int(joint.parent_body().index())
         above[child] = int(index), parent
         if plant.IsAnchored(joint.parent_body()):
             anchored.add(parent)
-    order: list[int] = []
     for body in bodies:
         chain, number = [], int(body)
         while number not in order and number not in anchored:
@@ -94,8 +92,7 @@ def poses_and_twists_into(joints, state, out):
     returns `joints`.
     """
     still = (0.0, 0.0, 0.0)
-    for k in range(joints.shape[0]):
-        row = joints[k]
+    for k, row in enumerate(joints):
         turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
         if row[_PARENT_ROW_COLUMN] >= 0.0:
             above = out[int(row[_PARENT_ROW_COLUMN])]
@@ -120,8 +117,7 @@ def poses_and_twists_into(joints, state, out):
             speed = plus(plus(speed, cross(spin, lever)), scale_vector(state[v], axis))
         elif kind == _FREE_JOINT:
             lever = rotate_vector(turn, vector_at(state, q + 4))
-            place = plus(place, lever)
-            speed = plus(speed, cross(spin, lever))
+            place, speed = plus(place, lever), plus(speed, cross(spin, lever))
             speed = plus(speed, rotate_vector(turn, vector_at(state, v + 3)))
             spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
             turn = quaternion_product(turn, normalized_quaternion(quaternion_at(state, q)))
@@ -155,8 +151,7 @@ def interpolate_joint_state(joints, h, u, start, end, out):
     `start` and `end` are the plant's states at both ends; `MakeJointTableAndRowBodies` returns
     `joints`.
     """
-    for k in range(joints.shape[0]):
-        row = joints[k]
+    for row in joints:
         q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])
         kind = row[_JOINT_TYPE_COLUMN]
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):

@@ -77,15 +77,12 @@ class SheetSpring(environment.Environment):
         plant.WeldFrames(plant.world_frame(), base, RigidTransform(self.position))
         bending = plant.GetJointByName("bending", instance)
         bending.set_default_damping(self.damping)
-        plant.AddForceElement(
-            PrismaticSpring(bending, nominal_position=0.0, stiffness=self.stiffness)
-        )
+        plant.AddForceElement(PrismaticSpring(bending, 0.0, self.stiffness))
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        leaf = plant.GetBodyByName("leaf")
         tool_bodies = environment.BodiesWeldedToTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
-        shapes = plant.GetCollisionGeometriesForBody(leaf)
+        shapes = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("leaf"))
         environment.ExcludeContact(plant, scene_graph, shapes, others)

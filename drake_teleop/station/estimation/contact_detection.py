@@ -79,12 +79,10 @@ class ContactDetection(LeafSystem):
         self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel | None, period: float
     ) -> None:
         super().__init__()
+        threshold = floor.threshold(config.statistic, config.margin)
+        hold, following = round(config.hold / period), period / config.drift_time
         self._settings = ContactDetector(
-            floor,
-            floor.threshold(config.statistic, config.margin),
-            statistic=config.statistic,
-            hold=round(config.hold / period),
-            following=period / config.drift_time,
+            floor, threshold, statistic=config.statistic, hold=hold, following=following
         ).settings
         self._sample = self._declare_sample_ports(arm)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)

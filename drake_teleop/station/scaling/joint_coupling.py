@@ -35,21 +35,19 @@ class JointCoupling(LeafSystem):
     def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
         super().__init__()
         if len(home) != len(start):
-            raise DrakeTeleopError(
-                f"the leader has {len(home)} joints, but the slave {len(start)} (they must agree)",
-                where="master.leader.leads",
-                remedy="set leads: pose, or give arms of the same kinematics",
+            what = (
+                f"the leader has {len(home)} joints, but the slave {len(start)} (they must agree)"
             )
+            remedy = "set leads: pose, or give arms of the same kinematics"
+            raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
         self._state = self.DeclareVectorInputPort("master_state", 2 * n)
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
         self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
         sources = {self._state.ticket(), self.xd_ticket()}
-        for name, size, calc in (
-            ("leader_joints", n, self._calc_joints),
-            ("pose_command", 7, self._calc_pose),
-        ):
-            self.DeclareVectorOutputPort(name, size, weak_callback(calc), sources)
+        joints, pose = weak_callback(self._calc_joints), weak_callback(self._calc_pose)
+        self.DeclareVectorOutputPort("leader_joints", n, joints, sources)
+        self.DeclareVectorOutputPort("pose_command", 7, pose, sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_held_joints_and_clutch)
         self.DeclareInitializationDiscreteUpdateEvent(self._update_held_joints_and_clutch)
 

@@ -69,6 +69,10 @@ from drake_teleop.station.sensor.sensor_chain import (
 
 _NAME_IN_ERRORS = "AddWristSensor"
 _DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
+# Output ports of a plant that the sensor reads, with the type of their elements.
+_PLANT_PORT_TYPES = {"body_poses": RigidTransform, "body_spatial_velocities": SpatialVelocity}
+_PLANT_PORT_TYPES |= {"body_spatial_accelerations": SpatialAcceleration}
+_PLANT_PORT_TYPES |= {"reaction_forces": SpatialForce}
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
 _SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
@@ -108,14 +112,9 @@ def AddWristSensor(
     sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
-    for port, source in {
-        "state": state,
-        "body_poses": plant.get_body_poses_output_port(),
-        "body_spatial_velocities": plant.get_body_spatial_velocities_output_port(),
-        "body_spatial_accelerations": plant.get_body_spatial_accelerations_output_port(),
-        "reaction_forces": plant.get_reaction_forces_output_port(),
-    }.items():
-        builder.Connect(source, sensor.GetInputPort(port))
+    builder.Connect(state, sensor.GetInputPort("state"))
+    for port in _PLANT_PORT_TYPES:
+        builder.Connect(plant.GetOutputPort(port), sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
         block_s = SAMPLES_PER_NOISE_BLOCK * sensor.period
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
@@ -185,12 +184,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states(*which))
         self._poses, self._velocities, self._accelerations, self._reactions = (
             self.DeclareAbstractInputPort(name, AbstractValue.Make([kind()]))
-            for name, kind in (
-                ("body_poses", RigidTransform),
-                ("body_spatial_velocities", SpatialVelocity),
-                ("body_spatial_accelerations", SpatialAcceleration),
-                ("reaction_forces", SpatialForce),
-            )
+            for name, kind in _PLANT_PORT_TYPES.items()
         )
         noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self._noise = noise

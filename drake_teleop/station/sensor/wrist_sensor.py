@@ -125,30 +125,22 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
     copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
-    sample = memory[:size]
+    sample, flag = memory[:size], regressor.SATURATION_FLAG_INDEX
     copy_into(memory, size, memory, 0, size)
     if not sensor_chain.are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[regressor.SATURATION_FLAG_INDEX] = (
-            regressor.LOST_SAMPLE_FLAG + sensor_chain.LOST_READING_FLAG_SAMPLES
-        )
+        sample[flag] = regressor.LOST_SAMPLE_FLAG + sensor_chain.LOST_READING_FLAG_SAMPLES
         return
-    lost = sample[regressor.SATURATION_FLAG_INDEX] - 1.0
+    lost = sample[flag] - 1.0
     if ideal:
         copy_into(sample, 0, truth, 0, regressor.SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[regressor.SATURATION_FLAG_INDEX] = 0.0
-        copy_into(
-            sample,
-            regressor.SAMPLE_JOINT_POSITION.start,
-            truth,
-            sensor_chain.TRUE_JOINT_ANGLES.start,
-            n,
-        )
+        sample[flag] = 0.0
+        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, x, 0, n)
     else:
         reading = np.empty(13 + n)
         sensor_chain.read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
         estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
     if lost >= regressor.LOST_SAMPLE_FLAG:
-        sample[regressor.SATURATION_FLAG_INDEX] = lost
+        sample[flag] = lost
 
 
 @njit(cache=True)
@@ -313,9 +305,8 @@ class WristSensor(LeafSystem):
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._uses_plant_contact = config.ideal or bool(contact.drake_contact_reason)
         # Contact needs many steps per torque sample, so queueing them saves time.
-        self._max_queued_steps = (
-            _MAX_QUEUED_PLANT_STEPS if slave.can_touch and not contact.drake_contact_reason else 1
-        )
+        queues = slave.can_touch and not contact.drake_contact_reason
+        self._max_queued_steps = _MAX_QUEUED_PLANT_STEPS if queues else 1
         self._around = np.zeros(2 + contact.plant_state_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
@@ -360,16 +351,14 @@ class WristSensor(LeafSystem):
         seen = (self._state, *pushes, *around, self._noise)
         tickets = {port.ticket() for port in seen if port is not None}
         tickets |= {self.time_ticket(), self.xd_ticket()}
-        self._step = self.DeclareVectorOutputPort(
-            "step", len(self._result), weak_callback(self._calc_step), tickets
-        )
+        calc = weak_callback(self._calc_step)
+        self._step = self.DeclareVectorOutputPort("step", len(self._result), calc, tickets)
         if self.reason_beyond_contact_law:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
-        self.DeclarePeriodicPublishEvent(
-            _ACCELERATION_CHECK_PERIOD_S, 0.0, self._check_acceleration_for_unknown_forces
-        )
+        check = self._check_acceleration_for_unknown_forces
+        self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_PERIOD_S, 0.0, check)
 
     @property
     def motion_dependent_state_indices(self) -> NDArray[np.intp]:
@@ -495,12 +484,10 @@ class WristSensor(LeafSystem):
         vdot = self._acceleration.Eval(context)
         error, size = np.abs(xdot[n + 1 : -1] - vdot).max(), np.abs(vdot).max()
         if not error < _ACCELERATION_CHECK_TOLERANCE * (1.0 + size):
-            raise DrakeTeleopError(
-                f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
-                "not receive it",
-                where="wrist_sensor.applied_wrench_W",
-                remedy="connect every wrench on the tool to this port",
-            )
+            what = "a force moves the slave, but the wrist sensor does not receive it"
+            what, where = f"at {context.get_time():g} s {what}", "wrist_sensor.applied_wrench_W"
+            remedy = "connect every wrench on the tool to this port"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         return EventStatus.Succeeded()
 
 

@@ -46,11 +46,9 @@ def ArmModelFromPlant(
     other joint moves on its links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
-        raise DrakeTeleopError(
-            f"the arm has no frame named {sensor_frame_name!r}",
-            where=plant.GetModelInstanceName(model_instance),
-            remedy="name the frame or link at which the sensor measures",
-        )
+        what, where = "the arm has no frame named", plant.GetModelInstanceName(model_instance)
+        remedy = "name the frame or link at which the sensor measures"
+        raise DrakeTeleopError(f"{what} {sensor_frame_name!r}", where=where, remedy=remedy)
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
     all_joints = map(plant.get_joint, plant.GetJointIndices())
     inboard_joints = {joint.child_body().index(): joint for joint in all_joints}
@@ -72,13 +70,9 @@ def ArmModelFromPlant(
     context = plant.CreateDefaultContext()
     # C rotates the joint's axis to z.
     C = [RigidTransform(RotationMatrix.MakeFromOneVector(_joint_axis(j), 2)) for j in joints]
-    X_WS = frame_S.CalcPoseInWorld(context)
-    X_WJ = [
-        j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)
-    ]
-    X_WL = [j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)]
-    X_WJ.append(X_WS)
-    X_WL.append(X_WS)
+    X_WS, pairs = frame_S.CalcPoseInWorld(context), list(zip(joints, C, strict=True))
+    X_WJ = [*(j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
+    X_WL = [*(j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
     for row, X_WP in enumerate([RigidTransform(), *X_WL[:-1]]):
         X_PJ = X_WP.InvertAndCompose(X_WJ[row])
         table[row, ROTATION_COLUMN:TRANSLATION_COLUMN] = X_PJ.rotation().matrix().ravel()
@@ -92,17 +86,12 @@ def ArmModelFromPlant(
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_about_link_origin(M_B, X_LB)
     lower, upper = np.array([_joint_position_limits(j) for j in joints]).T.copy()
-    return ArmModel(
-        joint_names=tuple(joint.name() for joint in joints),
-        table=table,
-        lower=lower,
-        upper=upper,
-        velocity_limit=np.array([j.velocity_upper_limits()[0] for j in joints]),
-        acceleration_limit=np.array([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=np.array(efforts),
-        position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
-        velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
-    )
+    speed = np.array([j.velocity_upper_limits()[0] for j in joints])
+    acceleration = np.array([j.acceleration_upper_limits()[0] for j in joints])
+    limits = lower, upper, speed, acceleration, np.array(efforts)
+    q_index = np.array([j.position_start() for j in joints], dtype=np.intp)
+    v_index = np.array([j.velocity_start() for j in joints], dtype=np.intp)
+    return ArmModel(tuple(joint.name() for joint in joints), table, *limits, q_index, v_index)
 
 
 def _joint_position_limits(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> tuple[float, float]:
@@ -110,10 +99,8 @@ def _joint_position_limits(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> t
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
-    return (
-        -np.inf if lower < -_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else lower,
-        np.inf if upper > _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else upper,
-    )
+    limit = _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M
+    return -np.inf if lower < -limit else lower, np.inf if upper > limit else upper
 
 
 def _joint_axis(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> Array:
@@ -201,12 +188,10 @@ def fill_missing_joint_limits(
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
-        raise DrakeTeleopError(
-            f"{np.array(arm.joint_names)[immovable][0]} cannot move: both of its limits are "
-            f"{arm.lower[immovable][0]:g} {unit}",
-            where=where,
-            remedy="correct the limits, or make the joint a fixed one",
-        )
+        name, limit = np.array(arm.joint_names)[immovable][0], arm.lower[immovable][0]
+        what = f"{name} cannot move: both of its limits are {limit:g} {unit}"
+        remedy = "correct the limits, or make the joint a fixed one"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     reach = _DEFAULT_JOINT_HALF_RANGE_M
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)

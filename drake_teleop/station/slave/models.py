@@ -188,13 +188,10 @@ def ParseTool(
         remedy = "give one tree of links; its root is welded to the sensor frame"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     with drake_errors.translate_drake_errors(path):
-        assumptions = [
-            *repaired.assumptions,
-            *chain_joints.weld_joints_outside_chain(plant, before, []),
-        ]
+        held_joints = chain_joints.weld_joints_outside_chain(plant, before, [])
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
-    return roots[0], assumptions
+    return roots[0], [*repaired.assumptions, *held_joints]
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> None:

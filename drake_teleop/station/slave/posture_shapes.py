@@ -131,11 +131,9 @@ class PostureShapes:
 
     def overlaps(self) -> list[Overlap]:
         """Return the pairs of overlapping bodies, except those that nearly always overlap."""
-        return [
-            Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
-            for (first, second), distance in self._body_pair_distances().items()
-            if (first, second) not in self._by_design
-        ]
+        found, body = self._body_pair_distances(), self.plant.get_body
+        pairs = [pair for pair in found if pair not in self._by_design]
+        return [Overlap(body(first), body(second), found[first, second]) for first, second in pairs]
 
     def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
         hulls = [hull for body in bodies for hull in self.hull_points_W(body)]
@@ -159,9 +157,8 @@ class PostureShapes:
 
     def _has_shapes(self, index: BodyIndex) -> bool:
         body, plant = self.plant.get_body(index), self.plant
-        return bool(
-            plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
-        )
+        shapes = plant.GetCollisionGeometriesForBody(body)
+        return bool(shapes or plant.GetVisualGeometriesForBody(body))
 
     def _body_pair_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
@@ -248,10 +245,8 @@ def overlap_warnings(shapes: PostureShapes, *, of_arm: bool = False) -> list[str
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:
             remedy = "move the object in environment, or give another start in slave.home"
-        found.append(
-            f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm at the start"
-            f" (convex hulls of meshes count); {remedy}"
-        )
+        what = f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm"
+        found.append(f"{what} at the start (convex hulls of meshes count); {remedy}")
     return found
 
 

@@ -81,12 +81,10 @@ class Scene(Environment):
         others = set(inspector.GetAllGeometryIds(geometry.Role.kProximity)) - set(own)
         materials = map(inspector.GetProximityProperties, others)
         if not any(map(has_hydroelastic_properties, materials)):
-            raise DrakeTeleopError(
-                "contact is hydroelastic, but no shape in the file is",
-                where=str(self.path),
-                remedy="give one drake:compliant_hydroelastic or drake:rigid_hydroelastic in its"
-                " drake:proximity_properties, or set contact: point",
-            )
+            what = "contact is hydroelastic, but no shape in the file is"
+            tags = "drake:compliant_hydroelastic or drake:rigid_hydroelastic"
+            remedy = f"give one {tags} in its drake:proximity_properties, or set contact: point"
+            raise DrakeTeleopError(what, where=str(self.path), remedy=remedy)
         for shape in own:
             material = geometry.ProximityProperties(inspector.GetProximityProperties(shape))
             if not has_hydroelastic_properties(material):

@@ -121,19 +121,15 @@ def MakeToolContactModel(
         from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
-        found = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
+        pairs = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
     except DrakeTeleopError as error:
         return contact._replace(drake_contact_reason=str(error))
-    if not len(found.compiled_pairs):
-        reason = found.monitoring_reason or "no shapes can touch"
-        return contact._replace(drake_contact_reason=reason)
+    compiled, monitored, reason = pairs
+    if not len(compiled):
+        return contact._replace(drake_contact_reason=reason or "no shapes can touch")
+    contact = contact._replace(compiled_pairs=compiled, monitored_pairs=monitored)
     size = plant.num_multibody_states() if len(joints) else 0
-    return contact._replace(
-        compiled_pairs=found.compiled_pairs,
-        monitored_pairs=found.monitored_pairs,
-        joint_table=joints,
-        plant_state_size=size,
-    )
+    return contact._replace(joint_table=joints, plant_state_size=size)
 
 
 def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
@@ -151,19 +147,13 @@ def MovingBodiesExceptLeaf(
     plant: MultibodyPlant, touched: AddedEnvironment
 ) -> dict[str, tree.BodyIndex]:
     """Return the moving bodies of the environment, except the leaf, by unique name."""
-    bodies = [
-        plant.get_body(index)
-        for instance in touched.instances
-        if instance != touched.leaf_instance
-        for index in plant.GetBodyIndices(instance)
-    ]
-    moving = [body for body in bodies if not plant.IsAnchored(body)]
-    names = [body.name() for body in moving]
-    return {
-        re.sub(r"\W+", "_", body.name() if names.count(body.name()) == 1 else full): body.index()
-        for body in moving
-        for full in [body.scoped_name().get_full()]
-    }
+    instances = [each for each in touched.instances if each != touched.leaf_instance]
+    indices = [index for instance in instances for index in plant.GetBodyIndices(instance)]
+    moving = [body for body in map(plant.get_body, indices) if not plant.IsAnchored(body)]
+    short = [body.name() for body in moving]
+    full = [body.scoped_name().get_full() for body in moving]
+    names = [s if short.count(s) == 1 else f for s, f in zip(short, full, strict=True)]
+    return {re.sub(r"\W+", "_", n): b.index() for n, b in zip(names, moving, strict=True)}
 
 
 def supports_pose_conversion(joint: tree.Joint) -> bool:

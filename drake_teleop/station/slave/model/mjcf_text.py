@@ -33,12 +33,9 @@ class MjcfText:
         SubElement(self._root, "compiler", angle="radian", autolimits="false")
         self._assets = SubElement(self._root, "asset")
         self._meshes: dict[tuple[int, bool], str] = {}
-        self._colours = {
-            element.get("name", ""): rgba
-            for element in mjcf.elements_in("asset")
-            if element.tag == "material"
-            and (rgba := mjcf.attributes_of(element, "", "material").get("rgba"))
-        }
+        read = mjcf.attributes_of
+        materials = [each for each in mjcf.elements_in("asset") if each.tag == "material"]
+        self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
 
     def write(self, world: Body, moving: list[Joint]) -> str:
         """Return the MJCF text of a world; the joints `moving` get actuators."""

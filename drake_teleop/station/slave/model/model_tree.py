@@ -147,6 +147,5 @@ def _remove_loop_constraints(
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
         if len(names) < 2 or len(groups) > 1:
-            report.add_fault(
-                f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
-            )
+            what = f"its links form a loop, by {element.tag}"
+            report.add_fault(f"{what}; model the chain to the sensor alone")

@@ -44,10 +44,8 @@ def repair_sdf(
     for model in root.findall("model"):
         model.set("name", model.get("name") or file.stem)
     report.raise_faults(file)
-    inner = [
-        _repair_included_file(uri, file, files, purpose, folder)
-        for uri in root.iterfind(".//include/uri")
-    ]
+    uris = root.iterfind(".//include/uri")
+    inner = [_repair_included_file(uri, file, files, purpose, folder) for uri in uris]
     mesh_folder = folder if purpose.plant_has_shapes else None
     own = urdf_repair.convert_meshes_and_write_text(root, file, files, report, mesh_folder)
     return merge_repaired_models(own.text, [own, *filter(None, inner)])
@@ -60,11 +58,9 @@ def _repair_included_file(
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, file, files)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
-        raise DrakeTeleopError(
-            f"includes {address!r}, which does not exist",
-            where=str(file),
-            remedy=f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}",
-        )
+        what = f"includes {address!r}, which does not exist"
+        remedy = f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}"
+        raise DrakeTeleopError(what, where=str(file), remedy=remedy)
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {".urdf": urdf_repair.repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():

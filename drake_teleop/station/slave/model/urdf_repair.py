@@ -111,13 +111,11 @@ def convert_meshes_and_write_text(
     for fault, links in lost.items():
         report.state_repair("shapes are missing of", f"{join_names(links)}: {fault}")
     report.raise_faults(file)
-    limits = {
-        joint.get("name", ""): model_numbers.parse_number(
-            limit.get("effort") or limit.findtext("effort") or "0"
-        )
-        for joint in root.iter("joint")
-        for limit in joint.iter("limit")
-    }
+    limits = dict[str, float]()
+    for joint in root.iter("joint"):
+        for limit in joint.iter("limit"):
+            effort = limit.get("effort") or limit.findtext("effort")
+            limits[joint.get("name", "")] = model_numbers.parse_number(effort or "0")
     text = ElementTree.tostring(root, encoding="unicode")
     limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
     return RepairedModel(text, report.assumptions, limits, find_dependence_reasons(root))
