@@ -250,9 +250,8 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     if constants.encoders_only != 0.0:
         copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        _convert_and_fuse_accelerometer(
-            constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample
-        )
+        gravity = arm[n, LAST_ROW_GRAVITY_COLUMN:]
+        _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample)
     memory[0] += 1.0
 
 

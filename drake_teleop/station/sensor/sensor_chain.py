@@ -394,9 +394,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     copy_into(reading, READ_WRENCH.start, memory, force, 6)
     copy_into(reading, READ_ACCELERATION.start, memory, acceleration + 6, 6)
-    reading[READ_SATURATED] = max(
-        memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
-    )
+    force_flag, acceleration_row = memory[force + _NUM_CHANNELS], acceleration + _NUM_CHANNELS
+    reading[READ_SATURATED] = max(force_flag, memory[acceleration_row + 1])
     encoders = _DELAY_LINE_START + int(late[2]) * width + _DELAY_LINE_ROW_SIZE
     copy_into(reading, READ_ANGLES.start, memory, encoders, angles.shape[0])
 

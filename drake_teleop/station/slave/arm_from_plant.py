@@ -62,10 +62,9 @@ def ArmModelFromPlant(
         table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
         table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, tree.PrismaticJoint)
-    gravity = plant.gravity_field()
-    table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = (
-        gravity.gravity_vector() * gravity.is_enabled(model_instance)
-    )
+    field = plant.gravity_field()
+    gravity = field.gravity_vector() * field.is_enabled(model_instance)
+    table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = gravity
 
     context = plant.CreateDefaultContext()
     # C rotates the joint's axis to z.

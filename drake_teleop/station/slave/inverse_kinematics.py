@@ -101,9 +101,8 @@ def _ik_status_and_all_solutions_into(
         for b in range(2):
             q3 = q3_up if b == 0 else -q3_up
             to_wrist = np.arctan2(-rho if a == 0 else rho, z)
-            q2 = to_wrist - np.arctan2(
-                FOREARM_LENGTH_M * np.sin(q3), UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M * np.cos(q3)
-            )
+            along = UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M * np.cos(q3)
+            q2 = to_wrist - np.arctan2(FOREARM_LENGTH_M * np.sin(q3), along)
             c, s = np.cos(q2 + q3), np.sin(q2 + q3)
             # M = Ry(q2 + q3) Rz(-q1) R = Rz(q4) Ry(-q5) Rz(q6)
             u = c1 * R[0, 2] + s1 * R[1, 2]

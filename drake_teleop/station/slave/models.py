@@ -9,12 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import (
-    FlattenModelDirectives,
-    LoadModelDirectives,
-    Parser,
-    ProcessModelDirectives,
-)
+from pydrake.multibody import parsing
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoint
 
@@ -54,7 +49,7 @@ def repair_and_parse_model(
         read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
     files = ModelFiles(path, package_paths)
     purpose = purpose._replace(plant_has_shapes=plant.geometry_source_is_registered())
-    parser = Parser(plant)
+    parser = parsing.Parser(plant)
     parser.SetAutoRenaming(True)
     files.merge_packages_with_map(parser.package_map())
     files.check_referenced_files(path)
@@ -77,7 +72,7 @@ def repair_and_parse_model(
 
 
 def _add_repaired_file(
-    parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     repaired = _repair_file(path, files, purpose, folder)
     with drake_errors.raise_logged_errors():
@@ -90,10 +85,12 @@ def _add_repaired_file(
 
 
 def _add_files_of_directives(
-    parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     with drake_errors.raise_logged_errors():
-        directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
+        directives = parsing.FlattenModelDirectives(
+            parsing.LoadModelDirectives(str(path)), parser.package_map()
+        )
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
     for added in (each.add_model for each in directives.directives if each.add_model):
         file = files.find_file(added.file)
@@ -106,7 +103,7 @@ def _add_files_of_directives(
             copy.write_text(repaired[file].text, encoding="utf-8")
             added.file = f"file://{copy}"
     with drake_errors.raise_logged_errors():
-        models = ProcessModelDirectives(directives, parser)
+        models = parsing.ProcessModelDirectives(directives, parser)
     return [each.model_instance for each in models], list(repaired.values())
 
 
@@ -158,9 +155,8 @@ def ParseModel(
         limits = repaired.effort_limits if repaired.text else None
         chain_joints.set_one_actuator_per_joint(plant, chain, limits)
         rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
-    instances = {
-        plant.get_joint(k).model_instance() for k in chain if chain_joints.is_joint_moving(plant, k)
-    }
+    moving = [k for k in chain if chain_joints.is_joint_moving(plant, k)]
+    instances = {plant.get_joint(index).model_instance() for index in moving}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
         what = f"the joints up to the sensor belong to several models, {', '.join(names)}"

@@ -10,20 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import (
-    Capsule,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    GeometryId,
-    HalfSpace,
-    Mesh,
-    Role,
-    SceneGraph,
-    SceneGraphInspector,
-    Sphere,
-)
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
@@ -286,20 +274,23 @@ def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
         joint.set_position_limits(lower, upper)
 
 
-def _remove_visual_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def _remove_visual_shapes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
     for index in range(plant.num_bodies()):
         for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
             scene_graph.RemoveGeometry(plant.get_source_id(), shape)
 
 
 def _remove_arm_collisions(
-    plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
+    plant: MultibodyPlant,
+    scene_graph: geometry.SceneGraph,
+    arm: ModelInstanceIndex,
+    load: list[RigidBody],
 ) -> None:
     carried = {body.index() for body in load}
     for index in plant.GetBodyIndices(arm):
         for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
             if index not in carried:
-                scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
+                scene_graph.RemoveRole(plant.get_source_id(), shape, geometry.Role.kProximity)
 
 
 def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
@@ -316,35 +307,37 @@ def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
     return hulls
 
 
-def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+def hull_points_of(
+    inspector: geometry.SceneGraphInspector, identifier: geometry.GeometryId
+) -> Array:
     """Return points (k, 3) on the convex hull of a shape, in its body's frame [m].
 
     A half space has none, a round shape those of a polyhedron in it.
     """
-    shape = inspector.GetShape(geometry)
-    if isinstance(shape, (Mesh, Convex)):
+    shape = inspector.GetShape(identifier)
+    if isinstance(shape, (geometry.Mesh, geometry.Convex)):
         hull = shape.GetConvexHull()
         points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
-    elif isinstance(shape, Sphere):
+    elif isinstance(shape, geometry.Sphere):
         points = shape.radius() * _unit_sphere_points()
-    elif isinstance(shape, Ellipsoid):
+    elif isinstance(shape, geometry.Ellipsoid):
         points = _unit_sphere_points() * [shape.a(), shape.b(), shape.c()]
-    elif isinstance(shape, Capsule):
+    elif isinstance(shape, geometry.Capsule):
         end = [0.0, 0.0, shape.length() / 2]
         ball = shape.radius() * _unit_sphere_points()
         points = np.vstack([ball - end, ball + end])
-    elif isinstance(shape, Cylinder):
+    elif isinstance(shape, geometry.Cylinder):
         rim = _unit_sphere_points()[_NUM_CIRCLE_POINTS : 2 * _NUM_CIRCLE_POINTS] * [1.0, 1.0, 0.0]
         rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
         end = [0.0, 0.0, shape.length() / 2]
         points = np.vstack([rim - end, rim + end])
-    elif isinstance(shape, HalfSpace):
+    elif isinstance(shape, geometry.HalfSpace):
         return np.zeros((0, 3))
     else:
-        box = inspector.GetObbInGeometryFrame(geometry)
+        box = inspector.GetObbInGeometryFrame(identifier)
         corners = np.array(list(product((-1.0, 1.0), repeat=3)))
         points = (box.pose() @ (corners * box.half_width()).T).T
-    return (inspector.GetPoseInFrame(geometry) @ points.T).T
+    return (inspector.GetPoseInFrame(identifier) @ points.T).T
 
 
 def _unit_sphere_points() -> Array:

@@ -13,18 +13,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.geometry import (
-    Capsule,
-    CollisionFilterDeclaration,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    GeometryId,
-    GeometrySet,
-    ProximityProperties,
-    Role,
-    SceneGraph,
-)
+from pydrake import geometry
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RigidBody
@@ -107,7 +96,7 @@ class PostureShapes:
             what = "overlaps left out, as they are in nearly all postures:"
             self.assumptions.append(f"{what} {join_names(sorted(names))}")
 
-    def contact_shapes_of(self, body: BodyIndex) -> list[GeometryId]:
+    def contact_shapes_of(self, body: BodyIndex) -> list[geometry.GeometryId]:
         inspector = self._scene_graph.model_inspector()
         shapes = self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
         return [each for each in shapes if inspector.GetProximityProperties(each) is not None]
@@ -196,7 +185,9 @@ class PostureShapes:
             together.append(joined)
         for bodies in together:
             shapes = [shape for each in bodies for shape in self.contact_shapes_of(each)]
-            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(shapes)))
+            manager.Apply(
+                geometry.CollisionFilterDeclaration().ExcludeWithin(geometry.GeometrySet(shapes))
+            )
 
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
@@ -250,7 +241,9 @@ def overlap_warnings(shapes: PostureShapes, *, of_arm: bool = False) -> list[str
     return found
 
 
-def _complete_and_bound_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def _complete_and_bound_collision_shapes(
+    plant: MultibodyPlant, scene_graph: geometry.SceneGraph
+) -> None:
     """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
@@ -259,16 +252,18 @@ def _complete_and_bound_collision_shapes(plant: MultibodyPlant, scene_graph: Sce
     added = []  # afterwards, because Drake's lists move when shapes are added
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
         solids = plant.GetCollisionGeometriesForBody(body)
-        for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
-            shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
-            is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
+        for k, identifier in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
+            shape, box = inspector.GetShape(identifier), inspector.GetObbInGeometryFrame(identifier)
+            is_curved = isinstance(shape, (geometry.Capsule, geometry.Cylinder, geometry.Ellipsoid))
             is_limited = box is not None and max(box.half_width()) < _MAX_COLLISION_SHAPE_SIZE_M
-            here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
+            here, name = RigidTransform(inspector.GetPoseInFrame(identifier)), f"solid_{k}"
             if is_curved:
-                shape = Convex(here.inverse() @ hull_points_of(inspector, geometry).T, name)
+                shape = geometry.Convex(
+                    here.inverse() @ hull_points_of(inspector, identifier).T, name
+                )
             if is_limited and (is_curved or not solids):
                 added.append((body, here, shape.Clone(), f"{body.name()}_{name}"))
             if solids and (is_curved or not is_limited):
-                scene_graph.RemoveRole(source, geometry, Role.kProximity)
+                scene_graph.RemoveRole(source, identifier, geometry.Role.kProximity)
     for each in added:
-        plant.RegisterCollisionGeometry(*each, ProximityProperties())
+        plant.RegisterCollisionGeometry(*each, geometry.ProximityProperties())

@@ -90,9 +90,8 @@ class Scene(Environment):
             if not has_hydroelastic_properties(material):
                 mesh_edge = _TOOL_BALL_MESH_EDGE_M
                 geometry.AddCompliantHydroelasticProperties(mesh_edge, self.tool_modulus, material)
-                scene_graph.AssignRole(
-                    plant.get_source_id(), shape, material, geometry.RoleAssign.kReplace
-                )
+                replace = geometry.RoleAssign.kReplace
+                scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)
 
 
 def has_hydroelastic_properties(properties: geometry.ProximityProperties) -> bool:

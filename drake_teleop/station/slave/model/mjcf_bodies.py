@@ -215,9 +215,8 @@ class BodyReader:
         if "fullinertia" in given:
             xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return mjcf_meshes.MassProperties(mass, np.zeros(3), inertia).in_frame(
-            self._mjcf.read_pose(given)
-        )
+        about_centre = mjcf_meshes.MassProperties(mass, np.zeros(3), inertia)
+        return about_centre.in_frame(self._mjcf.read_pose(given))
 
     def mass_properties_of_body(self, body: Body) -> mjcf_meshes.MassProperties:
         """Return the body's mass properties from its `inertial` element, or from its shapes."""
@@ -233,9 +232,8 @@ class BodyReader:
             inertia = (axes * np.maximum(moments, bound)) @ axes.T
         if compiler.get("balanceinertia") == "true" and nearest_possible_inertia(inertia)[1]:
             inertia = np.eye(3) * np.trace(inertia) / 3
-        return mjcf_meshes.MassProperties(
-            max(mass, compiler.number("boundmass", 0.0)), centre, inertia
-        )
+        mass = max(mass, compiler.number("boundmass", 0.0))
+        return mjcf_meshes.MassProperties(mass, centre, inertia)
 
     def _mass_properties_of_geom(self, geom: Geom) -> mjcf_meshes.MassProperties:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))

@@ -219,9 +219,8 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
 
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     gear = abs(given.numbers("gear", (1.0,))[0])
-    force = _effort_limit_in_both_directions(
-        given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
-    )
+    limits = given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
+    force = _effort_limit_in_both_directions(limits)
     if (gain := _effort_per_control_unit(given, tag)) > 0.0:
         control = given.read_range("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
         force = min(force, gain * _effort_limit_in_both_directions(control))

@@ -92,9 +92,8 @@ def repair_links_and_joints(
             for part in [link] if purpose.is_scene else link.findall("inertial"):
                 model_numbers.check_lengths_and_inertias(part, f"link {name}", report)
             at_rest = num_joints_to_link.get(name) == 0
-            is_massless = model_numbers.repair_inertia_and_detect_missing(
-                link, report, is_sdf=is_sdf, at_rest=at_rest
-            )
+            repair = model_numbers.repair_inertia_and_detect_missing
+            is_massless = repair(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
                 report.state_assumption("no inertia of", name)
 
