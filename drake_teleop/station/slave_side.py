@@ -111,9 +111,8 @@ def MakeSlaveSide(
     max_age_s = max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz)
     scaling = ForceScaling(scenario.force_scaling, arm, R_WB, largest, max_age_s)
     force_scaling = builder.AddNamedSystem("force_scaling", scaling)
-    estimate = body.load_estimator.GetOutputPort("load_estimate")
-    builder.Connect(body.sample_ports["sample"], force_scaling.GetInputPort("sample"))
-    builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
+    estimate = {"load_estimate": body.load_estimator.GetOutputPort("load_estimate")}
+    connect_matching_inputs(builder, force_scaling, body.sample_ports | estimate)
     export_outputs(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _has_load_estimate(scenario, load_estimate):
         export_outputs(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
@@ -137,8 +136,7 @@ def MakeSlaveSide(
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
         builder.AddNamedSystem("contact_detection", detection)
-        builder.Connect(body.sample_ports["sample"], detection.GetInputPort("sample"))
-        builder.Connect(estimate, detection.GetInputPort("load_estimate"))
+        connect_matching_inputs(builder, detection, body.sample_ports | estimate)
         export_outputs(builder, detection, "contact")
     return builder.Build()
 

@@ -29,9 +29,7 @@ class ContactDetectionConfig:
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
     drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the offset in free motion")
-    recovery: float = quantity(
-        5e-3, "s", 0.0, 1.0, "recovery time of the low-pass after a saturation"
-    )
+    recovery: float = quantity(5e-3, "s", 0.0, 1.0, "recovery of the low-pass after a saturation")
 
 
 @njit(cache=True)

@@ -72,9 +72,7 @@ class ForceScalingConfig:
         *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
         length=10,
     )
-    force_scale: float = quantity(
-        1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
-    )
+    force_scale: float = quantity(1 / 17.5, "1", 0.0, 100.0, "wrench scale, slave to master (VI-B)")
     sigma_weight: float | None = quantity(
         None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
     )

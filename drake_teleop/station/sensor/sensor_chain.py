@@ -57,8 +57,7 @@ PRESET_NAMES = (
 _LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
 _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_TOLERANCE = 1e-6
-# Overload limit in ranges.
-_PLAUSIBLE_RANGES_UNSATURATED = 10.0
+_PLAUSIBLE_RANGES_UNSATURATED = 10.0  # overload limit in ranges
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
 _PLAUSIBLE_RANGES_SATURATED = 1.5
 
@@ -120,9 +119,7 @@ class WristSensorConfig:
 
     saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
     force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "range of fx, fy, fz")
-    torque_range: list[float] = quantity(
-        [12.0, 12.0, 12.0], "N m", 0.01, 1e4, "range of tx, ty, tz about So"
-    )
+    torque_range: list[float] = quantity([12.0] * 3, "N m", 0.01, 1e4, "range of tx, ty, tz at So")
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 

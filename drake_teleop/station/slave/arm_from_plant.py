@@ -208,22 +208,17 @@ def fill_missing_joint_limits(
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
+    turning_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s"
+    sliding_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s"
+    in_rad = f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,"
     rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
         (unlimited, "turns without end", f"a range of +-{reach:g} m"),
         (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
-        (
-            ~_is_positive_and_finite(arm.velocity_limit),
-            f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s",
-            f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s",
-        ),
+        (~_is_positive_and_finite(arm.velocity_limit), turning_speed, sliding_speed),
         (~_is_positive_and_finite(specified), rate_text, rate_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
-        (
-            ~plausible,
-            f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,",
-            "",
-        ),
+        (~plausible, in_rad, ""),
     ):
         for text, kind in ((revolute_text, ~slides), (prismatic_text, slides)):
             assumed = missing & kind

@@ -221,9 +221,8 @@ def assume_rotor_inertias(
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
     for joint in (joint for joint in joints if joint.index() in motor):
-        if motor[joint.index()].default_reflected_inertia() > 0.0:
-            continue
-        if _carries_inertia(plant, joint, auxiliary_bodies):
+        has_rotor = motor[joint.index()].default_reflected_inertia() > 0.0
+        if has_rotor or _carries_inertia(plant, joint, auxiliary_bodies):
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())

@@ -38,8 +38,7 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
-# Largest error that is rounding only [m].
-_POSE_ROUNDING_ERROR_M = 1e-14
+_POSE_ROUNDING_ERROR_M = 1e-14  # largest error that is rounding only [m]
 MIN_SINGULAR_VALUE_M = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
 MAX_SOLVER_STEPS_PER_COMMAND = 10
@@ -48,10 +47,8 @@ MAX_SOLVER_STEPS_PER_COMMAND = 10
 _MIN_STEP_DAMPING_M2 = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-3, 100, 100
-# Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_ZERO_GRADIENT_RATIO_M = 1e-3
-# Error below which out of reach and singular are indistinguishable [m].
-_UNREACHED_ERROR_M = 5e-6
+_ZERO_GRADIENT_RATIO_M = 1e-3  # ratio |J^T e| / |e| below which the gradient counts as zero [m]
+_UNREACHED_ERROR_M = 5e-6  # error below which out of reach and singular are indistinguishable [m]
 # The same tolerance for `find_posture`, which stops the search earlier [m].
 _SEARCH_UNREACHED_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].

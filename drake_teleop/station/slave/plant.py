@@ -318,25 +318,22 @@ def hull_points_of(
     if isinstance(shape, (geometry.Mesh, geometry.Convex)):
         hull = shape.GetConvexHull()
         points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
-    elif isinstance(shape, geometry.Sphere):
+    elif isinstance(shape, (geometry.Sphere, geometry.Capsule)):
         points = shape.radius() * _unit_sphere_points()
     elif isinstance(shape, geometry.Ellipsoid):
         points = _unit_sphere_points() * [shape.a(), shape.b(), shape.c()]
-    elif isinstance(shape, geometry.Capsule):
-        end = [0.0, 0.0, shape.length() / 2]
-        ball = shape.radius() * _unit_sphere_points()
-        points = np.vstack([ball - end, ball + end])
     elif isinstance(shape, geometry.Cylinder):
         rim = _unit_sphere_points()[_NUM_CIRCLE_POINTS : 2 * _NUM_CIRCLE_POINTS] * [1.0, 1.0, 0.0]
-        rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
-        end = [0.0, 0.0, shape.length() / 2]
-        points = np.vstack([rim - end, rim + end])
+        points = rim * (shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True))
     elif isinstance(shape, geometry.HalfSpace):
         return np.zeros((0, 3))
     else:
         box = inspector.GetObbInGeometryFrame(identifier)
         corners = np.array(list(product((-1.0, 1.0), repeat=3)))
         points = (box.pose() @ (corners * box.half_width()).T).T
+    if isinstance(shape, (geometry.Capsule, geometry.Cylinder)):
+        end = [0.0, 0.0, shape.length() / 2]
+        points = np.vstack([points - end, points + end])
     return (inspector.GetPoseInFrame(identifier) @ points.T).T
 
 

@@ -22,8 +22,7 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 # Memory of the servo: periods since the last command, index of the oldest command in the queue;
 # then target, r and dr/dt (n each), and the queue of commands.
 _PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
-# Braking v^2 = 2 a d with 80 % of the largest acceleration.
-_TWICE_BRAKING_SHARE = 2 * 0.8
+_TWICE_BRAKING_SHARE = 2 * 0.8  # braking v^2 = 2 a d with 80 % of the largest acceleration
 
 
 @settings
@@ -43,9 +42,7 @@ class PositionInterface:
     max_acceleration: float = quantity(
         40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
     )
-    drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "of the drives; sets joint stiffness"
-    )
+    drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "of drives; sets joint stiffness")
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
