@@ -20,6 +20,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
+from drake_teleop.station.slave import home
 from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, pose_into
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
@@ -29,11 +30,6 @@ from drake_teleop.station.slave.arm_from_plant import (
 )
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import (
-    R_WS_HOME,
-    check_inertia_and_holding_torque,
-    find_start_posture,
-)
 from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
@@ -130,7 +126,7 @@ def start_pose(slave: Slave) -> Array:
     """Return X_WS [qw qx qy qz px py pz] at the start, from `slave.home` or `slave.position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
-    return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
+    return np.array([*home.R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
@@ -186,9 +182,9 @@ def AddSlavePlant(
         _remove_arm_collisions(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
-    start = find_start_posture(slave, arm) if q_start is None else q_start
+    start = home.find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
-        check_inertia_and_holding_torque(arm, start)
+        home.check_inertia_and_holding_torque(arm, start)
     friction = values_per_joint(arm, slave.friction, "slave.friction", 0.0)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())

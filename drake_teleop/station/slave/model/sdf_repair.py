@@ -6,18 +6,13 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model import urdf_repair
+from drake_teleop.station.slave.model import repair_report, urdf_repair
 from drake_teleop.station.slave.model.model_references import (
     PACKAGE_FOLDER_SETTINGS,
     ModelFiles,
     read_xml,
 )
 from drake_teleop.station.slave.model.model_tree import link_of_frame
-from drake_teleop.station.slave.model.repair_report import (
-    RepairedModel,
-    RepairReport,
-    merge_repaired_models,
-)
 
 # Children that Drake reads; it also reads elements with its own prefix.
 _CHILD_TAGS_READ_BY_DRAKE = {
@@ -30,9 +25,9 @@ _CHILD_TAGS_READ_BY_DRAKE = {
 
 def repair_sdf(
     root: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
-) -> RepairedModel:
+) -> repair_report.RepairedModel:
     """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
-    report = RepairReport(strict=purpose.is_scene)
+    report = repair_report.RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
         _keep_model_with_sensor(root, file, files, purpose.sensor_name, report)
         for element in list(root.iter()):
@@ -48,12 +43,12 @@ def repair_sdf(
     inner = [_repair_included_file(uri, file, files, purpose, folder) for uri in uris]
     mesh_folder = folder if purpose.plant_has_shapes else None
     own = urdf_repair.convert_meshes_and_write_text(root, file, files, report, mesh_folder)
-    return merge_repaired_models(own.text, [own, *filter(None, inner)])
+    return repair_report.merge_repaired_models(own.text, [own, *filter(None, inner)])
 
 
 def _repair_included_file(
     uri: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
-) -> RepairedModel | None:
+) -> repair_report.RepairedModel | None:
     """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, file, files)
@@ -83,7 +78,7 @@ def _find_included_model_file(address: str, file: Path, files: ModelFiles) -> Pa
 
 
 def _keep_model_with_sensor(
-    root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
+    root: Element, file: Path, files: ModelFiles, sensor: str, report: repair_report.RepairReport
 ) -> None:
     worlds = root.findall("world")
     children = [child for scope in (root, *worlds) for child in scope]
