@@ -67,8 +67,10 @@ def ArmModelFromPlant(
     table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = gravity
 
     context = plant.CreateDefaultContext()
+    sliding = tree.PrismaticJoint
+    axes = [j.translation_axis() if isinstance(j, sliding) else j.revolute_axis() for j in joints]
     # C rotates the joint's axis to z.
-    C = [RigidTransform(RotationMatrix.MakeFromOneVector(_joint_axis(j), 2)) for j in joints]
+    C = [RigidTransform(RotationMatrix.MakeFromOneVector(axis, 2)) for axis in axes]
     X_WS, pairs = frame_S.CalcPoseInWorld(context), list(zip(joints, C, strict=True))
     X_WJ = [*(j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
     X_WL = [*(j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
@@ -100,12 +102,6 @@ def _joint_position_limits(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> t
         return -np.inf, np.inf
     limit = _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M
     return -np.inf if lower < -limit else lower, np.inf if upper > limit else upper
-
-
-def _joint_axis(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> Array:
-    slides = isinstance(joint, tree.PrismaticJoint)
-    axis: Array = joint.translation_axis() if slides else joint.revolute_axis()
-    return axis
 
 
 def _moving_joints_to_sensor(

@@ -19,14 +19,10 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, forward_kinematics
 
-SHOULDER_HEIGHT_M = 0.420
-"""Base to shoulder [m]."""
-UPPER_ARM_LENGTH_M = 0.450
-"""Shoulder to elbow [m]."""
-FOREARM_LENGTH_M = 0.450
-"""Elbow to wrist centre [m]."""
-WRIST_TO_S_M = 0.085
-"""Wrist centre to the origin of S, along z_S [m]."""
+#: Base to shoulder [m]; shoulder to elbow [m].
+SHOULDER_HEIGHT_M, UPPER_ARM_LENGTH_M = 0.420, 0.450
+#: Elbow to wrist centre [m]; wrist centre to the origin of S, along z_S [m].
+FOREARM_LENGTH_M, WRIST_TO_S_M = 0.450, 0.085
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
 _MAX_SINGULAR_DISTANCE_OR_SIN_Q5 = 1e-9

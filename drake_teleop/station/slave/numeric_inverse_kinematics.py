@@ -80,16 +80,12 @@ def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
 @njit(cache=True)
 def _smaller_gram_matrix_into(J, H):
     n = H.shape[0]
-    rows = n == J.shape[1]
+    A = J if n == J.shape[1] else J.T
     for i in range(n):
         for k in range(i + 1):
             value = 0.0
-            if rows:
-                for m in range(6):
-                    value += J[m, i] * J[m, k]
-            else:
-                for m in range(J.shape[1]):
-                    value += J[i, m] * J[k, m]
+            for m in range(A.shape[0]):
+                value += A[m, i] * A[m, k]
             H[i, k] = H[k, i] = value
 
 

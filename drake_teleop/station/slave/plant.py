@@ -177,9 +177,9 @@ def AddSlavePlant(
         finalize_without_limit_warnings(plant)
     contact = ToolContactModel()
     if environment is not None and surroundings is not None:
-        _remove_visual_shapes(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_arm_collisions(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
+        load = bodies_carried_by(plant, frame.body())
+        _remove_shapes_without_contact(plant, scene_graph, instance, load)
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = home.find_start_posture(slave, arm) if q_start is None else q_start
@@ -270,23 +270,20 @@ def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
         joint.set_position_limits(lower, upper)
 
 
-def _remove_visual_shapes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
-    for index in range(plant.num_bodies()):
-        for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
-            scene_graph.RemoveGeometry(plant.get_source_id(), shape)
-
-
-def _remove_arm_collisions(
+def _remove_shapes_without_contact(
     plant: MultibodyPlant,
-    scene_graph: geometry.SceneGraph,
+    scene: geometry.SceneGraph,
     arm: ModelInstanceIndex,
     load: list[RigidBody],
 ) -> None:
-    carried = {body.index() for body in load}
-    for index in plant.GetBodyIndices(arm):
-        for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
-            if index not in carried:
-                scene_graph.RemoveRole(plant.get_source_id(), shape, geometry.Role.kProximity)
+    source, carried = plant.get_source_id(), {body.index() for body in load}
+    for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
+        for shape in plant.GetVisualGeometriesForBody(body):
+            scene.RemoveGeometry(source, shape)
+    own = [index for index in plant.GetBodyIndices(arm) if index not in carried]
+    for body in map(plant.get_body, own):
+        for shape in plant.GetCollisionGeometriesForBody(body):
+            scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
 def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
