@@ -73,11 +73,6 @@ _DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
 _PLANT_PORT_TYPES = {"body_poses": RigidTransform, "body_spatial_velocities": SpatialVelocity}
 _PLANT_PORT_TYPES |= {"body_spatial_accelerations": SpatialAcceleration}
 _PLANT_PORT_TYPES |= {"reaction_forces": SpatialForce}
-# Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
-# of the reaction (on the joint's child) as a wrench on the load.
-_SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
-_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
-_GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
 # Configuration: R_WB (9), angular velocity of B in W (3), joint positions.
 _BODY_ROTATION_AND_RATE_SIZE = 12
 
@@ -244,21 +239,20 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
 @njit(cache=True)
 def _true_values_into(geometry, configuration, acceleration, reaction, truth):
+    p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity_W, sign = geometry
     R_WB, omega = matrix_at(configuration, 0), vector_at(configuration, 9)
     alpha, a_Bo = vector_at(acceleration, 0), vector_at(acceleration, 3)
-    r = apply_matrix(R_WB, vector_at(geometry, _SENSOR_POSITION_IN_BODY))
+    r = apply_matrix(R_WB, p_BoSo_B)
     a = add_cross_product(add_cross_product(a_Bo, alpha, r), omega, cross(omega, r))
-    R_SB, R_BW = transposed(matrix_at(geometry, _SENSOR_ORIENTATION_IN_BODY)), transposed(R_WB)
-    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY_IN_WORLD))))
+    R_SB, R_BW = transposed(R_BS), transposed(R_WB)
+    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, gravity_W)))
     omega = apply_matrix(R_SB, apply_matrix(R_BW, omega))
     alpha = apply_matrix(R_SB, apply_matrix(R_BW, alpha))
-    R_SJc = matrix_at(geometry, _WELD_ORIENTATION_IN_SENSOR)
     f = apply_matrix(R_SJc, vector_at(reaction, 3))
-    tau = apply_matrix(R_SJc, vector_at(reaction, 0))
-    tau = plus(tau, cross(vector_at(geometry, _WELD_POSITION_IN_SENSOR), f))
+    tau = plus(apply_matrix(R_SJc, vector_at(reaction, 0)), cross(p_SoJc_S, f))
     for i in range(3):
-        truth[SAMPLE_WRENCH.start + i] = geometry[_REACTION_WRENCH_SIGN] * f[i]
-        truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_REACTION_WRENCH_SIGN] * tau[i]
+        truth[SAMPLE_WRENCH.start + i] = sign * f[i]
+        truth[SAMPLE_WRENCH.start + 3 + i] = sign * tau[i]
         truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
         truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
         truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
@@ -363,7 +357,9 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
     return arm, [BodyIndex(int(k)) for k in np.flatnonzero(group == group[int(load)])]
 
 
-def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> tuple[int, int, Array]:
+def _weld_properties(
+    plant: MultibodyPlant, S: Frame, joint: WeldJoint
+) -> tuple[int, int, tuple[Array | float, ...]]:
     """Return the indices of reaction and body of S in the plant's ports, and the geometry."""
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
@@ -378,7 +374,8 @@ def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> tuple
     instance = (joint.child_body() if on_parent else joint.parent_body()).model_instance()
     gravity = plant.gravity_field().gravity_vector() * plant.is_gravity_enabled(instance)
     rotations = [X.rotation().matrix().ravel() for X in (X_BS, X_SJc)]
-    places = [X_BS.translation(), *rotations, X_SJc.translation()]
-    geometry = np.concatenate([*places, gravity, [1.0 if on_parent else -1.0]])
+    places = map(np.array, (X_BS.translation(), *rotations, X_SJc.translation(), gravity))
+    # The sign turns the reaction on the joint's child into the wrench on the load.
+    geometry = *places, 1.0 if on_parent else -1.0
     reaction = list(plant.GetJointIndices()).index(joint.index())
     return reaction, int(S.body().index()), geometry
