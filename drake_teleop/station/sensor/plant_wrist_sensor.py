@@ -343,11 +343,8 @@ def _joints_of_plant(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, list[BodyIndex]]:
-    ends = [
-        (int(joint.parent_body().index()), int(joint.child_body().index()))
-        for joint in _joints_of_plant(plant)
-        if joint.index() != weld.index()
-    ]
+    others = [joint for joint in _joints_of_plant(plant) if joint.index() != weld.index()]
+    ends = [(int(j.parent_body().index()), int(j.child_body().index())) for j in others]
     linked = np.zeros((plant.num_bodies(), plant.num_bodies()))
     linked[tuple(np.reshape(ends, (-1, 2)).astype(int).T)] = 1.0
     _, group = connected_components(linked, directed=False)

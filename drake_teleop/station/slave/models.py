@@ -56,9 +56,8 @@ def repair_and_parse_model(
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
-    expected = (
-        drake_errors.SCENE_ERROR_TEXTS if purpose.is_scene else drake_errors.ROBOT_ERROR_TEXTS
-    )
+    robot, scene = drake_errors.ROBOT_ERROR_TEXTS, drake_errors.SCENE_ERROR_TEXTS
+    expected = scene if purpose.is_scene else robot
     with drake_errors.translate_drake_errors(path, expected, folder.name):
         read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
         instances, repaired = read(parser, path, files, purpose, Path(folder.name))

@@ -202,9 +202,8 @@ def follow_pose(
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
                 # The last joint turns the tool without the links.
-                step = (
-                    pull * np.sin(posture[i] - q[i]) if i < n - 1 else _best_step_of_joint(J, e, i)
-                )
+                turn = pull * np.sin(posture[i] - q[i])
+                step = turn if i < n - 1 else _best_step_of_joint(J, e, i)
             q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))

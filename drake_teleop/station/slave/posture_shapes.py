@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -85,11 +85,9 @@ class PostureShapes:
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self._root)
-        inspector = self._scene_graph.model_inspector()
-        self._points = {
-            index: [hull_points_of(inspector, shape) for shape in self.contact_shapes_of(index)]
-            for index in map(BodyIndex, range(self.plant.num_bodies()))
-        }
+        bodies, shapes_of = map(BodyIndex, range(self.plant.num_bodies())), self.contact_shapes_of
+        points = partial(hull_points_of, self._scene_graph.model_inspector())
+        self._points = {index: list(map(points, shapes_of(index))) for index in bodies}
         self._by_design = self._body_pairs_overlapping_by_design()
         names = [" and ".join(self.plant.get_body(k).name() for k in p) for p in self._by_design]
         if names:

@@ -93,11 +93,8 @@ class Tool:
 
 def end_of_tool_shapes(tool: Tool) -> list[float] | None:
     """Return the end p_STip [m] of the shape that reaches farthest along z_S, if there are any."""
-    ends = [
-        np.array(each.position) + np.array([0.0, 0.0, half])
-        for each in tool.shapes
-        for half in [each.radius if isinstance(each, Ball) else each.half_extent_along_z]
-    ]
+    halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
+    ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None
 
 
