@@ -93,6 +93,7 @@ def MakeSlaveSide(
     arm = body.slave.arm
     if controller is not None:
         builder.AddNamedSystem("controller", controller)
+        builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
     follows_leader = scenario.master.is_joint_leader
     setpoint = "leader_joints" if follows_leader else "pose_command"
     if torques:
@@ -103,8 +104,6 @@ def MakeSlaveSide(
             builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
         else:
             connect_ports(builder, controller, "pose_command", ik, "pose_command")
-    if controller is not None:
-        builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
 
     R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
     largest = scenario.wrist_sensor.largest_plausible_wrench()
