@@ -106,8 +106,9 @@ class LoadEstimator(LeafSystem):
         calculate = weak_callback(self._calc_load_state)
         self.DeclareVectorOutputPort("load_state", 1, calculate, {self.xd_ticket()})
         if config.watch:
-            known = covariance is not None
-            monitor = initial_monitor_memory(start, covariance) if known else np.zeros(MEMORY_SIZE)
+            monitor = np.zeros(MEMORY_SIZE)
+            if covariance is not None:
+                monitor = initial_monitor_memory(start, covariance)
             self.DeclareDiscreteState(monitor)
             noise, share = (noise_std, motion_std, period), config.relative_wrench_error
             change = change_detector_parameters(*noise, relative_wrench_error=share)

@@ -373,6 +373,6 @@ def _weld_properties(
     rotations = [X.rotation().matrix().ravel() for X in (X_BS, X_SJc)]
     places = map(np.array, (X_BS.translation(), *rotations, X_SJc.translation(), gravity))
     # The sign turns the reaction on the joint's child into the wrench on the load.
-    geometry = *places, 1.0 if on_parent else -1.0
+    geometry: tuple[Array | float, ...] = *places, 1.0 if on_parent else -1.0
     reaction = list(plant.GetJointIndices()).index(joint.index())
     return reaction, int(S.body().index()), geometry

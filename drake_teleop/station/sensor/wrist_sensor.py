@@ -2,8 +2,8 @@
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-The state at each sampling instant is interpolated within an integration step. With contact outside
-the compiled contact law (`ToolContactModel.drake_contact_reason`) each sample is an event at the end of a step.
+The state at each sampling instant is interpolated within an integration step. With contact from
+Drake (`ToolContactModel.drake_contact_reason`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
