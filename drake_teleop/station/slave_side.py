@@ -93,6 +93,7 @@ def MakeSlaveSide(
     arm = body.slave.arm
     if controller is not None:
         builder.AddNamedSystem("controller", controller)
+        builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
     follows_leader = scenario.master.is_joint_leader
     setpoint = "leader_joints" if follows_leader else "pose_command"
     if torques:
@@ -103,17 +104,14 @@ def MakeSlaveSide(
             builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
         else:
             connect_ports(builder, controller, "pose_command", ik, "pose_command")
-    if controller is not None:
-        builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
 
     R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
     largest = scenario.wrist_sensor.largest_plausible_wrench()
     max_age_s = max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz)
     scaling = ForceScaling(scenario.force_scaling, arm, R_WB, largest, max_age_s)
     force_scaling = builder.AddNamedSystem("force_scaling", scaling)
-    estimate = body.load_estimator.GetOutputPort("load_estimate")
-    builder.Connect(body.sample_ports["sample"], force_scaling.GetInputPort("sample"))
-    builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
+    estimate = {"load_estimate": body.load_estimator.GetOutputPort("load_estimate")}
+    connect_matching_inputs(builder, force_scaling, body.sample_ports | estimate)
     export_outputs(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _has_load_estimate(scenario, load_estimate):
         export_outputs(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
@@ -137,8 +135,7 @@ def MakeSlaveSide(
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
         builder.AddNamedSystem("contact_detection", detection)
-        builder.Connect(body.sample_ports["sample"], detection.GetInputPort("sample"))
-        builder.Connect(estimate, detection.GetInputPort("load_estimate"))
+        connect_matching_inputs(builder, detection, body.sample_ports | estimate)
         export_outputs(builder, detection, "contact")
     return builder.Build()
 
@@ -277,12 +274,10 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
     if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
         shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
-        raise DrakeTeleopError(
-            f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
-            f"{1e3 * step:g} ms",
-            where="slave.friction",
-            remedy=f"reduce the friction, or set simulation.max_step: {shorter:.2g}",
-        )
+        steps = f"too fast for steps of {1e3 * step:g} ms"
+        what = f"the friction stops a joint within {1e3 / rate:.2g} ms, {steps}"
+        remedy = f"reduce the friction, or set simulation.max_step: {shorter:.2g}"
+        raise DrakeTeleopError(what, where="slave.friction", remedy=remedy)
 
 
 def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant) -> None:
@@ -310,9 +305,8 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
             check_nonzero_load("load_estimate", estimate[6:])
-    scales = scenario.force_scaling.scales()
-    needed = {*scales.load_scales} != {scales.gamma}
-    if needed and not _has_load_estimate(scenario, estimate):
+    scales = set(scenario.force_scaling.scales())
+    if len(scales) > 1 and not _has_load_estimate(scenario, estimate):
         what = "sigma and gamma differ, which requires a load estimate, but there is none"
         remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
         raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)

@@ -7,14 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.geometry import (
-    AddContactMaterial,
-    CollisionFilterDeclaration,
-    GeometryId,
-    GeometrySet,
-    ProximityProperties,
-    SceneGraph,
-)
+from pydrake import geometry
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloatingJoint, RigidBody
@@ -47,7 +40,7 @@ class Environment(ABC):
         """Add the object to a plant with the tool, as new model instances, before Finalize."""
 
     def PrepareContact(
-        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+        self, plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
     ) -> None:
         """Change contact pairs and contact materials of object and `tool`, after Finalize."""
         return
@@ -101,7 +94,7 @@ class SeveralObjects(Environment):
             part.AddTo(plant)
 
     def PrepareContact(
-        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+        self, plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
     ) -> None:
         for part in self._parts:
             part.PrepareContact(plant, scene_graph, tool)
@@ -127,43 +120,39 @@ def BodiesWeldedToTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex
 
 
 def ToolShapes(
-    plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
-) -> dict[BodyIndex, list[GeometryId]]:
+    plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
+) -> dict[BodyIndex, list[geometry.GeometryId]]:
     """Return the shapes with contact properties of `tool` and of each body welded to it."""
-    properties = scene_graph.model_inspector().GetProximityProperties
-    return {
-        index: [
-            shape
-            for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index))
-            if properties(shape) is not None
-        ]
-        for index in BodiesWeldedToTool(plant, tool)
-    }
+    inspector, shapes = scene_graph.model_inspector(), dict[BodyIndex, list[geometry.GeometryId]]()
+    for index in BodiesWeldedToTool(plant, tool):
+        own = plant.GetCollisionGeometriesForBody(plant.get_body(index))
+        shapes[index] = [x for x in own if inspector.GetProximityProperties(x) is not None]
+    return shapes
 
 
 def ExcludeContact(
     plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    shapes: Iterable[GeometryId],
+    scene_graph: geometry.SceneGraph,
+    shapes: Iterable[geometry.GeometryId],
     bodies: Iterable[BodyIndex],
 ) -> None:
-    others = [
-        shape
-        for body in bodies
-        for shape in plant.GetCollisionGeometriesForBody(plant.get_body(body))
-    ]
-    if not others:
-        return
-    sets = GeometrySet(list(shapes)), GeometrySet(others)
-    between = CollisionFilterDeclaration().ExcludeBetween(*sets)
-    scene_graph.collision_filter_manager().Apply(between)
+    shapes_of = plant.GetCollisionGeometriesForBody
+    others = [shape for body in bodies for shape in shapes_of(plant.get_body(body))]
+    if others:
+        sets = geometry.GeometrySet(list(shapes)), geometry.GeometrySet(others)
+        between = geometry.CollisionFilterDeclaration().ExcludeBetween(*sets)
+        scene_graph.collision_filter_manager().Apply(between)
 
 
-def ContactMaterial(stiffness: float, dissipation: float, friction: float) -> ProximityProperties:
+def ContactMaterial(
+    stiffness: float, dissipation: float, friction: float
+) -> geometry.ProximityProperties:
     """Return a material for Drake's point contact, with equal static and dynamic friction.
 
     Units: stiffness [N/m], Hunt-Crossley dissipation [s/m], friction coefficient [1].
     """
-    properties = ProximityProperties()
-    AddContactMaterial(properties, dissipation, stiffness, CoulombFriction(friction, friction))
+    properties = geometry.ProximityProperties()
+    geometry.AddContactMaterial(
+        properties, dissipation, stiffness, CoulombFriction(friction, friction)
+    )
     return properties

@@ -9,15 +9,8 @@ from collections.abc import Iterable
 from math import cos, sin
 
 import numpy as np
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Joint,
-    JointIndex,
-    PrismaticJoint,
-    QuaternionFloatingJoint,
-    RevoluteJoint,
-)
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
@@ -43,7 +36,7 @@ BODY_STATE_SIZE = 13
 
 
 def MakeJointTableAndRowBodies(
-    plant: MultibodyPlant, bodies: Iterable[BodyIndex]
+    plant: MultibodyPlant, bodies: Iterable[tree.BodyIndex]
 ) -> tuple[Array, list[int]]:
     """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
 
@@ -52,15 +45,13 @@ def MakeJointTableAndRowBodies(
     parent) and 14-20 X_MB, a quaternion and a position each. Parents precede children.
     """
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
-    above: dict[int, tuple[int, int]] = {}
-    anchored: set[int] = set()
+    above, anchored, order = dict[int, tuple[int, int]](), set[int](), list[int]()
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         child, parent = int(joint.child_body().index()), int(joint.parent_body().index())
         above[child] = int(index), parent
         if plant.IsAnchored(joint.parent_body()):
             anchored.add(parent)
-    order: list[int] = []
     for body in bodies:
         chain, number = [], int(body)
         while number not in order and number not in anchored:
@@ -71,22 +62,22 @@ def MakeJointTableAndRowBodies(
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_table_row(plant, context, plant.get_joint(JointIndex(index)), row))
+        rows.append(_joint_table_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
 def _joint_table_row(
-    plant: MultibodyPlant, context: Context, joint: Joint, parent_row: int
+    plant: MultibodyPlant, context: Context, joint: tree.Joint, parent_row: int
 ) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if parent_row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _FIXED_JOINT, np.zeros(3)
-    if isinstance(joint, RevoluteJoint):
+    if isinstance(joint, tree.RevoluteJoint):
         kind, axis = _REVOLUTE_JOINT, joint.revolute_axis()
-    elif isinstance(joint, PrismaticJoint):
+    elif isinstance(joint, tree.PrismaticJoint):
         kind, axis = _PRISMATIC_JOINT, joint.translation_axis()
-    elif isinstance(joint, QuaternionFloatingJoint):
+    elif isinstance(joint, tree.QuaternionFloatingJoint):
         kind = _FREE_JOINT
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
@@ -101,8 +92,7 @@ def poses_and_twists_into(joints, state, out):
     returns `joints`.
     """
     still = (0.0, 0.0, 0.0)
-    for k in range(joints.shape[0]):
-        row = joints[k]
+    for k, row in enumerate(joints):
         turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
         if row[_PARENT_ROW_COLUMN] >= 0.0:
             above = out[int(row[_PARENT_ROW_COLUMN])]
@@ -127,8 +117,7 @@ def poses_and_twists_into(joints, state, out):
             speed = plus(plus(speed, cross(spin, lever)), scale_vector(state[v], axis))
         elif kind == _FREE_JOINT:
             lever = rotate_vector(turn, vector_at(state, q + 4))
-            place = plus(place, lever)
-            speed = plus(speed, cross(spin, lever))
+            place, speed = plus(place, lever), plus(speed, cross(spin, lever))
             speed = plus(speed, rotate_vector(turn, vector_at(state, v + 3)))
             spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
             turn = quaternion_product(turn, normalized_quaternion(quaternion_at(state, q)))
@@ -162,8 +151,7 @@ def interpolate_joint_state(joints, h, u, start, end, out):
     `start` and `end` are the plant's states at both ends; `MakeJointTableAndRowBodies` returns
     `joints`.
     """
-    for k in range(joints.shape[0]):
-        row = joints[k]
+    for row in joints:
         q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])
         kind = row[_JOINT_TYPE_COLUMN]
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):

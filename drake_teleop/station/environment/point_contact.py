@@ -36,7 +36,6 @@ from drake_teleop.common.vectors import (
 PAIR_STIFFNESS_COLUMN, PAIR_FRICTION_COLUMNS, BOX_BODY_ROW_COLUMN = 22, slice(24, 26), 27
 #: Number of columns of `ShapePairs.compiled_pairs` and `ShapePairs.monitored_pairs`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
-_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
 _SLIP_SPEED_REGULARIZATION_M_S = 1e-14  # as in Drake: a point at rest has a direction
 
 
@@ -78,9 +77,7 @@ def FindContactPairs(
         DrakeTeleopError: for an unbounded shape.
     """
     context = plant.CreateDefaultContext()
-    compiled_pairs: list[Array] = []
-    monitored_pairs: list[Array] = []
-    monitoring_reason = ""
+    compiled_pairs, monitored_pairs, monitoring_reason = list[Array](), list[Array](), ""
     touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
     for body in map(plant.get_body, touched):
         row = row_bodies.index(int(body.index())) if int(body.index()) in row_bodies else -1
@@ -106,11 +103,9 @@ def FindContactPairs(
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip_speed, row], *turned]
                     monitored_pairs.append(_pair_row(place, X_Other, box.half_width(), last))
-    return ShapePairs(
-        np.array(compiled_pairs).reshape(len(compiled_pairs), NUM_PAIR_COLUMNS),
-        np.array(monitored_pairs).reshape(len(monitored_pairs), NUM_MONITORED_COLUMNS),
-        monitoring_reason,
-    )
+    compiled = np.reshape(compiled_pairs, (len(compiled_pairs), NUM_PAIR_COLUMNS))
+    monitored = np.reshape(monitored_pairs, (len(monitored_pairs), NUM_MONITORED_COLUMNS))
+    return ShapePairs(compiled, monitored, monitoring_reason)
 
 
 def _pair_row(first: list[Any], X_Other: RigidTransform, half: Array, last: list[Any]) -> Array:
@@ -121,12 +116,10 @@ def _pair_row(first: list[Any], X_Other: RigidTransform, half: Array, last: list
 def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
     box = inspector.GetObbInGeometryFrame(shape)
     if box is None:
-        raise DrakeTeleopError(
-            f"a {type(inspector.GetShape(shape)).__name__} is unbounded, so contact with it cannot"
-            " be checked",
-            where=inspector.GetName(shape),
-            remedy="use a shape of finite size, such as a box",
-        )
+        kind = type(inspector.GetShape(shape)).__name__
+        what = f"a {kind} is unbounded, so contact with it cannot be checked"
+        remedy = "use a shape of finite size, such as a box"
+        raise DrakeTeleopError(what, where=inspector.GetName(shape), remedy=remedy)
     return box
 
 
@@ -136,12 +129,10 @@ def _require_sphere_and_box(
     sphere, edges = inspector.GetShape(ball), inspector.GetShape(box)
     if isinstance(sphere, Sphere) and isinstance(edges, Box):
         return sphere, edges
-    raise DrakeTeleopError(
-        "the compiled contact law supports spheres on boxes only, not a"
-        f" {type(sphere).__name__} on a {type(edges).__name__}",
-        where=inspector.GetName(box),
-        remedy="build the tool's tip of spheres and the environment of boxes",
-    )
+    pair = f"{type(sphere).__name__} on a {type(edges).__name__}"
+    what = f"the compiled contact law supports spheres on boxes only, not a {pair}"
+    remedy = "build the tool's tip of spheres and the environment of boxes"
+    raise DrakeTeleopError(what, where=inspector.GetName(box), remedy=remedy)
 
 
 def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
@@ -155,15 +146,13 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
 
 
 def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    names = (_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY)
-    if not all(shape.HasProperty("material", name) for shape in (ball, box) for name in names):
+    names = "point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"
+    if not all(x.HasProperty("material", name) for x in (ball, box) for name in names[:2]):
         what = "the contact material has no stiffness or no dissipation"
         remedy = "give drake:point_contact_stiffness and drake:hunt_crossley_dissipation"
         raise DrakeTeleopError(what, where="drake:proximity_properties", remedy=remedy)
-    (k_1, k_2), (d_1, d_2), frictions = (
-        [shape.GetProperty("material", name) for shape in (ball, box)]
-        for name in (*names, "coulomb_friction")
-    )
+    values = [[x.GetProperty("material", n) for x in (ball, box)] for n in names]
+    (k_1, k_2), (d_1, d_2), frictions = values
     both = CalcContactFrictionFromSurfaceProperties(*frictions)
     d = (k_2 * d_1 + k_1 * d_2) / (k_1 + k_2)
     return [k_1 * k_2 / (k_1 + k_2), d, both.static_friction(), both.dynamic_friction()]

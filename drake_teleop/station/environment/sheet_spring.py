@@ -12,19 +12,14 @@ from pydrake.multibody.tree import BodyIndex, PrismaticSpring
 
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.files import models_dir
-from drake_teleop.station.environment.environment import (
-    BodiesWeldedToTool,
-    Environment,
-    ExcludeContact,
-    FloorStand,
-)
+from drake_teleop.station.environment import environment
 
 _BENCH_BASE_TO_LEAF_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
 @dataclass
-class SheetSpring(Environment):
+class SheetSpring(environment.Environment):
     """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
@@ -35,9 +30,7 @@ class SheetSpring(Environment):
     thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the section")
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
-    damping_ratio: float = quantity(
-        0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 it creeps back"
-    )
+    damping_ratio: float = quantity(0.03, "1", 0.0, 100.0, "of the first mode; above 1 it creeps")
     slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property
@@ -65,9 +58,9 @@ class SheetSpring(Environment):
         return self.effective_mass, self.stiffness, self.damping
 
     @property
-    def floor_stand(self) -> FloorStand:
+    def floor_stand(self) -> environment.FloorStand:
         x, y, z = self.position
-        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BASE_TO_LEAF_M)
+        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BASE_TO_LEAF_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""
@@ -82,15 +75,12 @@ class SheetSpring(Environment):
         plant.WeldFrames(plant.world_frame(), base, RigidTransform(self.position))
         bending = plant.GetJointByName("bending", instance)
         bending.set_default_damping(self.damping)
-        plant.AddForceElement(
-            PrismaticSpring(bending, nominal_position=0.0, stiffness=self.stiffness)
-        )
+        plant.AddForceElement(PrismaticSpring(bending, 0.0, self.stiffness))
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        leaf = plant.GetBodyByName("leaf")
-        tool_bodies = BodiesWeldedToTool(plant, tool)
+        tool_bodies = environment.BodiesWeldedToTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
-        shapes = plant.GetCollisionGeometriesForBody(leaf)
-        ExcludeContact(plant, scene_graph, shapes, others)
+        shapes = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("leaf"))
+        environment.ExcludeContact(plant, scene_graph, shapes, others)

@@ -29,9 +29,7 @@ class ContactDetectionConfig:
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
     drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the offset in free motion")
-    recovery: float = quantity(
-        5e-3, "s", 0.0, 1.0, "recovery time of the low-pass after a saturation"
-    )
+    recovery: float = quantity(5e-3, "s", 0.0, 1.0, "recovery of the low-pass after a saturation")
 
 
 @njit(cache=True)
@@ -79,12 +77,10 @@ class ContactDetection(LeafSystem):
         self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel | None, period: float
     ) -> None:
         super().__init__()
+        threshold = floor.threshold(config.statistic, config.margin)
+        hold, following = round(config.hold / period), period / config.drift_time
         self._settings = ContactDetector(
-            floor,
-            floor.threshold(config.statistic, config.margin),
-            statistic=config.statistic,
-            hold=round(config.hold / period),
-            following=period / config.drift_time,
+            floor, threshold, statistic=config.statistic, hold=hold, following=following
         ).settings
         self._sample = self._declare_sample_ports(arm)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)

@@ -48,12 +48,10 @@ class LoadEstimatorConfig:
 
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
-            raise DrakeTeleopError(
-                f"'{self.method}' ignores the noise of the motion, so its covariance is too"
-                " small to detect a change of load",
-                where=f"{where}.method",
-                remedy="set method: rtls, or watch: false",
-            )
+            what = f"'{self.method}' ignores the noise of the motion"
+            result = "its covariance is too small to detect a change of load"
+            remedy = "set method: rtls, or watch: false"
+            raise DrakeTeleopError(f"{what}, so {result}", where=f"{where}.method", remedy=remedy)
 
 
 class LoadEstimator(LeafSystem):
@@ -108,14 +106,12 @@ class LoadEstimator(LeafSystem):
         calculate = weak_callback(self._calc_load_state)
         self.DeclareVectorOutputPort("load_state", 1, calculate, {self.xd_ticket()})
         if config.watch:
-            self.DeclareDiscreteState(
-                np.zeros(MEMORY_SIZE)
-                if covariance is None
-                else initial_monitor_memory(start, covariance)
-            )
-            change = change_detector_parameters(
-                noise_std, motion_std, period, relative_wrench_error=config.relative_wrench_error
-            )
+            monitor = np.zeros(MEMORY_SIZE)
+            if covariance is not None:
+                monitor = initial_monitor_memory(start, covariance)
+            self.DeclareDiscreteState(monitor)
+            noise, share = (noise_std, motion_std, period), config.relative_wrench_error
+            change = change_detector_parameters(*noise, relative_wrench_error=share)
             safe = np.zeros(10) if fallback is None else np.array(fallback, dtype=float)
             self._watch_arguments = safe, period, *change
         if config.enabled or config.watch:

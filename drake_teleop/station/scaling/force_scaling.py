@@ -19,24 +19,12 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
+from drake_teleop.load import regressor
 from drake_teleop.load.compensation import (
     add_excess_weight_into,
     scaled_wrench_into,
     scales_from_eta,
     weight_scales_and_inertia_scales,
-)
-from drake_teleop.load.regressor import (
-    FIRST_JOINT_INDEX,
-    LOST_SAMPLE_FLAG,
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_TIME_INDEX,
-    SAMPLE_WRENCH,
-    SATURATION_FLAG_INDEX,
-    non_contact_wrench_into,
-    sample_size,
 )
 from drake_teleop.station.slave.arm import (
     ArmModel,
@@ -47,6 +35,7 @@ from drake_teleop.station.slave.arm import (
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
 _CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 _NUM_BLENDED_SCALES = 6
+_JOINT_ANGLES = slice(regressor.FIRST_JOINT_INDEX, regressor.SAMPLE_TIME_INDEX)
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
 MAX_SAMPLE_AGE_S = 0.05
@@ -83,9 +72,7 @@ class ForceScalingConfig:
         *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
         length=10,
     )
-    force_scale: float = quantity(
-        1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
-    )
+    force_scale: float = quantity(1 / 17.5, "1", 0.0, 100.0, "wrench scale, slave to master (VI-B)")
     sigma_weight: float | None = quantity(
         None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
     )
@@ -100,32 +87,26 @@ class ForceScalingConfig:
             DrakeTeleopError: for eta with other scales or without gripper_phi, or a negative mass.
         """
         if self.gripper_phi is not None and self.gripper_phi[0] < 0.0:
-            raise DrakeTeleopError(
-                f"a mass of {self.gripper_phi[0]:g} kg is negative",
-                where=f"{where}.gripper_phi",
-                remedy="give phi as of `identify`: [m, m cx, m cy, m cz, Ixx, ...]",
-            )
+            what = f"a mass of {self.gripper_phi[0]:g} kg is negative"
+            remedy = "give phi as of `identify`: [m, m cx, m cy, m cz, Ixx, ...]"
+            raise DrakeTeleopError(what, where=f"{where}.gripper_phi", remedy=remedy)
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
             weights, inertias = weight_scales_and_inertia_scales(self.sigma, self.sigma, *separate)
             return Scales(*inertias, self.gamma, *weights)
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
-            raise DrakeTeleopError(
-                "eta scales the object alone: it requires gripper_phi and excludes other scales",
-                where=f"{where}.eta",
-                remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper), and leave "
-                "sigma_weight and sigma_inertia out",
-            )
+            what = "eta scales the object alone: it requires gripper_phi and excludes other scales"
+            required = "set sigma: 0, gamma: 1 and gripper_phi (section V of the paper)"
+            remedy = f"{required}, and leave sigma_weight and sigma_inertia out"
+            raise DrakeTeleopError(what, where=f"{where}.eta", remedy=remedy)
         gripper, grasped, gamma = scales_from_eta(self.eta)
         return Scales(gripper, grasped, gamma, gripper, grasped)
 
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    for part in range(2):
-        scale = torque_scale if part == 1 else force_scale
-        base = 3 * part
+    for base, scale in ((0, force_scale), (3, torque_scale)):
         in_W = apply_matrix(matrix_as_tuple(R_WS), vector_at(wrench_S, base))
         in_B = scale_vector(-scale, apply_matrix(transposed(matrix_as_tuple(R_WB)), in_W))
         out[base], out[base + 1], out[base + 2] = in_B
@@ -166,19 +147,20 @@ def blend_scales_at(change, time, scales):
 
 @njit(cache=True)
 def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
+    wrench, s = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_SPECIFIC_FORCE]
+    omega = sample[regressor.SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
     scaled_wrench_into(
-        sample[SAMPLE_WRENCH], estimate[:6],
-        sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-        phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
+        wrench, estimate[:6], s, omega, alpha, phi_gripper, phi_object, scales[0], scales[1],
+        scales[2], out,
     )  # fmt: skip
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
-        q, gravity = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.empty(3)
-        acceleration_from_specific_force_into(arm, q, np.zeros(3), gravity)
+        gravity = np.empty(3)
+        acceleration_from_specific_force_into(arm, sample[_JOINT_ANGLES], np.zeros(3), gravity)
         add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
@@ -188,15 +170,15 @@ def find_sample_fault(sample, estimate, time, valid_range):
 
     `valid_range` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
     """
-    if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
+    if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG
-    reading = reading and are_finite_and_in_range(sample[SAMPLE_MOTION])
+    reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.LOST_SAMPLE_FLAG
+    reading = reading and are_finite_and_in_range(sample[regressor.SAMPLE_MOTION])
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
         return _BAD_READING_FAULT
-    if not are_finite_and_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
+    if not are_finite_and_in_range(sample[_JOINT_ANGLES]):
         return _BAD_JOINTS_FAULT
     return _NO_FAULT if are_finite_and_in_range(estimate) else _BAD_LOAD_FAULT
 
@@ -228,7 +210,7 @@ def _rendered_wrench_into(
     blend_scales_at(change, time, scales)
     scales[2] *= contact_share
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
-    forward_kinematics(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], R_WS, p_WS)
+    forward_kinematics(arm, sample[_JOINT_ANGLES], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 
@@ -273,15 +255,15 @@ class ForceScaling(LeafSystem):
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
         self._valid_range = np.append(largest, oldest)
-        self._gripper: Array | None = None
-        if config.gripper_phi is not None:
-            self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
+        phi = config.gripper_phi
+        self._gripper = None if phi is None else np.concatenate([np.zeros(6), phi])
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
         # Old and new scales, start and length of the change; see `blend_scales_at`.
         found = config.scales()
         scales = [*found[:3], config.force_scale, *found[3:]]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
-        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+        sample_size = regressor.sample_size(arm.num_joints) + 1
+        self._sample = self.DeclareVectorInputPort("sample", sample_size)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         # Without time: a change of scales advances with each new sample.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
@@ -315,11 +297,9 @@ class ForceScaling(LeafSystem):
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)
         requested = np.array([*both, gamma, force_scale, *weights, duration], dtype=float)
         if not (requested >= 0.0).all() or not np.isfinite(requested).all():
-            raise DrakeTeleopError(
-                "a scale or the duration of the change is negative or not finite",
-                where="SetScales",
-                remedy="give finite numbers of 0 or more",
-            )
+            what = "a scale or the duration of the change is negative or not finite"
+            remedy = "give finite numbers of 0 or more"
+            raise DrakeTeleopError(what, where="SetScales", remedy=remedy)
         parameter = context.get_mutable_numeric_parameter(self._change)
         now, start = np.empty(_NUM_BLENDED_SCALES), context.get_time()
         blend_scales_at(parameter.value(), start, now)
@@ -343,14 +323,10 @@ class ForceScaling(LeafSystem):
         _scaled_wrench_into(*inputs, self._arm, _CONTACT_ONLY_SCALES, output.get_mutable_value())
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
-        sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
-        non_contact_wrench_into(
-            sample[SAMPLE_SPECIFIC_FORCE],
-            sample[SAMPLE_ANGULAR_VELOCITY],
-            sample[SAMPLE_ANGULAR_ACCELERATION],
-            phi,
-            output.get_mutable_value(),
-        )
+        motion = self._sample.Eval(context)[regressor.SAMPLE_MOTION]
+        phi = self._estimate.Eval(context)[6:]
+        wrench = output.get_mutable_value()
+        regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, wrench)
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
         self._calc_rendered(context, 1.0, output)
@@ -364,11 +340,7 @@ class ForceScaling(LeafSystem):
         _rendered_wrench_into(*inputs, *constants, output.get_mutable_value())
 
     def _evaluate_inputs(self, context: Context) -> tuple[Any, ...]:
-        estimate = self._estimate.Eval(context)
-        return (
-            self._sample.Eval(context),
-            estimate,
-            estimate if self._gripper is None else self._gripper,
-            context.get_numeric_parameter(self._change).value(),
-            context.get_time(),
-        )
+        sample, estimate = self._sample.Eval(context), self._estimate.Eval(context)
+        gripper = estimate if self._gripper is None else self._gripper
+        change = context.get_numeric_parameter(self._change).value()
+        return sample, estimate, gripper, change, context.get_time()

@@ -35,23 +35,20 @@ class JointCoupling(LeafSystem):
     def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
         super().__init__()
         if len(home) != len(start):
-            raise DrakeTeleopError(
-                f"the leader has {len(home)} joints, but the slave {len(start)} (they must agree)",
-                where="master.leader.leads",
-                remedy="set leads: pose, or give arms of the same kinematics",
-            )
+            numbers = f"{len(home)} joints, but the slave {len(start)}"
+            what = f"the leader has {numbers} (they must agree)"
+            remedy = "set leads: pose, or give arms of the same kinematics"
+            raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
         self._state = self.DeclareVectorInputPort("master_state", 2 * n)
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
         self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
         sources = {self._state.ticket(), self.xd_ticket()}
-        for name, size, calc in (
-            ("leader_joints", n, self._calc_joints),
-            ("pose_command", 7, self._calc_pose),
-        ):
-            self.DeclareVectorOutputPort(name, size, weak_callback(calc), sources)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_held_joints_and_clutch)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update_held_joints_and_clutch)
+        joints, pose = weak_callback(self._calc_joints), weak_callback(self._calc_pose)
+        self.DeclareVectorOutputPort("leader_joints", n, joints, sources)
+        self.DeclareVectorOutputPort("pose_command", 7, pose, sources)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joints_and_clutch)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update_joints_and_clutch)
 
     def _commanded_joint_positions(self, context: Context) -> Array:
         memory, n = context.get_discrete_state(0).value(), len(self._offset)
@@ -65,9 +62,7 @@ class JointCoupling(LeafSystem):
         joints = np.array(self._commanded_joint_positions(context))
         pose_into(self._table, joints, output.get_mutable_value())
 
-    def _update_held_joints_and_clutch(
-        self, context: Context, discrete_state: DiscreteValues
-    ) -> None:
+    def _update_joints_and_clutch(self, context: Context, discrete_state: DiscreteValues) -> None:
         memory = discrete_state.get_mutable_value(0)
         joints = self._commanded_joint_positions(context)
         if np.isfinite(joints).all():  # an opened clutch must hold a finite command

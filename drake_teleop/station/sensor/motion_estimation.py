@@ -14,7 +14,6 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.vectors import (
     add_cross_product,
@@ -33,6 +32,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     READ_SATURATED,
     WristSensorConfig,
     butterworth_sections,
+    check_bandwidth,
     group_delay_samples,
     low_pass_in_place,
     settle_low_pass,
@@ -149,13 +149,10 @@ def fusion_gains(
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std = _sensor_rotation_std_by_encoders(sensor, num_joints)
-    drift = config.angular_acceleration_drift
-    return (
-        steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
-        steady_state_kalman_gains(
-            angle_std * _SENSOR_RMS_LEVER_M_PER_RAD, s_std.mean(), config.acceleration_drift, period
-        ),
-    )
+    linear_std = angle_std * _SENSOR_RMS_LEVER_M_PER_RAD
+    drifts = config.angular_acceleration_drift, config.acceleration_drift
+    angular = steady_state_kalman_gains(angle_std, alpha_std.mean(), drifts[0], period)
+    return angular, steady_state_kalman_gains(linear_std, s_std.mean(), drifts[1], period)
 
 
 def estimated_motion_std(
@@ -225,13 +222,8 @@ def _angle_low_pass_sections(
     if sensor.low_pass != "none" and not sensor.ideal:
         filters[:2] = butterworth_sections(sensor.bandwidth_hz, 1 / period)
     if config.source == "encoders":
-        if config.encoder_bandwidth_hz >= 0.45 / period:
-            raise DrakeTeleopError(
-                f"a bandwidth of {config.encoder_bandwidth_hz:g} Hz is too near to half of the "
-                f"sensor's rate ({1 / period:g} Hz)",
-                where="motion_estimation.encoder_bandwidth_hz",
-                remedy="lower the bandwidth below 0.45 of the sensor's rate",
-            )
+        place = "motion_estimation.encoder_bandwidth_hz"
+        check_bandwidth(config.encoder_bandwidth_hz, 1 / period, place)
         filters[2:] = butterworth_sections(config.encoder_bandwidth_hz, 1 / period)
     return filters
 
@@ -258,9 +250,8 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     if constants.encoders_only != 0.0:
         copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        _convert_and_fuse_accelerometer(
-            constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample
-        )
+        gravity = arm[n, LAST_ROW_GRAVITY_COLUMN:]
+        _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample)
     memory[0] += 1.0
 
 

@@ -69,11 +69,10 @@ from drake_teleop.station.sensor.sensor_chain import (
 
 _NAME_IN_ERRORS = "AddWristSensor"
 _DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
-# Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
-# of the reaction (on the joint's child) as a wrench on the load.
-_SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
-_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
-_GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
+# Output ports of a plant that the sensor reads, with the type of their elements.
+_PLANT_PORT_TYPES = {"body_poses": RigidTransform, "body_spatial_velocities": SpatialVelocity}
+_PLANT_PORT_TYPES |= {"body_spatial_accelerations": SpatialAcceleration}
+_PLANT_PORT_TYPES |= {"reaction_forces": SpatialForce}
 # Configuration: R_WB (9), angular velocity of B in W (3), joint positions.
 _BODY_ROTATION_AND_RATE_SIZE = 12
 
@@ -108,14 +107,9 @@ def AddWristSensor(
     sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
-    for port, source in {
-        "state": state,
-        "body_poses": plant.get_body_poses_output_port(),
-        "body_spatial_velocities": plant.get_body_spatial_velocities_output_port(),
-        "body_spatial_accelerations": plant.get_body_spatial_accelerations_output_port(),
-        "reaction_forces": plant.get_reaction_forces_output_port(),
-    }.items():
-        builder.Connect(source, sensor.GetInputPort(port))
+    builder.Connect(state, sensor.GetInputPort("state"))
+    for port in _PLANT_PORT_TYPES:
+        builder.Connect(plant.GetOutputPort(port), sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
         block_s = SAMPLES_PER_NOISE_BLOCK * sensor.period
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
@@ -185,12 +179,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states(*which))
         self._poses, self._velocities, self._accelerations, self._reactions = (
             self.DeclareAbstractInputPort(name, AbstractValue.Make([kind()]))
-            for name, kind in (
-                ("body_poses", RigidTransform),
-                ("body_spatial_velocities", SpatialVelocity),
-                ("body_spatial_accelerations", SpatialAcceleration),
-                ("reaction_forces", SpatialForce),
-            )
+            for name, kind in _PLANT_PORT_TYPES.items()
         )
         noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self._noise = noise
@@ -250,21 +239,20 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
 @njit(cache=True)
 def _true_values_into(geometry, configuration, acceleration, reaction, truth):
+    p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity_W, sign = geometry
     R_WB, omega = matrix_at(configuration, 0), vector_at(configuration, 9)
     alpha, a_Bo = vector_at(acceleration, 0), vector_at(acceleration, 3)
-    r = apply_matrix(R_WB, vector_at(geometry, _SENSOR_POSITION_IN_BODY))
+    r = apply_matrix(R_WB, p_BoSo_B)
     a = add_cross_product(add_cross_product(a_Bo, alpha, r), omega, cross(omega, r))
-    R_SB, R_BW = transposed(matrix_at(geometry, _SENSOR_ORIENTATION_IN_BODY)), transposed(R_WB)
-    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY_IN_WORLD))))
+    R_SB, R_BW = transposed(R_BS), transposed(R_WB)
+    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, gravity_W)))
     omega = apply_matrix(R_SB, apply_matrix(R_BW, omega))
     alpha = apply_matrix(R_SB, apply_matrix(R_BW, alpha))
-    R_SJc = matrix_at(geometry, _WELD_ORIENTATION_IN_SENSOR)
     f = apply_matrix(R_SJc, vector_at(reaction, 3))
-    tau = apply_matrix(R_SJc, vector_at(reaction, 0))
-    tau = plus(tau, cross(vector_at(geometry, _WELD_POSITION_IN_SENSOR), f))
+    tau = plus(apply_matrix(R_SJc, vector_at(reaction, 0)), cross(p_SoJc_S, f))
     for i in range(3):
-        truth[SAMPLE_WRENCH.start + i] = geometry[_REACTION_WRENCH_SIGN] * f[i]
-        truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_REACTION_WRENCH_SIGN] * tau[i]
+        truth[SAMPLE_WRENCH.start + i] = sign * f[i]
+        truth[SAMPLE_WRENCH.start + 3 + i] = sign * tau[i]
         truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
         truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
         truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
@@ -355,11 +343,8 @@ def _joints_of_plant(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, list[BodyIndex]]:
-    ends = [
-        (int(joint.parent_body().index()), int(joint.child_body().index()))
-        for joint in _joints_of_plant(plant)
-        if joint.index() != weld.index()
-    ]
+    others = [joint for joint in _joints_of_plant(plant) if joint.index() != weld.index()]
+    ends = [(int(j.parent_body().index()), int(j.child_body().index())) for j in others]
     linked = np.zeros((plant.num_bodies(), plant.num_bodies()))
     linked[tuple(np.reshape(ends, (-1, 2)).astype(int).T)] = 1.0
     _, group = connected_components(linked, directed=False)
@@ -369,7 +354,9 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
     return arm, [BodyIndex(int(k)) for k in np.flatnonzero(group == group[int(load)])]
 
 
-def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> tuple[int, int, Array]:
+def _weld_properties(
+    plant: MultibodyPlant, S: Frame, joint: WeldJoint
+) -> tuple[int, int, tuple[Array | float, ...]]:
     """Return the indices of reaction and body of S in the plant's ports, and the geometry."""
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
@@ -384,7 +371,8 @@ def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> tuple
     instance = (joint.child_body() if on_parent else joint.parent_body()).model_instance()
     gravity = plant.gravity_field().gravity_vector() * plant.is_gravity_enabled(instance)
     rotations = [X.rotation().matrix().ravel() for X in (X_BS, X_SJc)]
-    places = [X_BS.translation(), *rotations, X_SJc.translation()]
-    geometry = np.concatenate([*places, gravity, [1.0 if on_parent else -1.0]])
+    places = map(np.array, (X_BS.translation(), *rotations, X_SJc.translation(), gravity))
+    # The sign turns the reaction on the joint's child into the wrench on the load.
+    geometry: tuple[Array | float, ...] = *places, 1.0 if on_parent else -1.0
     reaction = list(plant.GetJointIndices()).index(joint.index())
     return reaction, int(S.body().index()), geometry

@@ -18,36 +18,27 @@ _ATI_IMU_SETTINGS: dict[str, Any] = {
     "acceleration_range": 78.5,
     "acceleration_latency": 6e-3,
 }
-_BOTA_SETTINGS: dict[str, Any] = {"acceleration_latency": 0.0}
 
-# Ranges of fx and fy, fz, tx and ty, tz; noise of force and torque; resolution; other fields.
-_SETTINGS: dict[str, tuple[Any, ...]] = {
-    "ati_mini45": (290.0, 580.0, 10.0, 10.0, 0.06, 1.5e-3, 4.3e-4, {}),
-    "bota_sensone": (
-        *(500.0, 1200.0, 15.0, 12.0, 0.15, 3e-3, 1e-5),
-        _BOTA_SETTINGS | {"p_SoAo_S": [0.0, 0.0, 0.018]},
+# Ranges of fx and fy, fz, tx and ty, tz; noise of force and torque; resolution.
+_RANGES_AND_NOISE = {
+    "ati_mini45": (290.0, 580.0, 10.0, 10.0, 0.06, 1.5e-3, 4.3e-4),
+    "bota_sensone": (500.0, 1200.0, 15.0, 12.0, 0.15, 3e-3, 1e-5),
+    "bota_rokubi": (500.0, 1000.0, 10.0, 10.0, 0.2, 4e-3, 1e-5),
+    "robotiq_ft300": (300.0, 300.0, 30.0, 30.0, 0.1, 5e-3, 1e-5),
+    "onrobot_hex_e": (200.0, 200.0, 10.0, 6.5, 0.2, 5e-3, 1e-4),
+    "ur5e_built_in": (50.0, 50.0, 10.0, 10.0, 1.2, 0.07, 1e-4),
+    "franka_estimated": (100.0, 100.0, 20.0, 20.0, 0.035, 5e-3, 1e-5),
+}
+_OTHER_FIELDS: dict[str, dict[str, Any]] = {
+    "bota_sensone": dict(acceleration_latency=0.0, p_SoAo_S=[0.0, 0.0, 0.018]),
+    "bota_rokubi": dict(acceleration_latency=0.0, p_SoAo_S=[0.0, 0.0, 0.015]),
+    "robotiq_ft300": dict(bandwidth_hz=40.0, force_latency=5e-3),
+    "onrobot_hex_e": dict(
+        bandwidth_hz=150.0, force_walk=0.05, torque_walk=5e-4, force_latency=4e-3
     ),
-    "bota_rokubi": (
-        *(500.0, 1000.0, 10.0, 10.0, 0.2, 4e-3, 1e-5),
-        _BOTA_SETTINGS | {"p_SoAo_S": [0.0, 0.0, 0.015]},
-    ),
-    "robotiq_ft300": (
-        *(300.0, 300.0, 30.0, 30.0, 0.1, 5e-3, 1e-5),
-        {"bandwidth_hz": 40.0, "force_latency": 5e-3},
-    ),
-    "onrobot_hex_e": (
-        *(200.0, 200.0, 10.0, 6.5, 0.2, 5e-3, 1e-4),
-        {"bandwidth_hz": 150.0, "force_walk": 0.05, "torque_walk": 5e-4, "force_latency": 4e-3},
-    ),
-    "ur5e_built_in": (
-        *(50.0, 50.0, 10.0, 10.0, 1.2, 0.07, 1e-4),
-        {"bandwidth_hz": 100.0, "force_walk": 0.1, "torque_walk": 5e-3, "force_latency": 4e-3},
-    ),
-    "franka_estimated": (
-        *(100.0, 100.0, 20.0, 20.0, 0.035, 5e-3, 1e-5),
-        {"bandwidth_hz": 30.0, "gain_error": 0.05, "cross_talk": 0.03}
-        | {"force_walk": 0.2, "torque_walk": 0.02, "force_latency": 2e-3},
-    ),
+    "ur5e_built_in": dict(bandwidth_hz=100.0, force_walk=0.1, torque_walk=5e-3, force_latency=4e-3),
+    "franka_estimated": dict(bandwidth_hz=30.0, force_walk=0.2, torque_walk=0.02)
+    | dict(gain_error=0.05, cross_talk=0.03, force_latency=2e-3),
 }
 
 PRESETS: dict[str, WristSensorConfig] = {
@@ -70,9 +61,9 @@ PRESETS: dict[str, WristSensorConfig] = {
             **copy.deepcopy(_ATI_IMU_SETTINGS)
             | {"force_range": [side, side, along], "torque_range": [bending, bending, twist]}
             | {"force_noise": force, "torque_noise": torque, "resolution": step}
-            | others
+            | _OTHER_FIELDS.get(name, {})
         )
-        for name, (side, along, bending, twist, force, torque, step, others) in _SETTINGS.items()
+        for name, (side, along, bending, twist, force, torque, step) in _RANGES_AND_NOISE.items()
     },
 }
 """Sensors by name, with the sources of their values.

@@ -57,8 +57,7 @@ PRESET_NAMES = (
 _LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
 _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_TOLERANCE = 1e-6
-# Overload limit in ranges.
-_PLAUSIBLE_RANGES_UNSATURATED = 10.0
+_PLAUSIBLE_RANGES_UNSATURATED = 10.0  # overload limit in ranges
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
 _PLAUSIBLE_RANGES_SATURATED = 1.5
 
@@ -120,9 +119,7 @@ class WristSensorConfig:
 
     saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
     force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "range of fx, fy, fz")
-    torque_range: list[float] = quantity(
-        [12.0, 12.0, 12.0], "N m", 0.01, 1e4, "range of tx, ty, tz about So"
-    )
+    torque_range: list[float] = quantity([12.0] * 3, "N m", 0.01, 1e4, "range of tx, ty, tz at So")
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
@@ -186,14 +183,16 @@ class WristSensorConfig:
             what = "is not a rotation: its rows must be orthogonal unit vectors with determinant +1"
             remedy = "give nine numbers row by row; its columns are the axes of A in S"
             raise DrakeTeleopError(what, where=f"{where}.R_SA", remedy=remedy)
-        filtered = not self.ideal and self.low_pass != "none"
-        if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
-            raise DrakeTeleopError(
-                f"a bandwidth of {self.bandwidth_hz:g} Hz is too near to half of the sensor's rate "
-                f"({rate_hz:g} Hz)",
-                where=f"{where}.bandwidth_hz",
-                remedy="lower the bandwidth below 0.45 of the sensor's rate, or set low_pass: none",
-            )
+        if not self.ideal and self.low_pass != "none":
+            place, otherwise = f"{where}.bandwidth_hz", ", or set low_pass: none"
+            check_bandwidth(self.bandwidth_hz, rate_hz, place, otherwise)
+
+
+def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, otherwise: str = "") -> None:
+    if bandwidth_hz >= 0.45 * rate_hz:
+        what = f"a bandwidth of {bandwidth_hz:g} Hz is too near to half of the sensor's rate"
+        remedy = f"lower the bandwidth below 0.45 of the sensor's rate{otherwise}"
+        raise DrakeTeleopError(f"{what} ({rate_hz:g} Hz)", where=where, remedy=remedy)
 
 
 _CALIBRATION_FIELDS = (
@@ -299,28 +298,20 @@ def initialize_sensor_chain(
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
-    limits = config.ranges() if config.saturates else np.full(_NUM_CHANNELS, np.inf)
+    ranges = config.ranges()
+    limits = ranges if config.saturates else np.full(_NUM_CHANNELS, np.inf)
     sections = np.zeros((_NUM_LOW_PASS_SECTIONS, 5))
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
     latencies = config.latency_samples(period)
-    constants = _ChainConstants(
-        [*config.offset, *config.acceleration_offset],
-        np.append(np.array(config.drift) * period, np.zeros(6)),
-        config.noise_std(),
-        config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period),
-        config.resolution * config.ranges(),
-        limits,
-        wrench,
-        [force @ R_SA.T, angular @ R_SA.T],
-        p_SoAo_S,
-        sections,
-        _LOW_PASS_CHOICES.index(config.low_pass),
-        latencies,
-        config.encoder_resolution,
-        config.ideal,
-        _PLAUSIBLE_RANGES_UNSATURATED * config.ranges()[:6],
-    )
+    drift = np.append(np.array(config.drift) * period, np.zeros(6))
+    walk_step_std = config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period)
+    errors = drift, config.noise_std(), walk_step_std, config.resolution * ranges
+    channels = [*config.offset, *config.acceleration_offset], *errors, limits
+    calibrations = wrench, [force @ R_SA.T, angular @ R_SA.T]
+    low_pass = sections, _LOW_PASS_CHOICES.index(config.low_pass)
+    rest = config.encoder_resolution, config.ideal, _PLAUSIBLE_RANGES_UNSATURATED * ranges[:6]
+    constants = _ChainConstants(*channels, *calibrations, p_SoAo_S, *low_pass, latencies, *rest)
     rows = 0 if config.ideal else latencies.max() + 1
     memory = np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
     return as_compiled_arguments(constants), memory
@@ -400,9 +391,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     copy_into(reading, READ_WRENCH.start, memory, force, 6)
     copy_into(reading, READ_ACCELERATION.start, memory, acceleration + 6, 6)
-    reading[READ_SATURATED] = max(
-        memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
-    )
+    force_flag, acceleration_row = memory[force + _NUM_CHANNELS], acceleration + _NUM_CHANNELS
+    reading[READ_SATURATED] = max(force_flag, memory[acceleration_row + 1])
     encoders = _DELAY_LINE_START + int(late[2]) * width + _DELAY_LINE_ROW_SIZE
     copy_into(reading, READ_ANGLES.start, memory, encoders, angles.shape[0])
 

@@ -2,8 +2,8 @@
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-The state at each sampling instant is interpolated within an integration step. With contact outside
-the compiled contact law (`ToolContactModel.beyond`) each sample is an event at the end of a step.
+The state at each sampling instant is interpolated within an integration step. With contact from
+Drake (`ToolContactModel.drake_contact_reason`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -42,21 +42,11 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.load import regressor
 from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
+from drake_teleop.station.sensor import sensor_chain
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
     initialize_motion_estimator,
-)
-from drake_teleop.station.sensor.sensor_chain import (
-    FILTER_MEMORY_START,
-    LOST_READING_FLAG_SAMPLES,
-    NOISE_BLOCK_SIZE,
-    SAMPLES_PER_NOISE_BLOCK,
-    TRUE_JOINT_ANGLES,
-    WristSensorConfig,
-    are_values_plausible,
-    initialize_sensor_chain,
-    read_sensor_into,
 )
 from drake_teleop.station.slave.arm import (
     SENSOR_MOTION_SIZE,
@@ -133,26 +123,24 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     v, vdot = x[half : half + n], xdot[half : half + n]
     rigid = truth[regressor.SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
-    copy_into(truth, TRUE_JOINT_ANGLES.start, x, 0, n)
+    copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
-    sample = memory[:size]
+    sample, flag = memory[:size], regressor.SATURATION_FLAG_INDEX
     copy_into(memory, size, memory, 0, size)
-    if not are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[regressor.SATURATION_FLAG_INDEX] = (
-            regressor.LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
-        )
+    if not sensor_chain.are_values_plausible(constants, truth):  # keeps it out of the filters
+        sample[flag] = regressor.LOST_SAMPLE_FLAG + sensor_chain.LOST_READING_FLAG_SAMPLES
         return
-    lost = sample[regressor.SATURATION_FLAG_INDEX] - 1.0
+    lost = sample[flag] - 1.0
     if ideal:
         copy_into(sample, 0, truth, 0, regressor.SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[regressor.SATURATION_FLAG_INDEX] = 0.0
-        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
+        sample[flag] = 0.0
+        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, x, 0, n)
     else:
         reading = np.empty(13 + n)
-        read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
+        sensor_chain.read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
         estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
     if lost >= regressor.LOST_SAMPLE_FLAG:
-        sample[regressor.SATURATION_FLAG_INDEX] = lost
+        sample[flag] = lost
 
 
 @njit(cache=True)
@@ -294,7 +282,7 @@ class WristSensor(LeafSystem):
     def __init__(
         self,
         slave: SlavePlant,
-        config: WristSensorConfig,
+        config: sensor_chain.WristSensorConfig,
         motion: MotionEstimationConfig,
         period: float,
         hold_time: float,
@@ -304,7 +292,7 @@ class WristSensor(LeafSystem):
         super().__init__()
         arm = slave.arm
         n = self._n = arm.num_joints
-        constants, chain = initialize_sensor_chain(config, n, period)
+        constants, chain = sensor_chain.initialize_sensor_chain(config, n, period)
         motion_constants, estimator = initialize_motion_estimator(motion, config, n, period)
         self._physics, contact = slave.physics_of_plant, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
@@ -319,9 +307,8 @@ class WristSensor(LeafSystem):
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._uses_plant_contact = config.ideal or bool(contact.drake_contact_reason)
         # Contact needs many steps per torque sample, so queueing them saves time.
-        self._max_queued_steps = (
-            _MAX_QUEUED_PLANT_STEPS if slave.can_touch and not contact.drake_contact_reason else 1
-        )
+        queues = slave.can_touch and not contact.drake_contact_reason
+        self._max_queued_steps = _MAX_QUEUED_PLANT_STEPS if queues else 1
         self._around = np.zeros(2 + contact.plant_state_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
@@ -336,8 +323,8 @@ class WristSensor(LeafSystem):
         self._plant_copy = cache(copy)  # made at its first use
         self._max_copy_wrenches = 2 * self._max_queued_steps + int(hold_time / period) + 4
         self._period = period
-        self._event_periods = (hold_time, SAMPLES_PER_NOISE_BLOCK * period)
-        self._no_noise, self._zero_wrench = np.zeros(NOISE_BLOCK_SIZE), np.zeros(6)
+        self._event_periods = (hold_time, sensor_chain.SAMPLES_PER_NOISE_BLOCK * period)
+        self._no_noise, self._zero_wrench = np.zeros(sensor_chain.NOISE_BLOCK_SIZE), np.zeros(6)
         self._no_rate = np.zeros(0)
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
@@ -355,7 +342,7 @@ class WristSensor(LeafSystem):
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
             self._tool = contact.tool_bodies, contact.tool_shapes
         if not config.ideal:
-            self._noise = self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
+            self._noise = self.DeclareVectorInputPort("noise", sensor_chain.NOISE_BLOCK_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._memory_slice = slice(len(first) + 1, None)  # memory in the output
@@ -366,23 +353,21 @@ class WristSensor(LeafSystem):
         seen = (self._state, *pushes, *around, self._noise)
         tickets = {port.ticket() for port in seen if port is not None}
         tickets |= {self.time_ticket(), self.xd_ticket()}
-        self._step = self.DeclareVectorOutputPort(
-            "step", len(self._result), weak_callback(self._calc_step), tickets
-        )
+        calc = weak_callback(self._calc_step)
+        self._step = self.DeclareVectorOutputPort("step", len(self._result), calc, tickets)
         if self.reason_beyond_contact_law:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
-        self.DeclarePeriodicPublishEvent(
-            _ACCELERATION_CHECK_PERIOD_S, 0.0, self._check_acceleration_for_unknown_forces
-        )
+        check = self._check_acceleration_for_unknown_forces
+        self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_PERIOD_S, 0.0, check)
 
     @property
     def motion_dependent_state_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
         size = regressor.sample_size(self._n)
-        before_and_walks = range(size, 2 * size + FILTER_MEMORY_START)
+        before_and_walks = range(size, 2 * size + sensor_chain.FILTER_MEMORY_START)
         others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
@@ -501,12 +486,10 @@ class WristSensor(LeafSystem):
         vdot = self._acceleration.Eval(context)
         error, size = np.abs(xdot[n + 1 : -1] - vdot).max(), np.abs(vdot).max()
         if not error < _ACCELERATION_CHECK_TOLERANCE * (1.0 + size):
-            raise DrakeTeleopError(
-                f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
-                "not receive it",
-                where="wrist_sensor.applied_wrench_W",
-                remedy="connect every wrench on the tool to this port",
-            )
+            what = "a force moves the slave, but the wrist sensor does not receive it"
+            what, where = f"at {context.get_time():g} s {what}", "wrist_sensor.applied_wrench_W"
+            remedy = "connect every wrench on the tool to this port"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         return EventStatus.Succeeded()
 
 
@@ -523,7 +506,7 @@ def sample_at_rest(arm: ArmModel, q: Array) -> Array:
 def AddCompiledWristSensor(
     builder: DiagramBuilder,
     slave: SlavePlant,
-    config: WristSensorConfig,
+    config: sensor_chain.WristSensorConfig,
     motion: MotionEstimationConfig,
     period: float,
     hold_time: float,
@@ -538,8 +521,8 @@ def AddCompiledWristSensor(
     connect_matching_inputs(builder, sensor, slave.ports)
     connect_matching_inputs(builder, sensor, torque)
     if not config.ideal:
-        block_s = SAMPLES_PER_NOISE_BLOCK * period
-        noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
+        block_s = sensor_chain.SAMPLES_PER_NOISE_BLOCK * period
+        noise = RandomSource(RandomDistribution.kGaussian, sensor_chain.NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     parts = regressor.signal_sizes_of_sample(slave.arm.num_joints)

@@ -37,8 +37,7 @@ from drake_teleop.station.slave.joint_friction import dry_friction
 ROTATION_COLUMN, TRANSLATION_COLUMN, PHI_COLUMN, ROTOR_COLUMN = 0, 9, 12, 22
 DAMPING_COLUMN, DRY_FRICTION_COLUMN, IS_PRISMATIC_COLUMN = 23, 24, 25
 NUM_TABLE_COLUMNS = 26
-# First of three columns with gravity, in the last row only.
-LAST_ROW_GRAVITY_COLUMN = 22
+LAST_ROW_GRAVITY_COLUMN = 22  # first of three columns with gravity, in the last row only
 
 SENSOR_MOTION_SIZE = 21
 """Length of the vector that `sensor_motion` fills."""

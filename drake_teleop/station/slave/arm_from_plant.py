@@ -9,18 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Frame,
-    Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    RevoluteJoint,
-    RigidBody,
-    SpatialInertia,
-    WeldJoint,
-)
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -46,7 +36,9 @@ _DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
 
 
 def ArmModelFromPlant(
-    plant: MultibodyPlant, model_instance: ModelInstanceIndex, sensor_frame_name: str = "sensor"
+    plant: MultibodyPlant,
+    model_instance: tree.ModelInstanceIndex,
+    sensor_frame_name: str = "sensor",
 ) -> ArmModel:
     """Return the arm between the world and the sensor frame of a finalized plant.
 
@@ -54,11 +46,9 @@ def ArmModelFromPlant(
     other joint moves on its links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
-        raise DrakeTeleopError(
-            f"the arm has no frame named {sensor_frame_name!r}",
-            where=plant.GetModelInstanceName(model_instance),
-            remedy="name the frame or link at which the sensor measures",
-        )
+        what, where = "the arm has no frame named", plant.GetModelInstanceName(model_instance)
+        remedy = "name the frame or link at which the sensor measures"
+        raise DrakeTeleopError(f"{what} {sensor_frame_name!r}", where=where, remedy=remedy)
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
     all_joints = map(plant.get_joint, plant.GetJointIndices())
     inboard_joints = {joint.child_body().index(): joint for joint in all_joints}
@@ -71,22 +61,19 @@ def ArmModelFromPlant(
     for row, joint in enumerate(joints):
         table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
-        table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
-    gravity = plant.gravity_field()
-    table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = (
-        gravity.gravity_vector() * gravity.is_enabled(model_instance)
-    )
+        table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, tree.PrismaticJoint)
+    field = plant.gravity_field()
+    gravity = field.gravity_vector() * field.is_enabled(model_instance)
+    table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = gravity
 
     context = plant.CreateDefaultContext()
+    sliding = tree.PrismaticJoint
+    axes = [j.translation_axis() if isinstance(j, sliding) else j.revolute_axis() for j in joints]
     # C rotates the joint's axis to z.
-    C = [RigidTransform(RotationMatrix.MakeFromOneVector(_joint_axis(j), 2)) for j in joints]
-    X_WS = frame_S.CalcPoseInWorld(context)
-    X_WJ = [
-        j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)
-    ]
-    X_WL = [j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)]
-    X_WJ.append(X_WS)
-    X_WL.append(X_WS)
+    C = [RigidTransform(RotationMatrix.MakeFromOneVector(axis, 2)) for axis in axes]
+    X_WS, pairs = frame_S.CalcPoseInWorld(context), list(zip(joints, C, strict=True))
+    X_WJ = [*(j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
+    X_WL = [*(j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
     for row, X_WP in enumerate([RigidTransform(), *X_WL[:-1]]):
         X_PJ = X_WP.InvertAndCompose(X_WJ[row])
         table[row, ROTATION_COLUMN:TRANSLATION_COLUMN] = X_PJ.rotation().matrix().ravel()
@@ -100,45 +87,32 @@ def ArmModelFromPlant(
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_about_link_origin(M_B, X_LB)
     lower, upper = np.array([_joint_position_limits(j) for j in joints]).T.copy()
-    return ArmModel(
-        joint_names=tuple(joint.name() for joint in joints),
-        table=table,
-        lower=lower,
-        upper=upper,
-        velocity_limit=np.array([j.velocity_upper_limits()[0] for j in joints]),
-        acceleration_limit=np.array([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=np.array(efforts),
-        position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
-        velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
-    )
+    speed = np.array([j.velocity_upper_limits()[0] for j in joints])
+    acceleration = np.array([j.acceleration_upper_limits()[0] for j in joints])
+    limits = lower, upper, speed, acceleration, np.array(efforts)
+    q_index = np.array([j.position_start() for j in joints], dtype=np.intp)
+    v_index = np.array([j.velocity_start() for j in joints], dtype=np.intp)
+    return ArmModel(tuple(joint.name() for joint in joints), table, *limits, q_index, v_index)
 
 
-def _joint_position_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
+def _joint_position_limits(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> tuple[float, float]:
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
-    if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
+    if isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
-    return (
-        -np.inf if lower < -_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else lower,
-        np.inf if upper > _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else upper,
-    )
-
-
-def _joint_axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
-    slides = isinstance(joint, PrismaticJoint)
-    axis: Array = joint.translation_axis() if slides else joint.revolute_axis()
-    return axis
+    limit = _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M
+    return -np.inf if lower < -limit else lower, np.inf if upper > limit else upper
 
 
 def _moving_joints_to_sensor(
-    inboard_joints: dict[BodyIndex, Joint], frame_S: Frame
-) -> list[RevoluteJoint | PrismaticJoint]:
-    body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
+    inboard_joints: dict[tree.BodyIndex, tree.Joint], frame_S: tree.Frame
+) -> list[tree.RevoluteJoint | tree.PrismaticJoint]:
+    body, joints = frame_S.body(), list[tree.RevoluteJoint | tree.PrismaticJoint]()
     while body.index() in inboard_joints:
         joint = inboard_joints[body.index()]
-        if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+        if isinstance(joint, (tree.RevoluteJoint, tree.PrismaticJoint)):
             joints.append(joint)
-        elif not isinstance(joint, WeldJoint):
+        elif not isinstance(joint, tree.WeldJoint):
             what = f"the arm up to the sensor contains an unsupported {joint.type_name()} joint"
             remedy = "weld the arm's base to the world; up to the sensor, use joints of one axis"
             raise DrakeTeleopError(what, where=joint.name(), remedy=remedy)
@@ -151,10 +125,10 @@ def _moving_joints_to_sensor(
 
 
 def _table_row_of_body(
-    body: RigidBody,
-    inboard_joints: dict[BodyIndex, Joint],
-    rows: dict[BodyIndex, int],
-    sensor_body: RigidBody,
+    body: tree.RigidBody,
+    inboard_joints: dict[tree.BodyIndex, tree.Joint],
+    rows: dict[tree.BodyIndex, int],
+    sensor_body: tree.RigidBody,
 ) -> int | None:
     moving, outermost = None, body
     while True:
@@ -165,7 +139,7 @@ def _table_row_of_body(
         if body.index() not in inboard_joints:
             return None
         joint = inboard_joints[body.index()]
-        if not isinstance(joint, WeldJoint):
+        if not isinstance(joint, tree.WeldJoint):
             moving = joint
         body = joint.parent_body()
     if moving is not None:
@@ -174,7 +148,7 @@ def _table_row_of_body(
     return rows[body.index()]
 
 
-def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
+def _phi_about_link_origin(M_BBo_B: tree.SpatialInertia, X_LB: RigidTransform) -> Array:
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
@@ -209,12 +183,10 @@ def fill_missing_joint_limits(
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
-        raise DrakeTeleopError(
-            f"{np.array(arm.joint_names)[immovable][0]} cannot move: both of its limits are "
-            f"{arm.lower[immovable][0]:g} {unit}",
-            where=where,
-            remedy="correct the limits, or make the joint a fixed one",
-        )
+        name, limit = np.array(arm.joint_names)[immovable][0], arm.lower[immovable][0]
+        what = f"{name} cannot move: both of its limits are {limit:g} {unit}"
+        remedy = "correct the limits, or make the joint a fixed one"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     reach = _DEFAULT_JOINT_HALF_RANGE_M
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
@@ -232,22 +204,17 @@ def fill_missing_joint_limits(
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
+    turning_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s"
+    sliding_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s"
+    in_rad = f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,"
     rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
         (unlimited, "turns without end", f"a range of +-{reach:g} m"),
         (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
-        (
-            ~_is_positive_and_finite(arm.velocity_limit),
-            f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s",
-            f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s",
-        ),
+        (~_is_positive_and_finite(arm.velocity_limit), turning_speed, sliding_speed),
         (~_is_positive_and_finite(specified), rate_text, rate_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
-        (
-            ~plausible,
-            f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,",
-            "",
-        ),
+        (~plausible, in_rad, ""),
     ):
         for text, kind in ((revolute_text, ~slides), (prismatic_text, slides)):
             assumed = missing & kind

@@ -176,14 +176,12 @@ def set_one_actuator_per_joint(
     the limits of existing actuators.
     """
     moving = [index for index in chain if is_joint_moving(plant, index)]
-    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    own = {each.joint().index(): each for each in actuators if each.joint().index() in moving}
-    data = {
-        index: (each.effort_limit(), each.default_rotor_inertia(), each.default_gear_ratio())
-        for index, each in own.items()
-    }
-    for each in own.values():
-        plant.RemoveJointActuator(each)
+    data = dict[JointIndex, tuple[float, float, float]]()
+    for motor in list(map(plant.get_joint_actuator, plant.GetJointActuatorIndices())):
+        if motor.joint().index() in moving:
+            drive = motor.default_rotor_inertia(), motor.default_gear_ratio()
+            data[motor.joint().index()] = motor.effort_limit(), *drive
+            plant.RemoveJointActuator(motor)
     for index in moving:
         joint = plant.get_joint(index)
         effort, rotor, gear = data.get(index, (np.inf, 0.0, 1.0))
@@ -221,9 +219,8 @@ def assume_rotor_inertias(
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
     for joint in (joint for joint in joints if joint.index() in motor):
-        if motor[joint.index()].default_reflected_inertia() > 0.0:
-            continue
-        if _carries_inertia(plant, joint, auxiliary_bodies):
+        has_rotor = motor[joint.index()].default_reflected_inertia() > 0.0
+        if has_rotor or _carries_inertia(plant, joint, auxiliary_bodies):
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())

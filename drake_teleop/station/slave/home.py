@@ -61,12 +61,10 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
     outside = (q < arm.lower) | (q > arm.upper)
     if outside.any():
         k = int(outside.argmax())
-        raise DrakeTeleopError(
-            f"joint {arm.joint_names[k]} at {q[k]:g} is outside its limits, {arm.lower[k]:.4g} to"
-            f" {arm.upper[k]:.4g}",
-            where="slave.home",
-            remedy="give a position within these limits",
-        )
+        limits = f"{arm.lower[k]:.4g} to {arm.upper[k]:.4g}"
+        what = f"joint {arm.joint_names[k]} at {q[k]:g} is outside its limits, {limits}"
+        remedy = "give a position within these limits"
+        raise DrakeTeleopError(what, where="slave.home", remedy=remedy)
     return q
 
 

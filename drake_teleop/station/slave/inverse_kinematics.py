@@ -19,14 +19,10 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, forward_kinematics
 
-SHOULDER_HEIGHT_M = 0.420
-"""Base to shoulder [m]."""
-UPPER_ARM_LENGTH_M = 0.450
-"""Shoulder to elbow [m]."""
-FOREARM_LENGTH_M = 0.450
-"""Elbow to wrist centre [m]."""
-WRIST_TO_S_M = 0.085
-"""Wrist centre to the origin of S, along z_S [m]."""
+#: Base to shoulder [m]; shoulder to elbow [m].
+SHOULDER_HEIGHT_M, UPPER_ARM_LENGTH_M = 0.420, 0.450
+#: Elbow to wrist centre [m]; wrist centre to the origin of S, along z_S [m].
+FOREARM_LENGTH_M, WRIST_TO_S_M = 0.450, 0.085
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
 _MAX_SINGULAR_DISTANCE_OR_SIN_Q5 = 1e-9
@@ -65,9 +61,7 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _ik_status_and_all_solutions_into(
-    R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array
-) -> int:
+def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array) -> int:
     """Write all eight solutions to q (8, 6); return the `IkStatus`.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
@@ -101,9 +95,8 @@ def _ik_status_and_all_solutions_into(
         for b in range(2):
             q3 = q3_up if b == 0 else -q3_up
             to_wrist = np.arctan2(-rho if a == 0 else rho, z)
-            q2 = to_wrist - np.arctan2(
-                FOREARM_LENGTH_M * np.sin(q3), UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M * np.cos(q3)
-            )
+            along = UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M * np.cos(q3)
+            q2 = to_wrist - np.arctan2(FOREARM_LENGTH_M * np.sin(q3), along)
             c, s = np.cos(q2 + q3), np.sin(q2 + q3)
             # M = Ry(q2 + q3) Rz(-q1) R = Rz(q4) Ry(-q5) Rz(q6)
             u = c1 * R[0, 2] + s1 * R[1, 2]
@@ -155,7 +148,7 @@ def _nearest_branch_into(
     if not (np.isfinite(R.sum()) and are_finite_and_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _ik_status_and_all_solutions_into(R, p, reference[0], reference[3], branches)
+    status = _all_solutions_into(R, p, reference[0], reference[3], branches)
     best = -1
     best_distance = np.inf
     for row in range(8):

@@ -78,23 +78,19 @@ class JointControlConfig:
         for name in ("position_bandwidth_hz", "velocity_bandwidth_hz"):
             # A double integrator with held torques is stable below gain 2 / period in both loops.
             if (bandwidth := getattr(self, name)) >= rate / np.pi:
-                raise DrakeTeleopError(
-                    f"{bandwidth:g} Hz is unstable with joint control at {rate:g} Hz (stable below"
-                    f" {rate / np.pi:.4g} Hz)",
-                    where=f"{where}.{name}",
-                    remedy="lower it, or raise rates.joint_control_hz",
-                )
+                what = f"{bandwidth:g} Hz is unstable with joint control at {rate:g} Hz"
+                what = f"{what} (stable below {rate / np.pi:.4g} Hz)"
+                remedy = "lower it, or raise rates.joint_control_hz"
+                raise DrakeTeleopError(what, where=f"{where}.{name}", remedy=remedy)
 
     def check_computed_torque(self, what: str) -> None:
         """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
         if self.servo != COMPUTED_TORQUE_SERVO_NAME:
-            raise DrakeTeleopError(
-                f"{what} does not support the servo {self.servo}",
-                where="joint_control.servo",
-                remedy=f"choose {COMPUTED_TORQUE_SERVO_NAME}, with a position_bandwidth_hz of"
-                f" {1 / (2 * np.pi * self.tracking_delay_s):.2g} for the same lag; `run` supports"
-                " every servo",
-            )
+            what = f"{what} does not support the servo {self.servo}"
+            hz = 1 / (2 * np.pi * self.tracking_delay_s)
+            value = f"with a position_bandwidth_hz of {hz:.2g} for the same lag"
+            remedy = f"choose {COMPUTED_TORQUE_SERVO_NAME}, {value}; `run` supports every servo"
+            raise DrakeTeleopError(what, where="joint_control.servo", remedy=remedy)
 
 
 @njit(cache=True, omits_reference_counting=True)

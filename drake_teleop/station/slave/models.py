@@ -9,34 +9,13 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import (
-    FlattenModelDirectives,
-    LoadModelDirectives,
-    Parser,
-    ProcessModelDirectives,
-)
+from pydrake.multibody import parsing
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
-from drake_teleop.station.slave.chain_joints import (
-    assume_rotor_inertias,
-    check_chain,
-    check_joints_form_tree,
-    is_joint_moving,
-    set_one_actuator_per_joint,
-    weld_base_and_find_chain,
-    weld_free_bodies,
-    weld_held_joints,
-    weld_joints_outside_chain,
-)
-from drake_teleop.station.slave.drake_errors import (
-    ROBOT_ERROR_TEXTS,
-    SCENE_ERROR_TEXTS,
-    raise_logged_errors,
-    translate_drake_errors,
-)
+from drake_teleop.station.slave import chain_joints, drake_errors
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import (
@@ -70,18 +49,19 @@ def repair_and_parse_model(
         read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
     files = ModelFiles(path, package_paths)
     purpose = purpose._replace(plant_has_shapes=plant.geometry_source_is_registered())
-    parser = Parser(plant)
+    parser = parsing.Parser(plant)
     parser.SetAutoRenaming(True)
     files.merge_packages_with_map(parser.package_map())
     files.check_referenced_files(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
-    expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
-    with translate_drake_errors(path, expected, folder.name):
+    robot, scene = drake_errors.ROBOT_ERROR_TEXTS, drake_errors.SCENE_ERROR_TEXTS
+    expected = scene if purpose.is_scene else robot
+    with drake_errors.translate_drake_errors(path, expected, folder.name):
         read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
         instances, repaired = read(parser, path, files, purpose, Path(folder.name))
-        check_joints_form_tree(plant, str(path))
+        chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         what = "the model has springs or other force elements, which are not supported"
         remedy = "remove them; only motors, gravity and contact move the arm"
@@ -91,10 +71,10 @@ def repair_and_parse_model(
 
 
 def _add_repaired_file(
-    parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     repaired = _repair_file(path, files, purpose, folder)
-    with raise_logged_errors():
+    with drake_errors.raise_logged_errors():
         if repaired.text:
             kind = path.suffix.lower().removeprefix(".")
             instances = parser.AddModelsFromString(repaired.text, kind)
@@ -104,10 +84,12 @@ def _add_repaired_file(
 
 
 def _add_files_of_directives(
-    parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    with raise_logged_errors():
-        directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
+    with drake_errors.raise_logged_errors():
+        directives = parsing.FlattenModelDirectives(
+            parsing.LoadModelDirectives(str(path)), parser.package_map()
+        )
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
     for added in (each.add_model for each in directives.directives if each.add_model):
         file = files.find_file(added.file)
@@ -119,8 +101,8 @@ def _add_files_of_directives(
             copy = folder / f"{len(repaired)}_{file.name}"
             copy.write_text(repaired[file].text, encoding="utf-8")
             added.file = f"file://{copy}"
-    with raise_logged_errors():
-        models = ProcessModelDirectives(directives, parser)
+    with drake_errors.raise_logged_errors():
+        models = parsing.ProcessModelDirectives(directives, parser)
     return [each.model_instance for each in models], list(repaired.values())
 
 
@@ -163,16 +145,17 @@ def ParseModel(
     added_instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
     frame = _find_sensor_frame(plant, added_instances, sensor_frame, where)
     added = set(plant.GetJointIndices()) - before
-    held = weld_held_joints(plant, hold, added)
-    chain = weld_base_and_find_chain(plant, frame, X_WBase, where)
-    check_chain(plant, chain, repaired.dependence_reasons, where)
-    free = weld_free_bodies(plant, added_instances)
-    with translate_drake_errors(path):
-        held += weld_joints_outside_chain(plant, before, chain)
+    held = chain_joints.weld_held_joints(plant, hold, added)
+    chain = chain_joints.weld_base_and_find_chain(plant, frame, X_WBase, where)
+    chain_joints.check_chain(plant, chain, repaired.dependence_reasons, where)
+    free = chain_joints.weld_free_bodies(plant, added_instances)
+    with drake_errors.translate_drake_errors(path):
+        held += chain_joints.weld_joints_outside_chain(plant, before, chain)
         limits = repaired.effort_limits if repaired.text else None
-        set_one_actuator_per_joint(plant, chain, limits)
-        rotors = assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
-    instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
+        chain_joints.set_one_actuator_per_joint(plant, chain, limits)
+        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
+    moving = [k for k in chain if chain_joints.is_joint_moving(plant, k)]
+    instances = {plant.get_joint(index).model_instance() for index in moving}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
         what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
@@ -199,11 +182,11 @@ def ParseTool(
         what = f"the tool must have one root link, but has {len(roots)}: {names}"
         remedy = "give one tree of links; its root is welded to the sensor frame"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-    with translate_drake_errors(path):
-        assumptions = [*repaired.assumptions, *weld_joints_outside_chain(plant, before, [])]
+    with drake_errors.translate_drake_errors(path):
+        held_joints = chain_joints.weld_joints_outside_chain(plant, before, [])
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
-    return roots[0], assumptions
+    return roots[0], [*repaired.assumptions, *held_joints]
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> None:

@@ -38,8 +38,7 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
-# Largest error that is rounding only [m].
-_POSE_ROUNDING_ERROR_M = 1e-14
+_POSE_ROUNDING_ERROR_M = 1e-14  # largest error that is rounding only [m]
 MIN_SINGULAR_VALUE_M = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
 MAX_SOLVER_STEPS_PER_COMMAND = 10
@@ -48,10 +47,8 @@ MAX_SOLVER_STEPS_PER_COMMAND = 10
 _MIN_STEP_DAMPING_M2 = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-3, 100, 100
-# Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_ZERO_GRADIENT_RATIO_M = 1e-3
-# Error below which out of reach and singular are indistinguishable [m].
-_UNREACHED_ERROR_M = 5e-6
+_ZERO_GRADIENT_RATIO_M = 1e-3  # ratio |J^T e| / |e| below which the gradient counts as zero [m]
+_UNREACHED_ERROR_M = 5e-6  # error below which out of reach and singular are indistinguishable [m]
 # The same tolerance for `find_posture`, which stops the search earlier [m].
 _SEARCH_UNREACHED_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
@@ -83,16 +80,12 @@ def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
 @njit(cache=True)
 def _smaller_gram_matrix_into(J, H):
     n = H.shape[0]
-    rows = n == J.shape[1]
+    A = J if n == J.shape[1] else J.T
     for i in range(n):
         for k in range(i + 1):
             value = 0.0
-            if rows:
-                for m in range(6):
-                    value += J[m, i] * J[m, k]
-            else:
-                for m in range(J.shape[1]):
-                    value += J[i, m] * J[k, m]
+            for m in range(A.shape[0]):
+                value += A[m, i] * A[m, k]
             H[i, k] = H[k, i] = value
 
 
@@ -209,9 +202,8 @@ def follow_pose(
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
                 # The last joint turns the tool without the links.
-                step = (
-                    pull * np.sin(posture[i] - q[i]) if i < n - 1 else _best_step_of_joint(J, e, i)
-                )
+                turn = pull * np.sin(posture[i] - q[i])
+                step = turn if i < n - 1 else _best_step_of_joint(J, e, i)
             q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))

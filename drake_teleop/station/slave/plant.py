@@ -10,20 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import (
-    Capsule,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    GeometryId,
-    HalfSpace,
-    Mesh,
-    Role,
-    SceneGraph,
-    SceneGraphInspector,
-    Sphere,
-)
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
@@ -32,6 +20,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
+from drake_teleop.station.slave import home
 from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, pose_into
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
@@ -41,11 +30,6 @@ from drake_teleop.station.slave.arm_from_plant import (
 )
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import (
-    R_WS_HOME,
-    check_inertia_and_holding_torque,
-    find_start_posture,
-)
 from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
@@ -142,7 +126,7 @@ def start_pose(slave: Slave) -> Array:
     """Return X_WS [qw qx qy qz px py pz] at the start, from `slave.home` or `slave.position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
-    return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
+    return np.array([*home.R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
@@ -193,14 +177,14 @@ def AddSlavePlant(
         finalize_without_limit_warnings(plant)
     contact = ToolContactModel()
     if environment is not None and surroundings is not None:
-        _remove_visual_shapes(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_arm_collisions(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
+        load = bodies_carried_by(plant, frame.body())
+        _remove_shapes_without_contact(plant, scene_graph, instance, load)
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
-    start = find_start_posture(slave, arm) if q_start is None else q_start
+    start = home.find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
-        check_inertia_and_holding_torque(arm, start)
+        home.check_inertia_and_holding_torque(arm, start)
     friction = values_per_joint(arm, slave.friction, "slave.friction", 0.0)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
@@ -286,20 +270,20 @@ def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
         joint.set_position_limits(lower, upper)
 
 
-def _remove_visual_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    for index in range(plant.num_bodies()):
-        for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
-            scene_graph.RemoveGeometry(plant.get_source_id(), shape)
-
-
-def _remove_arm_collisions(
-    plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
+def _remove_shapes_without_contact(
+    plant: MultibodyPlant,
+    scene: geometry.SceneGraph,
+    arm: ModelInstanceIndex,
+    load: list[RigidBody],
 ) -> None:
-    carried = {body.index() for body in load}
-    for index in plant.GetBodyIndices(arm):
-        for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
-            if index not in carried:
-                scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
+    source, carried = plant.get_source_id(), {body.index() for body in load}
+    for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
+        for shape in plant.GetVisualGeometriesForBody(body):
+            scene.RemoveGeometry(source, shape)
+    own = [index for index in plant.GetBodyIndices(arm) if index not in carried]
+    for body in map(plant.get_body, own):
+        for shape in plant.GetCollisionGeometriesForBody(body):
+            scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
 def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
@@ -316,35 +300,34 @@ def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
     return hulls
 
 
-def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+def hull_points_of(
+    inspector: geometry.SceneGraphInspector, identifier: geometry.GeometryId
+) -> Array:
     """Return points (k, 3) on the convex hull of a shape, in its body's frame [m].
 
     A half space has none, a round shape those of a polyhedron in it.
     """
-    shape = inspector.GetShape(geometry)
-    if isinstance(shape, (Mesh, Convex)):
+    shape = inspector.GetShape(identifier)
+    if isinstance(shape, (geometry.Mesh, geometry.Convex)):
         hull = shape.GetConvexHull()
         points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
-    elif isinstance(shape, Sphere):
+    elif isinstance(shape, (geometry.Sphere, geometry.Capsule)):
         points = shape.radius() * _unit_sphere_points()
-    elif isinstance(shape, Ellipsoid):
+    elif isinstance(shape, geometry.Ellipsoid):
         points = _unit_sphere_points() * [shape.a(), shape.b(), shape.c()]
-    elif isinstance(shape, Capsule):
-        end = [0.0, 0.0, shape.length() / 2]
-        ball = shape.radius() * _unit_sphere_points()
-        points = np.vstack([ball - end, ball + end])
-    elif isinstance(shape, Cylinder):
+    elif isinstance(shape, geometry.Cylinder):
         rim = _unit_sphere_points()[_NUM_CIRCLE_POINTS : 2 * _NUM_CIRCLE_POINTS] * [1.0, 1.0, 0.0]
-        rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
-        end = [0.0, 0.0, shape.length() / 2]
-        points = np.vstack([rim - end, rim + end])
-    elif isinstance(shape, HalfSpace):
+        points = rim * (shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True))
+    elif isinstance(shape, geometry.HalfSpace):
         return np.zeros((0, 3))
     else:
-        box = inspector.GetObbInGeometryFrame(geometry)
+        box = inspector.GetObbInGeometryFrame(identifier)
         corners = np.array(list(product((-1.0, 1.0), repeat=3)))
         points = (box.pose() @ (corners * box.half_width()).T).T
-    return (inspector.GetPoseInFrame(geometry) @ points.T).T
+    if isinstance(shape, (geometry.Capsule, geometry.Cylinder)):
+        end = [0.0, 0.0, shape.length() / 2]
+        points = np.vstack([points - end, points + end])
+    return (inspector.GetPoseInFrame(identifier) @ points.T).T
 
 
 def _unit_sphere_points() -> Array:

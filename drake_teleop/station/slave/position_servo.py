@@ -22,8 +22,7 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 # Memory of the servo: periods since the last command, index of the oldest command in the queue;
 # then target, r and dr/dt (n each), and the queue of commands.
 _PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
-# Braking v^2 = 2 a d with 80 % of the largest acceleration.
-_TWICE_BRAKING_SHARE = 2 * 0.8
+_TWICE_BRAKING_SHARE = 2 * 0.8  # braking v^2 = 2 a d with 80 % of the largest acceleration
 
 
 @settings
@@ -43,35 +42,27 @@ class PositionInterface:
     max_acceleration: float = quantity(
         40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
     )
-    drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "of the drives; sets joint stiffness"
-    )
+    drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "of drives; sets joint stiffness")
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         periods = rate / self.command_hz
         if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
-            raise DrakeTeleopError(
-                f"rates.joint_control_hz, {rate:g} Hz, is no multiple of command_hz,"
-                f" {self.command_hz:g} Hz",
-                where=f"{where}.command_hz",
-                remedy="choose a rate of the joint control that is a multiple of it",
-            )
+            commands = f"command_hz, {self.command_hz:g} Hz"
+            what = f"rates.joint_control_hz, {rate:g} Hz, is no multiple of {commands}"
+            remedy = "choose a rate of the joint control that is a multiple of it"
+            raise DrakeTeleopError(what, where=f"{where}.command_hz", remedy=remedy)
         damping = self.acceleration_per_error * self.lookahead / rate
         if damping + 0.5 * self.acceleration_per_error / rate**2 > 1.5:  # unstable from 2
-            raise DrakeTeleopError(
-                f"{self.acceleration_per_error:g} 1/s^2 is too high for a lookahead of"
-                f" {self.lookahead:g} s and control steps of {1e3 / rate:g} ms",
-                where=f"{where}.acceleration_per_error",
-                remedy="lower it or lookahead, or raise rates.joint_control_hz",
-            )
+            limits = f"a lookahead of {self.lookahead:g} s and control steps of {1e3 / rate:g} ms"
+            what = f"{self.acceleration_per_error:g} 1/s^2 is too high for {limits}"
+            remedy = "lower it or lookahead, or raise rates.joint_control_hz"
+            raise DrakeTeleopError(what, where=f"{where}.acceleration_per_error", remedy=remedy)
         if self.drive_bandwidth_hz > 0.1 * rate:
-            raise DrakeTeleopError(
-                f"the bandwidth, {self.drive_bandwidth_hz:g} Hz, is too high for joint control at"
-                f" {rate:g} Hz",
-                where=f"{where}.drive_bandwidth_hz",
-                remedy="choose at most a tenth of rates.joint_control_hz",
-            )
+            control = f"joint control at {rate:g} Hz"
+            what = f"the bandwidth, {self.drive_bandwidth_hz:g} Hz, is too high for {control}"
+            remedy = "choose at most a tenth of rates.joint_control_hz"
+            raise DrakeTeleopError(what, where=f"{where}.drive_bandwidth_hz", remedy=remedy)
 
 
 #: Interfaces by name; docs/station.md lists the sources.

@@ -9,22 +9,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.geometry import (
-    Capsule,
-    CollisionFilterDeclaration,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    GeometryId,
-    GeometrySet,
-    ProximityProperties,
-    Role,
-    SceneGraph,
-)
+from pydrake import geometry
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RigidBody
@@ -96,18 +85,16 @@ class PostureShapes:
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self._root)
-        inspector = self._scene_graph.model_inspector()
-        self._points = {
-            index: [hull_points_of(inspector, shape) for shape in self.contact_shapes_of(index)]
-            for index in map(BodyIndex, range(self.plant.num_bodies()))
-        }
+        bodies, shapes_of = map(BodyIndex, range(self.plant.num_bodies())), self.contact_shapes_of
+        points = partial(hull_points_of, self._scene_graph.model_inspector())
+        self._points = {index: list(map(points, shapes_of(index))) for index in bodies}
         self._by_design = self._body_pairs_overlapping_by_design()
         names = [" and ".join(self.plant.get_body(k).name() for k in p) for p in self._by_design]
         if names:
             what = "overlaps left out, as they are in nearly all postures:"
             self.assumptions.append(f"{what} {join_names(sorted(names))}")
 
-    def contact_shapes_of(self, body: BodyIndex) -> list[GeometryId]:
+    def contact_shapes_of(self, body: BodyIndex) -> list[geometry.GeometryId]:
         inspector = self._scene_graph.model_inspector()
         shapes = self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
         return [each for each in shapes if inspector.GetProximityProperties(each) is not None]
@@ -131,11 +118,9 @@ class PostureShapes:
 
     def overlaps(self) -> list[Overlap]:
         """Return the pairs of overlapping bodies, except those that nearly always overlap."""
-        return [
-            Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
-            for (first, second), distance in self._body_pair_distances().items()
-            if (first, second) not in self._by_design
-        ]
+        found, body = self._body_pair_distances(), self.plant.get_body
+        pairs = [pair for pair in found if pair not in self._by_design]
+        return [Overlap(body(first), body(second), found[first, second]) for first, second in pairs]
 
     def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
         hulls = [hull for body in bodies for hull in self.hull_points_W(body)]
@@ -159,9 +144,8 @@ class PostureShapes:
 
     def _has_shapes(self, index: BodyIndex) -> bool:
         body, plant = self.plant.get_body(index), self.plant
-        return bool(
-            plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
-        )
+        shapes = plant.GetCollisionGeometriesForBody(body)
+        return bool(shapes or plant.GetVisualGeometriesForBody(body))
 
     def _body_pair_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
@@ -199,7 +183,9 @@ class PostureShapes:
             together.append(joined)
         for bodies in together:
             shapes = [shape for each in bodies for shape in self.contact_shapes_of(each)]
-            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(shapes)))
+            manager.Apply(
+                geometry.CollisionFilterDeclaration().ExcludeWithin(geometry.GeometrySet(shapes))
+            )
 
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
@@ -248,14 +234,14 @@ def overlap_warnings(shapes: PostureShapes, *, of_arm: bool = False) -> list[str
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:
             remedy = "move the object in environment, or give another start in slave.home"
-        found.append(
-            f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm at the start"
-            f" (convex hulls of meshes count); {remedy}"
-        )
+        what = f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm"
+        found.append(f"{what} at the start (convex hulls of meshes count); {remedy}")
     return found
 
 
-def _complete_and_bound_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def _complete_and_bound_collision_shapes(
+    plant: MultibodyPlant, scene_graph: geometry.SceneGraph
+) -> None:
     """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
@@ -264,16 +250,18 @@ def _complete_and_bound_collision_shapes(plant: MultibodyPlant, scene_graph: Sce
     added = []  # afterwards, because Drake's lists move when shapes are added
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
         solids = plant.GetCollisionGeometriesForBody(body)
-        for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
-            shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
-            is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
+        for k, identifier in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
+            shape, box = inspector.GetShape(identifier), inspector.GetObbInGeometryFrame(identifier)
+            is_curved = isinstance(shape, (geometry.Capsule, geometry.Cylinder, geometry.Ellipsoid))
             is_limited = box is not None and max(box.half_width()) < _MAX_COLLISION_SHAPE_SIZE_M
-            here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
+            here, name = RigidTransform(inspector.GetPoseInFrame(identifier)), f"solid_{k}"
             if is_curved:
-                shape = Convex(here.inverse() @ hull_points_of(inspector, geometry).T, name)
+                shape = geometry.Convex(
+                    here.inverse() @ hull_points_of(inspector, identifier).T, name
+                )
             if is_limited and (is_curved or not solids):
                 added.append((body, here, shape.Clone(), f"{body.name()}_{name}"))
             if solids and (is_curved or not is_limited):
-                scene_graph.RemoveRole(source, geometry, Role.kProximity)
+                scene_graph.RemoveRole(source, identifier, geometry.Role.kProximity)
     for each in added:
-        plant.RegisterCollisionGeometry(*each, ProximityProperties())
+        plant.RegisterCollisionGeometry(*each, geometry.ProximityProperties())

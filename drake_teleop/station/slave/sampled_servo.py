@@ -106,10 +106,8 @@ class SampledServo(LeafSystem):
         arm = slave.arm
         n = self._n = arm.num_joints
         self._arm = arm.table
-        self._constants = (
-            servo_gains_and_limits(arm, config), slave.physics_of_plant, samples, period,
-            np.zeros(3 * n)
-        )  # fmt: skip
+        servo, scratch = servo_gains_and_limits(arm, config), np.zeros(3 * n)
+        self._constants = servo, slave.physics_of_plant, samples, period, scratch
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._at_rest, self._sheet = np.zeros(2), None
@@ -129,8 +127,8 @@ class SampledServo(LeafSystem):
         output.SetFromVector(line[:n] + (context.get_time() - line[-1]) * line[n : 2 * n])
 
     def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
-        n = self._n
-        output.SetFromVector(context.get_discrete_state_vector().value()[n : 2 * n])
+        line = context.get_discrete_state_vector().value()
+        output.SetFromVector(line[self._n : 2 * self._n])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)

@@ -3,13 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydrake.geometry import (
-    AddCompliantHydroelasticProperties,
-    ProximityProperties,
-    Role,
-    RoleAssign,
-    SceneGraph,
-)
+from pydrake import geometry
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
@@ -78,28 +72,27 @@ class Scene(Environment):
                 AddFreeJoint(plant, body, X_WBase)
 
     def PrepareContact(
-        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+        self, plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
     ) -> None:
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
         own = [shape for each in ToolShapes(plant, scene_graph, tool).values() for shape in each]
-        others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
+        others = set(inspector.GetAllGeometryIds(geometry.Role.kProximity)) - set(own)
         materials = map(inspector.GetProximityProperties, others)
         if not any(map(has_hydroelastic_properties, materials)):
-            raise DrakeTeleopError(
-                "contact is hydroelastic, but no shape in the file is",
-                where=str(self.path),
-                remedy="give one drake:compliant_hydroelastic or drake:rigid_hydroelastic in its"
-                " drake:proximity_properties, or set contact: point",
-            )
+            what = "contact is hydroelastic, but no shape in the file is"
+            tags = "drake:compliant_hydroelastic or drake:rigid_hydroelastic"
+            remedy = f"give one {tags} in its drake:proximity_properties, or set contact: point"
+            raise DrakeTeleopError(what, where=str(self.path), remedy=remedy)
         for shape in own:
-            material = ProximityProperties(inspector.GetProximityProperties(shape))
+            material = geometry.ProximityProperties(inspector.GetProximityProperties(shape))
             if not has_hydroelastic_properties(material):
                 mesh_edge = _TOOL_BALL_MESH_EDGE_M
-                AddCompliantHydroelasticProperties(mesh_edge, self.tool_modulus, material)
-                scene_graph.AssignRole(plant.get_source_id(), shape, material, RoleAssign.kReplace)
+                geometry.AddCompliantHydroelasticProperties(mesh_edge, self.tool_modulus, material)
+                replace = geometry.RoleAssign.kReplace
+                scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)
 
 
-def has_hydroelastic_properties(properties: ProximityProperties) -> bool:
+def has_hydroelastic_properties(properties: geometry.ProximityProperties) -> bool:
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

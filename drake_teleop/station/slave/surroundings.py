@@ -10,16 +10,8 @@ import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import GeometryId, SceneGraph
 from pydrake.math import RigidTransform
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Frame,
-    Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    QuaternionFloatingJoint,
-    RevoluteJoint,
-)
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
@@ -45,8 +37,8 @@ _MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue o
 class AddedEnvironment(NamedTuple):
     """Model instances of an environment; `leaf_instance`: of a leaf or `moving_part`, or None."""
 
-    instances: Collection[ModelInstanceIndex]
-    leaf_instance: ModelInstanceIndex | None
+    instances: Collection[tree.ModelInstanceIndex]
+    leaf_instance: tree.ModelInstanceIndex | None
 
 
 class ToolContactModel(NamedTuple):
@@ -72,25 +64,25 @@ class ToolContactModel(NamedTuple):
     tool_bodies: frozenset[int] = frozenset()
     tool_shapes: frozenset[int] = frozenset()
     leaf_parameters: Array = np.array([1.0, 0.0, 0.0, 0.0])
-    leaf_instance: ModelInstanceIndex | None = None
-    moving_bodies: dict[str, BodyIndex] = {}  # noqa: RUF012  (never changed)
+    leaf_instance: tree.ModelInstanceIndex | None = None
+    moving_bodies: dict[str, tree.BodyIndex] = {}  # noqa: RUF012  (never changed)
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvironment:
     before, leaf_instance = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
-            leaf_instance = ModelInstanceIndex(plant.num_model_instances())
+            leaf_instance = tree.ModelInstanceIndex(plant.num_model_instances())
         part.AddTo(plant)
     added = range(before, plant.num_model_instances())
-    return AddedEnvironment([ModelInstanceIndex(index) for index in added], leaf_instance)
+    return AddedEnvironment([tree.ModelInstanceIndex(index) for index in added], leaf_instance)
 
 
 def MakeToolContactModel(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
-    sensor_frame: Frame,
-    tool: BodyIndex,
+    sensor_frame: tree.Frame,
+    tool: tree.BodyIndex,
     environment: Environment,
     touched: AddedEnvironment,
 ) -> ToolContactModel:
@@ -129,19 +121,15 @@ def MakeToolContactModel(
         from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
-        found = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
+        pairs = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
     except DrakeTeleopError as error:
         return contact._replace(drake_contact_reason=str(error))
-    if not len(found.compiled_pairs):
-        reason = found.monitoring_reason or "no shapes can touch"
-        return contact._replace(drake_contact_reason=reason)
+    compiled, monitored, reason = pairs
+    if not len(compiled):
+        return contact._replace(drake_contact_reason=reason or "no shapes can touch")
+    contact = contact._replace(compiled_pairs=compiled, monitored_pairs=monitored)
     size = plant.num_multibody_states() if len(joints) else 0
-    return contact._replace(
-        compiled_pairs=found.compiled_pairs,
-        monitored_pairs=found.monitored_pairs,
-        joint_table=joints,
-        plant_state_size=size,
-    )
+    return contact._replace(joint_table=joints, plant_state_size=size)
 
 
 def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
@@ -157,34 +145,28 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
 
 def MovingBodiesExceptLeaf(
     plant: MultibodyPlant, touched: AddedEnvironment
-) -> dict[str, BodyIndex]:
+) -> dict[str, tree.BodyIndex]:
     """Return the moving bodies of the environment, except the leaf, by unique name."""
-    bodies = [
-        plant.get_body(index)
-        for instance in touched.instances
-        if instance != touched.leaf_instance
-        for index in plant.GetBodyIndices(instance)
-    ]
-    moving = [body for body in bodies if not plant.IsAnchored(body)]
-    names = [body.name() for body in moving]
-    return {
-        re.sub(r"\W+", "_", body.name() if names.count(body.name()) == 1 else full): body.index()
-        for body in moving
-        for full in [body.scoped_name().get_full()]
-    }
+    instances = [each for each in touched.instances if each != touched.leaf_instance]
+    indices = [index for instance in instances for index in plant.GetBodyIndices(instance)]
+    moving = [body for body in map(plant.get_body, indices) if not plant.IsAnchored(body)]
+    short = [body.name() for body in moving]
+    full = [body.scoped_name().get_full() for body in moving]
+    names = [s if short.count(s) == 1 else f for s, f in zip(short, full, strict=True)]
+    return {re.sub(r"\W+", "_", n): b.index() for n, b in zip(names, moving, strict=True)}
 
 
-def supports_pose_conversion(joint: Joint) -> bool:
+def supports_pose_conversion(joint: tree.Joint) -> bool:
     """Return whether `joint_positions_of_pose` supports the type of the joint."""
-    kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
+    kinds = (tree.RevoluteJoint, tree.PrismaticJoint, tree.QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
-def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> Array:
-    if isinstance(joint, RevoluteJoint):
+def joint_positions_of_pose(joint: tree.Joint, X_FM: RigidTransform) -> Array:
+    if isinstance(joint, tree.RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
-    if isinstance(joint, PrismaticJoint):
+    if isinstance(joint, tree.PrismaticJoint):
         return np.array([X_FM.translation() @ joint.translation_axis()])
     turned = X_FM.rotation().ToQuaternion().wxyz()
     return np.concatenate([turned, X_FM.translation()])[: joint.num_positions()]
@@ -195,7 +177,7 @@ class MovingBodyPose(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
+    def __init__(self, plant: MultibodyPlant, body: tree.BodyIndex) -> None:
         super().__init__()
         self._joints, order = MakeJointTableAndRowBodies(plant, [body])
         self._bodies = np.empty((len(order), BODY_STATE_SIZE))

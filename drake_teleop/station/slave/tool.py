@@ -16,8 +16,6 @@ from drake_teleop.station.environment.environment import ContactMaterial
 from drake_teleop.station.slave.models import ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
-# Contact material of the shapes, as for the ball of tool.sdf.
-_CONTACT_STIFFNESS_N_M, _CONTACT_DISSIPATION_S_M, _TOOL_FRICTION_COEFFICIENT = 4e5, 1.0, 0.2
 _REPLAY_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _TOOL_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
@@ -95,11 +93,8 @@ class Tool:
 
 def end_of_tool_shapes(tool: Tool) -> list[float] | None:
     """Return the end p_STip [m] of the shape that reaches farthest along z_S, if there are any."""
-    ends = [
-        np.array(each.position) + np.array([0.0, 0.0, half])
-        for each in tool.shapes
-        for half in [each.radius if isinstance(each, Ball) else each.half_extent_along_z]
-    ]
+    halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
+    ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None
 
 
@@ -121,9 +116,7 @@ def AddTool(
 
 
 def _add_tool_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
-    surface = ContactMaterial(
-        _CONTACT_STIFFNESS_N_M, _CONTACT_DISSIPATION_S_M, _TOOL_FRICTION_COEFFICIENT
-    )
+    surface = ContactMaterial(stiffness=4e5, dissipation=1.0, friction=0.2)  # as in tool.sdf
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _TOOL_COLOUR)

@@ -10,21 +10,12 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model import mjcf_meshes
 from drake_teleop.station.slave.model.mjcf_elements import (
     MIN_DIRECTION_VECTOR_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
-)
-from drake_teleop.station.slave.model.mjcf_meshes import (
-    ZERO_MASS_PROPERTIES,
-    MassProperties,
-    Mesh,
-    MeshLibrary,
-    combine_mass_properties,
-    fit_shape_to_mesh,
-    unit_density_properties_of_mesh,
-    unit_density_properties_of_primitive,
 )
 from drake_teleop.station.slave.model.model_numbers import (
     MAX_MODEL_VALUE_SI,
@@ -62,7 +53,7 @@ class Geom:
     X_BG: RigidTransform
     size: list[float]
     attributes: Attributes
-    mesh: Mesh | None
+    mesh: mjcf_meshes.Mesh | None
 
     @property
     def is_visible(self) -> bool:
@@ -83,7 +74,7 @@ class Body:
     geoms: list[Geom] = field(default_factory=list)
     sites: dict[str, RigidTransform] = field(default_factory=dict)
     children: list[Body] = field(default_factory=list)
-    inertial: MassProperties | None = None
+    inertial: mjcf_meshes.MassProperties | None = None
     generator_tags: list[str] = field(default_factory=list)
     is_auxiliary: bool = False  # a body that the file does not have
 
@@ -102,7 +93,7 @@ class BodyReader:
     """Reader of the bodies in an MJCF file; joints and bodies without names get one."""
 
     def __init__(self, mjcf: Mjcf) -> None:
-        self._mjcf, self.meshes = mjcf, MeshLibrary(mjcf)
+        self._mjcf, self.meshes = mjcf, mjcf_meshes.MeshLibrary(mjcf)
         self._names = {e.get("name", "") for e in mjcf.root.iter() if e.tag in ("body", "joint")}
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
@@ -206,7 +197,7 @@ class BodyReader:
         if mesh is not None and kind != "mesh":
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
-                X_GM, size = fit_shape_to_mesh(mesh, kind, by_box=by_box)
+                X_GM, size = mjcf_meshes.fit_shape_to_mesh(mesh, kind, by_box=by_box)
             except ValueError as error:
                 self.lost.setdefault(str(error), []).append((body, given))
                 return
@@ -215,7 +206,7 @@ class BodyReader:
             self._mjcf.report.state_assumption("solid instead of hollow shapes of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
-    def _read_inertial(self, body: Body, given: Attributes) -> MassProperties:
+    def _read_inertial(self, body: Body, given: Attributes) -> mjcf_meshes.MassProperties:
         mass = float(given.vector("mass", (0.0,))[0])
         if mass < 0.0:
             self._mjcf.report.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
@@ -224,35 +215,37 @@ class BodyReader:
         if "fullinertia" in given:
             xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.read_pose(given))
+        about_centre = mjcf_meshes.MassProperties(mass, np.zeros(3), inertia)
+        return about_centre.in_frame(self._mjcf.read_pose(given))
 
-    def mass_properties_of_body(self, body: Body) -> MassProperties:
+    def mass_properties_of_body(self, body: Body) -> mjcf_meshes.MassProperties:
         """Return the body's mass properties from its `inertial` element, or from its shapes."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
             parts = [self._mass_properties_of_geom(geom) for geom in body.geoms]
-            given = combine_mass_properties(parts)
-        mass, centre, inertia = given or ZERO_MASS_PROPERTIES
+            given = mjcf_meshes.combine_mass_properties(parts)
+        mass, centre, inertia = given or mjcf_meshes.ZERO_MASS_PROPERTIES
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:
             moments, axes = np.linalg.eigh(inertia)
             inertia = (axes * np.maximum(moments, bound)) @ axes.T
         if compiler.get("balanceinertia") == "true" and nearest_possible_inertia(inertia)[1]:
             inertia = np.eye(3) * np.trace(inertia) / 3
-        return MassProperties(max(mass, compiler.number("boundmass", 0.0)), centre, inertia)
+        mass = max(mass, compiler.number("boundmass", 0.0))
+        return mjcf_meshes.MassProperties(mass, centre, inertia)
 
-    def _mass_properties_of_geom(self, geom: Geom) -> MassProperties:
+    def _mass_properties_of_geom(self, geom: Geom) -> mjcf_meshes.MassProperties:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
-            return ZERO_MASS_PROPERTIES
+            return mjcf_meshes.ZERO_MASS_PROPERTIES
         try:
-            shape = unit_density_properties_of_primitive(geom.kind, geom.size)
+            shape = mjcf_meshes.unit_density_properties_of_primitive(geom.kind, geom.size)
             if geom.mesh:
-                shape = unit_density_properties_of_mesh(geom.mesh)
+                shape = mjcf_meshes.unit_density_properties_of_mesh(geom.mesh)
         except ValueError as error:
             self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
-            return ZERO_MASS_PROPERTIES
+            return mjcf_meshes.ZERO_MASS_PROPERTIES
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)
         return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)

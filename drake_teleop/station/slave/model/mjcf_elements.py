@@ -97,7 +97,7 @@ class Mjcf:
         self.autolimits = self.compiler.get("autolimits", "true") == "true"
         self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN_DEFAULT_CLASS: {}}
         for element in self.root.findall("default"):
-            self._read_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
+            self._add_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def find_file(self, element: Element, name: str, folder: str) -> Path | None:
         """Return the file `name` in `folder`, beside the main or else the included MJCF file."""
@@ -155,9 +155,7 @@ class Mjcf:
             return RotationMatrix(columns / np.linalg.norm(columns, axis=0))
         return smallest_rotation_of_z_to(given.vector("zaxis", (0.0, 0.0, 1.0)))
 
-    def _insert_includes(
-        self, element: Element, path: Path, included: set[Path], depth: int
-    ) -> None:
+    def _insert_includes(self, element: Element, path: Path, seen: set[Path], depth: int) -> None:
         if depth > _MAX_ELEMENT_NESTING_DEPTH:
             what = f"its elements are nested more than {_MAX_ELEMENT_NESTING_DEPTH} deep"
             raise DrakeTeleopError(what, where=str(self.path))
@@ -166,25 +164,23 @@ class Mjcf:
             if child.get("file"):
                 self._folders[child] = path.resolve().parent
             if child.tag != "include":
-                self._insert_includes(child, path, included, depth + 1)
+                self._insert_includes(child, path, seen, depth + 1)
                 content.append(child)
                 continue
             name = child.get("file", "")
             file = self.find_file(child, name, "")
             if file is None:
                 self.report.add_fault(f"the included file {name!r} was not found")
-            elif file.resolve() in included:
+            elif file.resolve() in seen:
                 self.report.add_fault(f"{name} is included twice")
             else:
-                included.add(file.resolve())
+                seen.add(file.resolve())
                 root = read_xml(file)
-                self._insert_includes(root, file, included, depth)
+                self._insert_includes(root, file, seen, depth)
                 content += root
         element[:] = content
 
-    def _read_defaults(
-        self, element: Element, name: str, values: dict[str, dict[str, str]]
-    ) -> None:
+    def _add_defaults(self, element: Element, name: str, values: dict[str, dict[str, str]]) -> None:
         self._defaults[name] = values
         nested = element.findall("default")
         for child in (each for each in element if each.tag != "default"):
@@ -193,7 +189,7 @@ class Mjcf:
                 kind, own = "actuator", {**own, "kind": child.tag}
             values[kind] = _merge_defaults(values.get(kind, {}), own)
         for child in nested:
-            self._read_defaults(child, child.get("class", ""), dict(values))
+            self._add_defaults(child, child.get("class", ""), dict(values))
 
 
 def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, str]:

@@ -95,9 +95,8 @@ def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
         return ZERO_MASS_PROPERTIES
     centre = centre + volume @ (corners - centre).sum(axis=1) / 4 / volume.sum()
     # As in MuJoCo, the volumes are computed again about the centre of mass.
-    return _mass_properties_of_simplices(
-        corners - centre, _tetrahedron_volumes(corners - centre, mesh.inertia), centre, 4
-    )
+    volume = _tetrahedron_volumes(corners - centre, mesh.inertia)
+    return _mass_properties_of_simplices(corners - centre, volume, centre, 4)
 
 
 def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:

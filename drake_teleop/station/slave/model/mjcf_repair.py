@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from pydrake.math import RigidTransform
 
+from drake_teleop.station.slave.model import model_numbers
 from drake_teleop.station.slave.model.mjcf_bodies import (
     Body,
     BodyReader,
@@ -24,10 +25,6 @@ from drake_teleop.station.slave.model.mjcf_bodies import (
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES, MassProperties
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
-from drake_teleop.station.slave.model.model_numbers import (
-    correct_impossible_inertia,
-    nearest_possible_inertia,
-)
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import (
     RepairedModel,
@@ -219,9 +216,8 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
 
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     gear = abs(given.numbers("gear", (1.0,))[0])
-    force = _effort_limit_in_both_directions(
-        given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
-    )
+    limits = given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
+    force = _effort_limit_in_both_directions(limits)
     if (gain := _effort_per_control_unit(given, tag)) > 0.0:
         control = given.read_range("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
         force = min(force, gain * _effort_limit_in_both_directions(control))
@@ -335,9 +331,9 @@ def _valid_properties(
             report.state_repair("an inertia without a mass left out of", name)
         return ZERO_MASS_PROPERTIES
     scaled = given.with_mass(factor * given.mass)
-    inertia = nearest_possible_inertia(scaled.inertia)[0]
+    inertia = model_numbers.nearest_possible_inertia(scaled.inertia)[0]
     if is_moved:
-        inertia = correct_impossible_inertia(scaled.inertia, name, report)
+        inertia = model_numbers.correct_impossible_inertia(scaled.inertia, name, report)
     return scaled._replace(inertia=inertia)
 
 

@@ -9,12 +9,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_teleop.station.slave.model.mjcf_bodies import (
-    Body,
-    Geom,
-    Joint,
-    takes_part_in_contacts,
-)
+from drake_teleop.station.slave.model import mjcf_bodies
 from drake_teleop.station.slave.model.mjcf_elements import Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
@@ -33,14 +28,11 @@ class MjcfText:
         SubElement(self._root, "compiler", angle="radian", autolimits="false")
         self._assets = SubElement(self._root, "asset")
         self._meshes: dict[tuple[int, bool], str] = {}
-        self._colours = {
-            element.get("name", ""): rgba
-            for element in mjcf.elements_in("asset")
-            if element.tag == "material"
-            and (rgba := mjcf.attributes_of(element, "", "material").get("rgba"))
-        }
+        read = mjcf.attributes_of
+        materials = [each for each in mjcf.elements_in("asset") if each.tag == "material"]
+        self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
 
-    def write(self, world: Body, moving: list[Joint]) -> str:
+    def write(self, world: mjcf_bodies.Body, moving: list[mjcf_bodies.Joint]) -> str:
         """Return the MJCF text of a world; the joints `moving` get actuators."""
         top = SubElement(self._root, "worldbody")
         self._write_body_content(top, world)
@@ -55,11 +47,11 @@ class MjcfText:
             SubElement(actuators, "motor", name=joint.name, joint=joint.name)
         return tostring(self._root, encoding="unicode")
 
-    def _write_body_content(self, element: Element, body: Body) -> None:
+    def _write_body_content(self, element: Element, body: mjcf_bodies.Body) -> None:
         for joint in body.joints:
             self._write_joint(element, joint)
         for geom in body.geoms if self._purpose.plant_has_shapes else ():
-            if takes_part_in_contacts(geom.attributes) or geom.is_visible:
+            if mjcf_bodies.takes_part_in_contacts(geom.attributes) or geom.is_visible:
                 self._write_geom(element, geom, body)
         for child in body.children:
             inner = SubElement(element, "body", {"name": child.name, **_format_pose(child.X_PB)})
@@ -72,7 +64,7 @@ class MjcfText:
                 SubElement(inner, "freejoint")
             self._write_body_content(inner, child)
 
-    def _write_joint(self, element: Element, joint: Joint) -> None:
+    def _write_joint(self, element: Element, joint: mjcf_bodies.Joint) -> None:
         if joint.kind == "free":
             SubElement(element, "freejoint", name=joint.name)
             return
@@ -88,14 +80,14 @@ class MjcfText:
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
 
-    def _write_geom(self, element: Element, geom: Geom, body: Body) -> None:
+    def _write_geom(self, element: Element, geom: mjcf_bodies.Geom, body: mjcf_bodies.Body) -> None:
         given, values = geom.attributes, {"type": geom.kind, "mass": "0", **_format_pose(geom.X_BG)}
         if "friction" in given:
             values["friction"] = repr(given.numbers("friction", (1.0,))[0])
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
         seen, felt = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
-        has_contact = takes_part_in_contacts(given)
+        has_contact = mjcf_bodies.takes_part_in_contacts(given)
         if geom.mesh is None or self._purpose.is_scene or not has_contact:
             values |= ({} if has_contact else seen) | ({} if geom.is_visible else felt)
             size = {"size": _format_numbers(geom.size)}

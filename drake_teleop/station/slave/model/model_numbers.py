@@ -162,9 +162,8 @@ def check_lengths_and_inertias(element: Element, where: str, report: RepairRepor
             if math.isnan(value) and word.lower().strip("+-") != "nan":
                 continue  # a name; Drake reports an invalid number
             if not abs(value) <= MAX_MODEL_VALUE_SI:
-                report.add_fault(
-                    f"{where}: {inner.tag} {word} is no finite number up to {MAX_MODEL_VALUE_SI:g}"
-                )
+                what = f"is no finite number up to {MAX_MODEL_VALUE_SI:g}"
+                report.add_fault(f"{where}: {inner.tag} {word} {what}")
             if inner.tag == "drake:rotor_inertia" and value < 0.0:
                 report.add_fault(f"{where}: a rotor inertia of {word} kg m^2 is negative")
 
@@ -196,15 +195,11 @@ def _check_joint_type_mimic_and_axis(joint: Element, where: str, report: RepairR
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
     if kind not in ("revolute", "continuous", "prismatic"):
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
-        report.add_fault(
-            f"{name} is a {kind} joint{between}; up to the sensor, use joints that turn about one"
-            " axis or slide along it"
-        )
+        remedy = "up to the sensor, use joints that turn about one axis or slide along it"
+        report.add_fault(f"{name} is a {kind} joint{between}; {remedy}")
     elif joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
-        report.add_fault(
-            f"{name} moves with another joint (mimic); remove the tag, or fix the joint by"
-            " slave.hold"
-        )
+        remedy = "remove the tag, or fix the joint by slave.hold"
+        report.add_fault(f"{name} moves with another joint (mimic); {remedy}")
     axis = joint.find("axis")
     text = None if axis is None else axis.get("xyz") or axis.findtext("xyz")
     values = [parse_number(word) for word in (text or "1 0 0").split()]
@@ -234,10 +229,8 @@ def _check_joint_limit(limit: Element, where: str, report: RepairReport) -> None
 
 
 def _check_joint_dynamics(dynamics: Element, name: str, report: RepairReport) -> None:
-    damping, friction = (
-        parse_number(dynamics.get(what) or dynamics.findtext(what) or "0")
-        for what in ("damping", "friction")
-    )
+    texts = [dynamics.get(tag) or dynamics.findtext(tag) for tag in ("damping", "friction")]
+    damping, friction = (parse_number(text or "0") for text in texts)
     if friction != 0.0:
         report.state_assumption("no dry friction, which the model has, of", name)
         dynamics.attrib.pop("friction", None)

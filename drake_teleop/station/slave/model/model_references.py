@@ -27,9 +27,8 @@ _MAX_MODEL_FILES, _MAX_MODEL_BYTES, _MAX_TEXT_FILE_BYTES = 2000, 500_000_000, 50
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
 _XML_SUFFIXES = (".urdf", ".sdf", ".xml")
-_BINARY_SUFFIXES = set(
-    [".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae"]
-)
+_BINARY_SUFFIXES = {".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2"}
+_BINARY_SUFFIXES |= {".dae"}
 PACKAGE_FOLDER_SETTINGS = "--package-path, or package_paths in slave or master.leader"
 """Places where users name the folders of packages, for messages."""
 _PACKAGE_FILE_NAME = "package.xml"
@@ -52,11 +51,8 @@ class ModelFiles:
         self.packages: dict[str, Path] = {}
         for folder in package_paths:
             if not folder.is_dir():
-                raise DrakeTeleopError(
-                    f"there is no folder {folder} for its packages",
-                    where=str(model),
-                    remedy=f"correct {PACKAGE_FOLDER_SETTINGS}",
-                )
+                what, remedy = f"there is no folder {folder}", f"correct {PACKAGE_FOLDER_SETTINGS}"
+                raise DrakeTeleopError(f"{what} for its packages", where=str(model), remedy=remedy)
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
             if folder.is_dir():
@@ -107,10 +103,9 @@ class ModelFiles:
     def file_access_fault(self, path: Path, kind: str) -> str:
         """Return the reason why a file of `kind`, such as meshes, must not be read, or nothing."""
         if not self.may_read_file(path):
-            return (
-                f"{kind} in {path.resolve().parent} are outside the model's folder and its packages"
-                f" (name their folder: {PACKAGE_FOLDER_SETTINGS})"
-            )
+            where = f"{kind} in {path.resolve().parent}"
+            what = f"{where} are outside the model's folder and its packages"
+            return f"{what} (name their folder: {PACKAGE_FOLDER_SETTINGS})"
         try:
             self.check_referenced_files(path)
         except DrakeTeleopError as error:

@@ -24,10 +24,8 @@ def joint_end(joint: Element, name: str) -> str:
 def link_of_frame(scope: Element, frame: str) -> str:
     """Return the link that carries the frame, link or joint `frame`, or an empty text."""
     links = [link.get("name", "") for link in scope.findall("link")]
-    carriers = {
-        each.get("name", ""): each.get("link") or each.get("attached_to") or ""
-        for each in scope.findall("frame")
-    }
+    frames = scope.findall("frame")
+    carriers = {x.get("name", ""): x.get("link") or x.get("attached_to") or "" for x in frames}
     carriers |= {each.get("name", ""): joint_end(each, "child") for each in list_joints(scope)}
     passed = set[str]()
     while frame not in links and frame in carriers and frame not in passed:
@@ -147,6 +145,5 @@ def _remove_loop_constraints(
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
         if len(names) < 2 or len(groups) > 1:
-            report.add_fault(
-                f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
-            )
+            what = f"its links form a loop, by {element.tag}"
+            report.add_fault(f"{what}; model the chain to the sensor alone")

@@ -6,23 +6,13 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.model import repair_report, urdf_repair
 from drake_teleop.station.slave.model.model_references import (
     PACKAGE_FOLDER_SETTINGS,
     ModelFiles,
     read_xml,
 )
 from drake_teleop.station.slave.model.model_tree import link_of_frame
-from drake_teleop.station.slave.model.repair_report import (
-    RepairedModel,
-    RepairReport,
-    merge_repaired_models,
-)
-from drake_teleop.station.slave.model.urdf_repair import (
-    ModelPurpose,
-    convert_meshes_and_write_text,
-    repair_links_and_joints,
-    repair_urdf,
-)
 
 # Children that Drake reads; it also reads elements with its own prefix.
 _CHILD_TAGS_READ_BY_DRAKE = {
@@ -34,10 +24,10 @@ _CHILD_TAGS_READ_BY_DRAKE = {
 
 
 def repair_sdf(
-    root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> RepairedModel:
+    root: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
+) -> repair_report.RepairedModel:
     """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
-    report = RepairReport(strict=purpose.is_scene)
+    report = repair_report.RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
         _keep_model_with_sensor(root, file, files, purpose.sensor_name, report)
         for element in list(root.iter()):
@@ -45,33 +35,29 @@ def repair_sdf(
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
-    repair_links_and_joints(root, purpose, report, is_sdf=True)
+    urdf_repair.repair_links_and_joints(root, purpose, report, is_sdf=True)
     for model in root.findall("model"):
         model.set("name", model.get("name") or file.stem)
     report.raise_faults(file)
-    inner = [
-        _repair_included_file(uri, file, files, purpose, folder)
-        for uri in root.iterfind(".//include/uri")
-    ]
+    uris = root.iterfind(".//include/uri")
+    inner = [_repair_included_file(uri, file, files, purpose, folder) for uri in uris]
     mesh_folder = folder if purpose.plant_has_shapes else None
-    own = convert_meshes_and_write_text(root, file, files, report, mesh_folder)
-    return merge_repaired_models(own.text, [own, *filter(None, inner)])
+    own = urdf_repair.convert_meshes_and_write_text(root, file, files, report, mesh_folder)
+    return repair_report.merge_repaired_models(own.text, [own, *filter(None, inner)])
 
 
 def _repair_included_file(
-    uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> RepairedModel | None:
+    uri: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
+) -> repair_report.RepairedModel | None:
     """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, file, files)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
-        raise DrakeTeleopError(
-            f"includes {address!r}, which does not exist",
-            where=str(file),
-            remedy=f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}",
-        )
+        what = f"includes {address!r}, which does not exist"
+        remedy = f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}"
+        raise DrakeTeleopError(what, where=str(file), remedy=remedy)
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
-    repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
+    repair = {".urdf": urdf_repair.repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():
         return None
     part = purpose._replace(is_in_directives=True)
@@ -92,7 +78,7 @@ def _find_included_model_file(address: str, file: Path, files: ModelFiles) -> Pa
 
 
 def _keep_model_with_sensor(
-    root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
+    root: Element, file: Path, files: ModelFiles, sensor: str, report: repair_report.RepairReport
 ) -> None:
     worlds = root.findall("world")
     children = [child for scope in (root, *worlds) for child in scope]

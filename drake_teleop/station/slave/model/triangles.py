@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 
 # Triangle of a binary STL file.
-_STL_TRIANGLE_DTYPE = np.dtype(
-    [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
-)
+_STL_TRIANGLE_FIELDS = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
+_STL_TRIANGLE_DTYPE = np.dtype(_STL_TRIANGLE_FIELDS)
 
 
 class Triangles(NamedTuple):

@@ -11,14 +11,8 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
+from drake_teleop.station.slave.model import model_numbers
 from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
-from drake_teleop.station.slave.model.model_numbers import (
-    check_lengths_and_inertias,
-    parse_number,
-    repair_inertia_and_detect_missing,
-    repair_joint,
-    replace_commas_by_blanks,
-)
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_tree import (
     WORLD_NAME,
@@ -77,7 +71,7 @@ def repair_links_and_joints(
     root: Element, purpose: ModelPurpose, report: RepairReport, *, is_sdf: bool
 ) -> None:
     """Repair links and joints of a robot, or of a model and its nested models."""
-    replace_commas_by_blanks(root)
+    model_numbers.replace_commas_by_blanks(root)
     scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _make_names_unique(scope, report)
@@ -91,16 +85,15 @@ def repair_links_and_joints(
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
             in_chain = id(joint) in in_chain_ids and joint.get("name") not in purpose.held_positions
-            repair_joint(joint, links, report, in_chain=in_chain)
+            model_numbers.repair_joint(joint, links, report, in_chain=in_chain)
         moving = {joint_end(each, "child") for each in joints if each.get("type") != "fixed"}
         for link in scope.findall("link"):
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
-                check_lengths_and_inertias(part, f"link {name}", report)
+                model_numbers.check_lengths_and_inertias(part, f"link {name}", report)
             at_rest = num_joints_to_link.get(name) == 0
-            is_massless = repair_inertia_and_detect_missing(
-                link, report, is_sdf=is_sdf, at_rest=at_rest
-            )
+            repair = model_numbers.repair_inertia_and_detect_missing
+            is_massless = repair(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
                 report.state_assumption("no inertia of", name)
 
@@ -117,11 +110,11 @@ def convert_meshes_and_write_text(
     for fault, links in lost.items():
         report.state_repair("shapes are missing of", f"{join_names(links)}: {fault}")
     report.raise_faults(file)
-    limits = {
-        joint.get("name", ""): parse_number(limit.get("effort") or limit.findtext("effort") or "0")
-        for joint in root.iter("joint")
-        for limit in joint.iter("limit")
-    }
+    limits = dict[str, float]()
+    for joint in root.iter("joint"):
+        for limit in joint.iter("limit"):
+            effort = limit.get("effort") or limit.findtext("effort")
+            limits[joint.get("name", "")] = model_numbers.parse_number(effort or "0")
     text = ElementTree.tostring(root, encoding="unicode")
     limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
     return RepairedModel(text, report.assumptions, limits, find_dependence_reasons(root))
@@ -194,7 +187,7 @@ def _has_valid_colour(material: Element) -> bool:
         material.remove(texture)
     colour = material.find("color")
     words = [] if colour is None else colour.get("rgba", "").split()
-    values = [parse_number(word) for word in words]
+    values = [model_numbers.parse_number(word) for word in words]
     return len(values) == 4 and all(0.0 <= value <= 1.0 for value in values)
 
 
@@ -214,6 +207,6 @@ def _remove_references_to_missing_parts(root: Element, report: RepairReport) -> 
             root.remove(motor)
             continue
         moving.discard(names[0])
-        check_lengths_and_inertias(motor, f"motor of {names[0]}", report)
+        model_numbers.check_lengths_and_inertias(motor, f"motor of {names[0]}", report)
         for actuator in motor.findall("actuator"):
             actuator.set("name", names[0])
