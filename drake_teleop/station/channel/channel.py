@@ -15,14 +15,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity import methods, safe_state
-from drake_teleop.station.passivity.memory import (
-    CHANNEL_FILL_TIME_LEFT,
-    LOAD_WRENCH,
-    MEMORY_SIZE,
-    WRENCH_LIMIT,
-    SlotAllocator,
-)
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
     CONTACT_FLAG,
@@ -83,8 +77,8 @@ class Channel(NetworkConfig):
 
 # State of both ends in one array.
 _MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
-_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + sum(_MONITOR_SIZES)
-_layout = SlotAllocator(_ENDS_STATE_SIZE)
+_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_MONITOR_SIZES)
+_layout = slots.SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
 _LAST_FINITE_MASTER_POSE_AND_FLAG = _layout.vector(8)
@@ -93,16 +87,16 @@ _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
 _MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _MONITOR_SIZES)
-MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
+MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = map(_layout.vector, [slots.MEMORY_SIZE] * 2)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
 _R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
 # Recorded values, see `ports` of `TeleopChannel`.
 PORTS_SIGNAL_SIZE = 8
-_layout = SlotAllocator(PORTS_SIGNAL_SIZE)
+_layout = slots.SlotAllocator(PORTS_SIGNAL_SIZE)
 _WORK_OF_HAND_WRENCH, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
 _SILENCE_TIMES_OF_ENDS, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
-_layout = SlotAllocator(7)
+_layout = slots.SlotAllocator(7)
 _RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
 _ZERO_LOAD_WRENCH = np.zeros(6)
 
@@ -194,7 +188,7 @@ def step_master_end(
     healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
     safe_state.master_limits_into(
-        healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits
+        healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, watch, limits
     )
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
@@ -222,7 +216,7 @@ def step_slave_end(
         twist[i] = dx[i] / T
     for g in range(2):
         work[g] += dot_of_group(held, dx, g)
-    load = memory[LOAD_WRENCH]
+    load = memory[slots.LOAD_WRENCH]
     if not (are_finite_and_in_range(wrench_B) and are_finite_and_in_range(load_B)):
         valid = False
         ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
@@ -377,7 +371,7 @@ class TeleopChannel(SteppedBlock):
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
         ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = slave
-        ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fill_time_s
+        ends[SLAVE_METHOD_MEMORY][slots.CHANNEL_FILL_TIME_LEFT] = fill_time_s
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)
 

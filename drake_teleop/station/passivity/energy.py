@@ -9,13 +9,7 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.passivity.memory import (
-    DISSIPATED_ENERGY,
-    MEMORY_SIZE,
-    RECEIVED_ENERGY,
-    SENT_ENERGY,
-    STORED_ENERGY,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
 #: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
@@ -77,11 +71,11 @@ class EnergyBalance:
 
 def energy_balance(memory: Array) -> EnergyBalance:
     """Return the energy balance of one end's `memory` (..., MEMORY_SIZE); zeros without one."""
-    if memory.shape[-1] != MEMORY_SIZE:
+    if memory.shape[-1] != slots.MEMORY_SIZE:
         raise DrakeTeleopError(
-            f"expected shape (..., {MEMORY_SIZE}), found {memory.shape}",
+            f"expected shape (..., {slots.MEMORY_SIZE}), found {memory.shape}",
             where="memory",
             remedy="give the memory of one channel end",
         )
-    parts = STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY
+    parts = slots.STORED_ENERGY, slots.RECEIVED_ENERGY, slots.SENT_ENERGY, slots.DISSIPATED_ENERGY
     return EnergyBalance(*(memory[..., part].copy() for part in parts))
