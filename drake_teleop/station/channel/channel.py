@@ -17,15 +17,9 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity import methods, safe_state
+from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.packet import (
-    CONTACT_FLAG,
-    PACKET_LOAD_WRENCH,
-    PACKET_SIZE,
-    SENDER_INPUTS_FINITE,
-    dot_of_group,
-    pose_difference_into,
-)
+from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 from drake_teleop.station.stepped_block import SteppedBlock
 
 _NETWORK_CHOICES = ("custom", *PRESETS)
@@ -145,7 +139,7 @@ def step_channel(
     """
     k = int(ends[_STEP_COUNT])
     ends[_STEP_COUNT] += 1.0
-    received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
+    received, packet = np.zeros(fields.PACKET_SIZE), np.empty(fields.PACKET_SIZE)
     _, fresh = network.receive_packet(backward_parameters, backward, k, received)
     step_master_end(
         steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
@@ -185,7 +179,7 @@ def step_master_end(
         _convert_wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
-    healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
+    healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
     safe_state.master_limits_into(
         healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, watch, limits
@@ -195,9 +189,9 @@ def step_master_end(
         packet,
     )  # fmt: skip
     if not valid:
-        packet[SENDER_INPUTS_FINITE] = 0.0
+        packet[fields.SENDER_INPUTS_FINITE] = 0.0
     _convert_wrench_to_master(held, frame, wrench_received[_RECEIVED_WRENCH])
-    wrench_received[_RECEIVED_CONTACT_FLAG] = received[CONTACT_FLAG]
+    wrench_received[_RECEIVED_CONTACT_FLAG] = received[fields.CONTACT_FLAG]
 
 
 @njit(cache=True)
@@ -233,14 +227,14 @@ def step_slave_end(
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_TIME_WITH_VALID_SLAVE_WRENCH] += T
     copy_into(wrench, 0, held, 0, 6)
-    healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
+    healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
         steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
         packet,
     )  # fmt: skip
     if not valid:
-        packet[SENDER_INPUTS_FINITE] = 0.0
-    packet[CONTACT_FLAG] = contact
+        packet[fields.SENDER_INPUTS_FINITE] = 0.0
+    packet[fields.CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
     safe_state.slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
@@ -347,8 +341,8 @@ class TeleopChannel(SteppedBlock):
         self._contact = self.DeclareVectorInputPort("contact", 1)
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_state_of_ends(passivity.method, parameters, start)
-        carried = np.zeros(PACKET_SIZE if self._uses_load else PACKET_LOAD_WRENCH.start)
-        initial = [network.initial_network_state(line, carried) for line in lines]
+        size = fields.PACKET_SIZE if self._uses_load else fields.PACKET_LOAD_WRENCH.start
+        initial = [network.initial_network_state(line, np.zeros(size)) for line in lines]
         receivers, in_transit = zip(*initial, strict=True)
         results = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7)]
         self._initial_arguments = (passivity.method, parameters)

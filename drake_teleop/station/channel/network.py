@@ -17,14 +17,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.packet import (
-    PACKET_LOAD_WRENCH,
-    POSE,
-    VELOCITY,
-    WRENCH,
-    has_arrived,
-    move_pose_into,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import has_arrived, move_pose_into
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 MAX_DELAY_S = 10.0  # [s], bounds the memory
@@ -302,10 +296,10 @@ def receive_packet(p, state, k, packet):
 
 @njit(cache=True)
 def _apply_silence_policy(policy, silent, packet):
-    velocity, pose = packet[VELOCITY], packet[POSE]
+    velocity, pose = packet[fields.VELOCITY], packet[fields.POSE]
     if policy == _SILENCE_POLICY_ZERO:
         velocity[:] = 0.0
-        packet[WRENCH] = packet[PACKET_LOAD_WRENCH] = 0.0
+        packet[fields.WRENCH] = packet[fields.PACKET_LOAD_WRENCH] = 0.0
     elif policy == _SILENCE_POLICY_EXTRAPOLATE and has_arrived(packet):
         move_pose_into(pose, velocity * min(silent, MAX_POSE_EXTRAPOLATION_S), pose)
         if silent > MAX_POSE_EXTRAPOLATION_S:

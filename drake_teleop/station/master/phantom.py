@@ -19,17 +19,10 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
+from drake_teleop.common import vectors
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    cross,
-    dot,
-    plus,
-    quaternion_product,
-    scale_vector,
-    solve_by_cholesky,
-)
 from drake_teleop.station.master.device_parameters import end_stop_force
 
 GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
@@ -183,13 +176,13 @@ def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
     # moments of inertia give no gyroscopic moment.
     omega, alpha = (0.0, 0.0, v[0]), (0.0, 0.0, 0.0)
     for k in range(2, 6):
-        turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
-        alpha = plus(alpha, cross(omega, turn))
-        omega = plus(omega, turn)
+        turn = vectors.scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
+        alpha = vectors.plus(alpha, vectors.cross(omega, turn))
+        omega = vectors.plus(omega, turn)
         if k >= 3:
             inertia = WRIST_LINK_INERTIA_KG_M2 + (hand_inertia if k == 5 else 0.0)
             for i in range(k + 1):
-                torque[i] -= inertia * dot((J[3, i], J[4, i], J[5, i]), alpha)
+                torque[i] -= inertia * vectors.dot((J[3, i], J[4, i], J[5, i]), alpha)
 
 
 @njit(cache=True)
@@ -223,7 +216,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
             vdot[i] += J[k, i] * hand_wrench[k]
     _subtract_coriolis_torque(q, v, J, device.hand_mass, device.hand_inertia, vdot)
     _add_friction_and_end_stops(q, v, device.dry_friction, device.damping, vdot)
-    solve_by_cholesky(M, vdot, 6)
+    vectors.solve_by_cholesky(M, vdot, 6)
 
 
 @njit(cache=True)
@@ -236,7 +229,7 @@ def pose_into(q, pose):
     # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
     a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
     b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    w, x, y, z = quaternion_product(a, b)
+    w, x, y, z = vectors.quaternion_product(a, b)
     pose[0] = w * c6 - x * s6
     pose[1] = x * c6 + w * s6
     pose[2] = y * c6 + z * s6

@@ -7,19 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    copy_into,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    rotate_vector,
-)
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import OperatorTraining
@@ -153,7 +146,7 @@ def intended_motion_into(packed, start, t, pose, twist):
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
-    copy_into(pose, 4, start, 4, 3)
+    vectors.copy_into(pose, 4, start, 4, 3)
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]
@@ -166,9 +159,9 @@ def intended_motion_into(packed, start, t, pose, twist):
         for k in range(3):
             pose[4 + k] += level * row[6 + k]
             twist[k] += rate * row[6 + k]
-        turn = quaternion_exponential((level * row[9], level * row[10], level * row[11]))
-        orientation = quaternion_product(turn, orientation)
-        omega = rotate_vector(turn, omega)
+        turn = vectors.quaternion_exponential((level * row[9], level * row[10], level * row[11]))
+        orientation = vectors.quaternion_product(turn, orientation)
+        omega = vectors.rotate_vector(turn, omega)
         omega = (omega[0] + rate * row[9], omega[1] + rate * row[10], omega[2] + rate * row[11])
     for k in range(4):
         pose[k] = orientation[k]
@@ -198,9 +191,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     rotational B].
     """
     intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    error = quaternion_logarithm(
-        quaternion_product(intended, conjugate_quaternion((pose[0], pose[1], pose[2], pose[3])))
-    )
+    inverse = vectors.conjugate_quaternion((pose[0], pose[1], pose[2], pose[3]))
+    error = vectors.quaternion_logarithm(vectors.quaternion_product(intended, inverse))
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
