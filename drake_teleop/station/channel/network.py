@@ -188,11 +188,9 @@ def _read_delay_trace(path: Path, period: float) -> Array:
     ):
         if bad.any():
             first = int(np.argmax(bad))
-            raise DrakeTeleopError(
-                f"row {table.line_in_file(first)}, {values[first]:g}, {what}",
-                where=f"{path}:{column}",
-                remedy="give seconds, sorted by time; an empty delay is a lost packet",
-            )
+            what = f"row {table.line_in_file(first)}, {values[first]:g}, {what}"
+            remedy = "give seconds, sorted by time; an empty delay is a lost packet"
+            raise DrakeTeleopError(what, where=f"{path}:{column}", remedy=remedy)
     sent = np.arange(math.floor(age[-1] / period + 0.5) + 1) * period
     row = np.searchsorted(age, sent + 1e-6 * period, side="right") - 1
     return np.where(lost, -1.0, np.floor(delay / period + 0.5))[row]

@@ -153,11 +153,9 @@ class Master:
     def check_pose_mode(self, what: str) -> None:
         """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
         if self.is_joint_leader:
-            raise DrakeTeleopError(
-                f"{what} cannot use a leader arm that commands joints",
-                where="master.leader.leads",
-                remedy="set it to pose: the rendered force is the same",
-            )
+            what = f"{what} cannot use a leader arm that commands joints"
+            remedy = "set it to pose: the rendered force is the same"
+            raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
 
     def encoder_steps(self) -> Array:
         """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
