@@ -36,13 +36,10 @@ class Channel(NetworkConfig):
     network: str = choice("custom", _NETWORK_CHOICES, "a preset, or custom for these fields")
     backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
     timeout: float | None = quantity(
-        None,
-        "s",
-        1e-3,
-        MAX_TIMEOUT_S,
+        None, "s", 1e-3, MAX_TIMEOUT_S,
         "silence after which an end enters its safe state; null: 1.5 times the longest silence in "
         "a minute of this network, at least 0.1 s",
-    )
+    )  # fmt: skip
 
     def networks_of_directions(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
         """Return the networks of both directions: forward (master to slave) and backward."""

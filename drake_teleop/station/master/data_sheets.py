@@ -107,11 +107,9 @@ class Master:
     """Settings of the haptic device, with its start position."""
 
     model: str = choice(
-        PHANTOM_NAME,
-        (PHANTOM_NAME, "custom", LEADER_NAME),
-        "device; custom: `figures` only; leader: arm from a file",
-        FIGURES,
-    )
+        PHANTOM_NAME, (PHANTOM_NAME, "custom", LEADER_NAME),
+        "device; custom: `figures` only; leader: arm from a file", FIGURES,
+    )  # fmt: skip
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )

@@ -35,29 +35,20 @@ class FourChannelConfig:
     """Parameters of the four-channel architecture."""
 
     stiffness: list[float] = quantity(
-        [100.0, 1.0],
-        "N/m, N m/rad",
-        0.0,
-        1e6,
+        [100.0, 1.0], "N/m, N m/rad", 0.0, 1e6,
         "stiffness of C_m, the spring between the hand and the received pose of the slave",
-    )
+    )  # fmt: skip
     damping: list[float] = quantity(
         [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper of C_m, parallel to its spring"
     )
     slave_feedback: float = quantity(
-        0.0,
-        "1",
-        -1.0,
-        10.0,
+        0.0, "1", -1.0, 10.0,
         "C5, gain of the contact force at the slave; that of the hand's force is C3 = 1 + C5",
-    )
+    )  # fmt: skip
     hand_feedback: float = quantity(
-        0.0,
-        "1",
-        -1.0,
-        10.0,
+        0.0, "1", -1.0, 10.0,
         "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
-    )
+    )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
         p[_COUPLING_STIFFNESS], p[_COUPLING_DAMPING] = self.stiffness, self.damping

@@ -117,19 +117,13 @@ class LedgerConfig:
     """Parameters of the passivity method "ledger"."""
 
     initial: list[float] = quantity(
-        [0.12, 0.011],
-        "J",
-        0.0,
-        1e3,
+        [0.12, 0.011], "J", 0.0, 1e3,
         "E_0, energy of both ends together at the start; the drag adds the rest of the reserves",
-    )
+    )  # fmt: skip
     reserve: list[float] = quantity(
-        [0.1, 0.01],
-        "J",
-        1e-9,
-        1e3,
+        [0.1, 0.01], "J", 1e-9, 1e3,
         "reserve of the slave: scaled kinetic energy of its fastest motion",
-    )
+    )  # fmt: skip
     hand_reserve: list[float] = quantity(
         [0.02, 1e-3], "J", 1e-9, 1e3, "reserve of the master, to push the hand back"
     )
@@ -140,13 +134,10 @@ class LedgerConfig:
         [0.01, 1e-3], "N, N m", 0.0, 1e3, "contact threshold of the wrench at the hand"
     )
     encoder_step: list[float] | None = quantity(
-        None,
-        "m, rad",
-        0.0,
-        0.1,
+        None, "m, rad", 0.0, 0.1,
         "position and rotation step of the device's encoders; null: as in the device's data sheet",
         length=2,
-    )
+    )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
         p[INITIAL_LEDGER_ENERGY] = self.initial

@@ -142,40 +142,28 @@ _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 @dataclass
 class _CommonMethodConfig:
     method: str = choice(
-        "none",
-        (),
+        "none", (),
         "passivity method of the channel; two_layer, pspm, four_channel and force_limit are"
-        " references for comparison",
-        METHODS,
-    )
+        " references for comparison", METHODS,
+    )  # fmt: skip
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest rendered force at the hand")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
-        [0.1, 1.0],
-        "m/s, rad/s",
-        1e-3,
-        1e3,
+        [0.1, 1.0], "m/s, rad/s", 1e-3, 1e3,
         "speed of the hand along the wrench where it starts to fade; zero at twice this speed",
-    )
+    )  # fmt: skip
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
     )
     servo_damping: list[float] = quantity(
-        [3.5e3, 117.0],
-        "N s/m, N m s/rad",
-        0.0,
-        1e8,
+        [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8,
         "D of the slave's servo, in the slave's units (E)",
-    )
+    )  # fmt: skip
     slave_mass: list[float] | None = quantity(
-        None,
-        "kg, kg m^2",
-        1e-6,
-        1e6,
+        None, "kg, kg m^2", 1e-6, 1e6,
         "mass of arm and tool at the tool, in the slave's units; null: 15.13, 0.5 (E), with ledger"
-        " mass and servo of the station's arm at the start",
-        length=2,
-    )
+        " mass and servo of the station's arm at the start", length=2,
+    )  # fmt: skip
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
 
 

@@ -44,12 +44,9 @@ class PspmConfig:
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
-        [0.015, 3e-4],
-        "J",
-        0.0,
-        1e6,
+        [0.015, 3e-4], "J", 0.0, 1e6,
         "largest E; the master sends the rest to the slave, the slave discards it",
-    )
+    )  # fmt: skip
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"
     )

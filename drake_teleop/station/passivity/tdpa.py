@@ -72,29 +72,20 @@ class TdpaConfig:
     """Parameters of the time-domain passivity approach (TDPA)."""
 
     release: float = quantity(
-        0.02,
-        "s",
-        0.0,
-        10.0,
+        0.02, "s", 0.0, 10.0,
         "time in which a reduced wrench returns to its full value (force-jump filter)",
-    )
+    )  # fmt: skip
     drain_rate: float = quantity(
         200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"
     )
     drift_rate: float = quantity(
-        20.0,
-        "1/s",
-        0.0,
-        1e3,
+        20.0, "1/s", 0.0, 1e3,
         "rate of the correction of a withheld command, within the available energy",
-    )
+    )  # fmt: skip
     speed: list[float] = quantity(
-        [1.0, 10.0],
-        "m/s, rad/s",
-        1e-3,
-        1e3,
+        [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
         "largest speed of the slave's command; its kinetic energy may be created at an impact",
-    )
+    )  # fmt: skip
     reserve: list[float] = quantity(
         [2e-3, 1e-4], "J", 0.0, 1e3, "part of the hand's input that the master keeps"
     )
@@ -102,12 +93,9 @@ class TdpaConfig:
         [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than the reserve"
     )
     hand_stiffness: list[float] = quantity(
-        [0.0, 0.0],
-        "N/m, N m/rad",
-        0.0,
-        1e5,
+        [0.0, 0.0], "N/m, N m/rad", 0.0, 1e5,
         "stiffness of the hand for the filter of the returned wrench; 0: no filter",
-    )
+    )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
         p[_WRENCH_RELEASE_TIME], p[_LEDGER_DRAIN_RATE] = self.release, self.drain_rate

@@ -49,12 +49,9 @@ class TwoLayerConfig:
     )
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy of a tank at the start")
     level: list[float] = quantity(
-        [0.01, 2e-4],
-        "J",
-        0.0,
-        1e3,
+        [0.01, 2e-4], "J", 0.0, 1e3,
         "level below which a damper on the hand fills the master's tank",
-    )
+    )  # fmt: skip
     capacity: list[float] = quantity(
         [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; the rest is discarded"
     )

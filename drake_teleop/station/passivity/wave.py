@@ -47,12 +47,9 @@ class WaveConfig:
     """Parameters of the wave variables."""
 
     impedance: list[float] = quantity(
-        [10.0, 0.05],
-        "N s/m, N m s/rad",
-        1e-6,
-        1e6,
+        [10.0, 0.05], "N s/m, N m s/rad", 1e-6, 1e6,
         "wave impedance b, for translation and rotation",
-    )
+    )  # fmt: skip
     filter: float = quantity(
         0.003, "s", 0.0, 10.0, "time constant of the filter of the received wave, at both ends"
     )
@@ -60,12 +57,9 @@ class WaveConfig:
         1.0, "1", 0.0, 100.0, "damping at the slave's end divided by b; at 1 it reflects no wave"
     )
     patience: float = quantity(
-        0.03,
-        "s",
-        0.0,
-        10.0,
+        0.03, "s", 0.0, 10.0,
         "silence after which the slave keeps its command until the next packet",
-    )
+    )  # fmt: skip
     drift_rate: float = quantity(
         2.0, "1/s", 0.0, 1e3, "rate of the drift correction where it takes no work"
     )
