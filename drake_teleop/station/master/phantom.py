@@ -276,18 +276,14 @@ def is_any_axis_at_end_stop(q: Array) -> NDArray[np.bool_]:
 
 
 def check_limits(q: Array) -> None:
-    margin = 1e-9
-    for i in range(6):
-        if not JOINT_LOWER_RAD[i] - margin <= q[i] <= JOINT_UPPER_RAD[i] + margin:
-            raise DrakeTeleopError(
-                f"Phantom joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
-                f"{np.degrees(JOINT_LOWER_RAD[i]):.1f} to {np.degrees(JOINT_UPPER_RAD[i]):.1f}",
-                where="pose_master",
-                remedy="choose a start pose inside the device's workspace",
-            )
-    if not Q2_MINUS_Q3_RANGE_RAD[0] - margin <= q[1] - q[2] <= Q2_MINUS_Q3_RANGE_RAD[1] + margin:
-        raise DrakeTeleopError(
-            f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
-            where="pose_master",
-            remedy="choose a start pose inside the device's workspace",
-        )
+    ranges = [*zip(JOINT_LOWER_RAD, JOINT_UPPER_RAD, strict=True), Q2_MINUS_Q3_RANGE_RAD]
+    for i, (angle, (lower, upper)) in enumerate(zip([*q, q[1] - q[2]], ranges, strict=True)):
+        if lower - 1e-9 <= angle <= upper + 1e-9:
+            continue
+        at, least, most = np.degrees([angle, lower, upper])
+        what = f"Phantom angle q2 - q3 would be {at:.1f} degrees, not -55 to 65"
+        if i < 6:
+            what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, its range is "
+            what += f"{least:.1f} to {most:.1f}"
+        remedy = "choose a start pose inside the device's workspace"
+        raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
