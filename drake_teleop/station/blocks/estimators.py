@@ -68,14 +68,11 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
         initial: ArrayLike | None = None,
         config: load_estimator.LoadEstimatorConfig | None = None,
     ) -> None:
-        super().__init__(
-            load_estimator.LoadEstimatorConfig(enabled=True) if config is None else config,
-            finite_array("noise_std", noise_std, 6),
-            np.zeros(9) if motion_std is None else finite_array("motion_std", motion_std, 9),
-            period,
-            regressor.FIRST_JOINT_INDEX,
-            np.zeros(16) if initial is None else finite_array("initial", initial, 16),
-        )
+        config = load_estimator.LoadEstimatorConfig(enabled=True) if config is None else config
+        noise = finite_array("noise_std", noise_std, 6)
+        motion = np.zeros(9) if motion_std is None else finite_array("motion_std", motion_std, 9)
+        start = np.zeros(16) if initial is None else finite_array("initial", initial, 16)
+        super().__init__(config, noise, motion, period, regressor.FIRST_JOINT_INDEX, start)
 
     def _declare_sample_ports(self, size: int) -> Any:
         return _SamplePorts(self)

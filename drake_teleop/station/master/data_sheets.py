@@ -83,19 +83,13 @@ _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_DATA_SHEET_FIELD_NAMES = (
-    *("apparent_mass", "friction", "peak_force", "size"),
-    *("turn", "resolution", "turn_resolution", "rate_hz"),
-)
+_COLUMNS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
+_sheets = {
+    name: DeviceFigures(**dict(zip(_COLUMNS.split(), copy.deepcopy(row), strict=True)))
+    for name, row in _DATA_SHEETS.items()
+}
 #: Data sheets by name, for `Master.figures`.
-FIGURES = Registry(
-    "device",
-    {
-        name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELD_NAMES, copy.deepcopy(row), strict=True)))
-        for name, row in _DATA_SHEETS.items()
-    },
-    DeviceFigures,
-)
+FIGURES = Registry("device", _sheets, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
@@ -129,19 +123,15 @@ class Master:
             resistance = self.friction.coulomb, self.friction.viscous
             parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
         else:
-            figures = self._data_sheet()
-            parameters = DeviceParameters(
-                *hand,
-                figures.peak_force,
-                figures.peak_torque,
-                np.repeat([figures.friction, figures.friction_torque], 3),
-                np.repeat([figures.damping, figures.turning_damping], 3),
-                mass=figures.apparent_mass,
-                inertia=figures.inertia,
-                workspace_centre=figures.centre,
-                half_workspace=0.5 * np.array(figures.size),
-                max_rotation=figures.turn,
+            sheet = self._data_sheet()
+            peaks, body = (
+                (sheet.peak_force, sheet.peak_torque),
+                (sheet.apparent_mass, sheet.inertia),
             )
+            friction = np.repeat([sheet.friction, sheet.friction_torque], 3)
+            damping = np.repeat([sheet.damping, sheet.turning_damping], 3)
+            workspace = sheet.centre, 0.5 * np.array(sheet.size), sheet.turn
+            parameters = DeviceParameters(*hand, *peaks, friction, damping, True, *body, *workspace)
         return HapticDevice(as_compiled_arguments(parameters), self.model)
 
     @property

@@ -107,11 +107,8 @@ def step_leader(
     """
     n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
-    if (
-        are_finite_and_in_range(hand_wrench)
-        and are_finite_and_in_range(drive[:6])
-        and are_finite_and_in_range(state)
-    ):
+    valid = are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6])
+    if valid and are_finite_and_in_range(state):
         F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
         for i in range(3):
             F[i], F[3 + i] = drive[i], drive[5 - i]
@@ -212,12 +209,12 @@ class LeaderDevice(HapticDeviceBase):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
         if status != IkStatus.OK:
-            raise DrakeTeleopError(
-                f"the leader arm cannot reach ({', '.join(f'{x:.3g}' for x in pose[4:])}) m in B"
-                f" (inverse kinematics: {status.name})",
-                where="pose_master",
-                remedy="choose a pose that its joints reach, or another home",
+            place = ", ".join(f"{x:.3g}" for x in pose[4:])
+            what = (
+                f"the leader arm cannot reach ({place}) m in B (inverse kinematics: {status.name})"
             )
+            remedy = "choose a pose that its joints reach, or another home"
+            raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
@@ -228,12 +225,10 @@ class LeaderDevice(HapticDeviceBase):
     def check_limits(self, q: Array) -> None:
         lower, upper = self.joint_table[[_MIN_Q_ROW, _MAX_Q_ROW]]
         for k in np.flatnonzero((q < lower) | (q > upper)):
-            raise DrakeTeleopError(
-                f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
-                f" {lower[k]:.3g} to {upper[k]:.3g} (rad or m)",
-                where="master.leader.home",
-                remedy="start within the limits of its joints",
-            )
+            joint, limits = self.arm.joint_names[k], f"{lower[k]:.3g} to {upper[k]:.3g} (rad or m)"
+            what = f"leader joint {joint} would be at {q[k]:.3g}, outside its limits {limits}"
+            remedy = "start within the limits of its joints"
+            raise DrakeTeleopError(what, where="master.leader.home", remedy=remedy)
 
     def is_any_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
         """Return flags (N,): True if a motor has `share` of its torque limit or more.

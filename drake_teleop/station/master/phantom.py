@@ -57,30 +57,21 @@ FRICTION_TANH_RAD_S = 0.01  # rad/s, estimate
 _MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD = 300.0, 1.5  # main axes
 _WRIST_STOP_STIFFNESS_N_M_RAD, _WRIST_STOP_DAMPING_N_M_S_RAD = 5.0, 0.01
 
+# Moments of inertia of the point masses of the links.
+_LINK_1_INERTIA = L1**2 * (MASS_A + MASS_C / 4)
+_LINK_2_INERTIA, _LINK_3_INERTIA = L2**2 * MASS_A / 4, L3**2 * MASS_C
 # M11 = _M11_CONSTANT + _M11_COS2Q2 cos 2 q2 + _M11_COS2Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
-_M11_CONSTANT = INERTIA_BASE_YY + 0.5 * (
-    sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
-    + L1**2 * (MASS_A + MASS_C / 4)
-    + L2**2 * MASS_A / 4
-    + L3**2 * MASS_C
-)
-_M11_COS2Q2 = 0.5 * (
-    INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + L1**2 * (MASS_A + MASS_C / 4)
-)
-_M11_COS2Q3 = 0.5 * (
-    INERTIA_A[1]
-    - INERTIA_A[2]
-    + INERTIA_DF[1]
-    - INERTIA_DF[2]
-    - L2**2 * MASS_A / 4
-    - L3**2 * MASS_C
-)
+_bodies = sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
+_constant_terms = _bodies + _LINK_1_INERTIA + _LINK_2_INERTIA + _LINK_3_INERTIA
+_M11_CONSTANT = INERTIA_BASE_YY + 0.5 * _constant_terms
+_cosine_terms = INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + _LINK_1_INERTIA
+_M11_COS2Q2 = 0.5 * _cosine_terms
+_cosine_terms = INERTIA_A[1] - INERTIA_A[2] + INERTIA_DF[1] - INERTIA_DF[2]
+_M11_COS2Q3 = 0.5 * (_cosine_terms - _LINK_2_INERTIA - _LINK_3_INERTIA)
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
-_M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
-_M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
-_REFLECTED_MOTOR_INERTIA_1, _REFLECTED_MOTOR_INERTIA_2, _REFLECTED_MOTOR_INERTIA_3 = (
-    gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS
-)
+_M22 = INERTIA_BE[0] + INERTIA_C[0] + _LINK_1_INERTIA
+_M33 = INERTIA_A[0] + INERTIA_DF[0] + _LINK_2_INERTIA + _LINK_3_INERTIA
+_REFLECTED_MOTOR_INERTIAS = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
 _GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
 _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
@@ -89,13 +80,10 @@ _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6
 def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
     M[0, 0] = (
-        _M11_CONSTANT
-        + _M11_COS2Q2 * math.cos(2.0 * q[1])
-        + _M11_COS2Q3 * math.cos(2.0 * q[2])
-        + 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
+        _M11_CONSTANT + _M11_COS2Q2 * math.cos(2.0 * q[1]) + _M11_COS2Q3 * math.cos(2.0 * q[2])
     )
-    M[1, 1] = _M22
-    M[2, 2] = _M33
+    M[0, 0] += 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
+    M[1, 1], M[2, 2] = _M22, _M33
     M[1, 2] = M[2, 1] = -_M23_MAX * math.sin(q[1] - q[2])
 
 
@@ -125,9 +113,8 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
-    M[0, 0] += _REFLECTED_MOTOR_INERTIA_1
-    M[1, 1] += _REFLECTED_MOTOR_INERTIA_2
-    M[2, 2] += _REFLECTED_MOTOR_INERTIA_3
+    for i in range(3):
+        M[i, i] += _REFLECTED_MOTOR_INERTIAS[i]
     tip_mass = WRIST_MASS_KG + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.

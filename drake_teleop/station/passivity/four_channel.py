@@ -3,7 +3,6 @@
 docs/theory.md, (T39). There is no energy balance: any delay makes the channel active.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 from drake_teleop.common.compiled import njit

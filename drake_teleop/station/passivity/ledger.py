@@ -3,7 +3,6 @@
 docs/theory.md, "The energy ledger", has the equations of these steps.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 

@@ -4,7 +4,6 @@ All poses, twists and wrenches are in world axes W. Wrenches are in the *master'
 wrench times motion of the slave's command is the work at the hand, docs/theory.md (T29).
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache

@@ -3,7 +3,6 @@
 A spring pulls each end to a set position as near to the requested one as the energy permits.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 

@@ -59,8 +59,7 @@ def initial_slave_monitor(pose: Array) -> Array:
     """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_TIME] = np.inf
-    for part in (_COMMAND_AT_STOP_START, _LAST_COMMAND, _COMMAND_BEFORE_LAST):
-        watch[part] = pose
+    watch[_COMMAND_AT_STOP_START] = watch[_LAST_COMMAND] = watch[_COMMAND_BEFORE_LAST] = pose
     return watch
 
 

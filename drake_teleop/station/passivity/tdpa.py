@@ -4,7 +4,6 @@
 slave's wrench.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 

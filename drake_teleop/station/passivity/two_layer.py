@@ -3,7 +3,6 @@
 The tank of each end must contain the energy that the wrench can use until the next step.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 from drake_teleop.common.compiled import njit

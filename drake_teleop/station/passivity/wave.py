@@ -4,7 +4,6 @@ docs/theory.md, (T33) to (T36). The receiver filters the integral of the wave wi
 energy, so jitter and loss create no energy.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 
