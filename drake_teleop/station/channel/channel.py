@@ -59,11 +59,9 @@ class Channel(NetworkConfig):
         """Return the silence [s] before an end's safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
-        longest = [
-            network.longest_silence(line, direction, period)
-            for direction, line in enumerate(self.networks_of_directions())
-        ]
-        return min(max(_TIMEOUT_PER_LONGEST_SILENCE * max(longest), MIN_TIMEOUT_S), MAX_TIMEOUT_S)
+        lines = enumerate(self.networks_of_directions())
+        longest = max(network.longest_silence(line, k, period) for k, line in lines)
+        return min(max(_TIMEOUT_PER_LONGEST_SILENCE * longest, MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.
@@ -309,16 +307,9 @@ class TeleopChannel(SteppedBlock):
     __slots__ = ()
 
     def __init__(
-        self,
-        channel: Channel,
-        passivity: PassivityConfig,
-        R_WB: Array,
-        scales: Array,
-        force_scale: float,
-        start: Array,
-        period: float,
-        seed: int,
-    ) -> None:
+        self, channel: Channel, passivity: PassivityConfig, R_WB: Array, scales: Array,
+        force_scale: float, start: Array, period: float, seed: int,
+    ) -> None:  # fmt: skip
         super().__init__()
         # Forward, the slave reads the command one step later. Backward, the master takes its step
         # before the slave.

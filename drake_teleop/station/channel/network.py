@@ -107,13 +107,9 @@ _IS_BAD_STATE, _NEWEST_ARRIVED_PACKET, _NEWEST_READ_PACKET, _SILENT_STEPS, _LAST
 
 
 def network_parameters(
-    config: NetworkConfig,
-    seed: int,
-    direction: int,
-    period: float,
-    min_steps: int = 0,
+    config: NetworkConfig, seed: int, direction: int, period: float, min_steps: int = 0,
     delays: NDArray[np.int64] | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return the parameters of one direction for `send_packet` and `receive_packet`.
 
     Args:
