@@ -113,7 +113,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the device's pose; a silent device releases the hand."""
+        """Return the `Inputs` of the device's pose; a silent device counts as let go."""
         state = self.receive_state(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}

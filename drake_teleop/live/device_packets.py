@@ -29,7 +29,7 @@ class DeviceState(NamedTuple):
         position: p_BE [m].
         quaternion_wxyz: (4,) unit quaternion of R_BE.
         flags: 0 or `CLUTCH_OPEN`.
-        behind: age of the position that the displayed force answers [s]; 0 without a force.
+        behind: age of the position from which the displayed force follows [s]; 0: no force.
     """
 
     number: int

@@ -85,10 +85,10 @@ def _update_displayed_wrench(wrench, held, period, limits, last, now):
 
 
 class ExternalMaster(LeafSystem):
-    """Real haptic device as a system with pose input and force output.
+    """Real haptic device as a system; `SetTarget` receives its poses.
 
-    The force fades within 50 ms while released or after a non-finite command, and returns within
-    0.25 s.
+    The force fades within 50 ms while the hand does not hold the device or after a non-finite
+    command, and returns within 0.25 s.
 
     .. pydrake_system::
 
@@ -128,7 +128,7 @@ class ExternalMaster(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_display)
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Interpolate the device's X_BE to `target` (7,) over 2 ms; None releases the device."""
+        """Interpolate the device's X_BE to `target` (7,) over 2 ms; None: the hand lets go."""
         now, held, motion = self._current_pose_and_twist(context)[:7], 0.0, np.zeros(6)
         if target is not None:
             turn = quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))

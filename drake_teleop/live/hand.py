@@ -159,7 +159,7 @@ class LiveHand(Operator):
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Start a smooth path to the pose X_BE `target` (7,); None releases the stylus."""
+        """Start a smooth path to the pose X_BE `target` (7,); None: the hand lets go."""
         path = np.zeros(_PATH_SIZE)
         if target is not None:
             now = self._current_motion(context)

@@ -135,7 +135,10 @@ class Inputs:
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,); `start` (3,): p_BE at zero; None: released."""
+        """Return the intended pose X_BE (7,); None if the hand lets go.
+
+        `start` (3,) is p_BE at zero inputs.
+        """
         if not self.held:
             return None
         q = quaternion_exponential(tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz)))

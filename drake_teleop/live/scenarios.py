@@ -114,7 +114,7 @@ def _payload_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the estimate (16,) [offsets, phi] of `before`, adapted to payload, sensor of `now`."""
+    """Return the estimate (16,) of `load` for `before`, adapted to payload, sensor of `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()

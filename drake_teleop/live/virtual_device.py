@@ -15,7 +15,7 @@ HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]
 
 
 class VirtualDevice:
-    """Simulated device in a moving hand; `energy`: work of both against the rendered force [J]."""
+    """Simulated device in a moving hand; `energy`: work against the rendered force [J]."""
 
     def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
         held, self._hand = GRIP_IMPEDANCES[grip], hand_motion

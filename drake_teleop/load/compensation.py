@@ -39,7 +39,7 @@ def scaled_wrench_into(
 
 @njit(cache=True)
 def add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    """Add both weights, times weight scale minus inertia scale, to a wrench (6,)."""
+    """Add the weights, times `excess_...` (weight scale minus inertia scale), to a wrench (6,)."""
     a, b = excess_gripper, excess_object
     up = scale_vector(-1.0, vector_at(gravity, 0))
     h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
@@ -112,7 +112,7 @@ def scaled_wrench(
         wrench, offsets, s, omega, alpha: as for `contact_wrench`.
         phi_gripper, phi_object: (10,) loads about So in S; zeros for a missing part.
         sigma_gripper, sigma_object, gamma: scales >= 0.
-        sigma_weight, sigma_inertia: scales >= 0 of weight and inertia of both parts; None:
+        sigma_weight, sigma_inertia: scales >= 0 of weight and inertia (gripper and object); None:
             sigma_gripper and sigma_object.
         gravity: (3,) or (..., 3) g in S [m/s^2]; needed if weight and inertia have other scales.
     """

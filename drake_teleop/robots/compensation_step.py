@@ -17,7 +17,7 @@ _MAX_REST_SPECIFIC_FORCE_RMS, _MAX_REST_OMEGA_RMS = 0.1, 0.02  # [m/s^2], [rad/s
 
 @njit(cache=True)
 def reading_problem(values, largest, limits):
-    """Return 0 for a valid reading (15,), else 1: not finite, 2: too large, or 4: at its range."""
+    """Return 0 for a valid reading (15,); 1: not finite, 2: above `largest`, 4: at `limits`."""
     for i in range(15):
         if not math.isfinite(values[i]):
             return VALUE_NOT_FINITE

@@ -133,7 +133,10 @@ class ImpedanceRange:
                 )
 
     def corners(self, omega: Array) -> Complex:
-        """Return the range's corners (..., 4) [N s/m], counter-clockwise from the lower left."""
+        """Return the corners (..., 4) of the impedances at `omega` [rad/s] in the complex plane.
+
+        Unit N s/m; counter-clockwise from the lower left.
+        """
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
         b0, b1 = self.damping

@@ -99,7 +99,7 @@ def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
 
 
 def closed_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
-    """Return the model with its loop closed over the delay of both ways."""
+    """Return the model with its loop closed over the round-trip delay."""
     periods = 2 * one_way_delay_in_hand_periods(axis, sampling)
     cut = cut_axis_model(axis, sampling)
     return cut.close_loop(["displayed_force"], ["received_force"], periods)

@@ -270,7 +270,6 @@ def _draw_stability_map(axes: Axes, map_of_grip: Mapping[str, StabilityMap], gri
 
 
 def verdict_sentences(figures: dict[str, Any]) -> list[str]:
-    """Return the summary in short sentences."""
     sentences = []
     if figures["method"] != "none":
         sentences += [

@@ -27,7 +27,7 @@ _EVALUATED_TIME_AFTER_RELEASE_S = 2.0  # s, evaluated after letting go
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Measures after release and during taps, all >= 0."""
+    """Measures after the hand lets go (release) and while it taps, all >= 0."""
 
     release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]

@@ -64,7 +64,10 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the work (N, 2) [J] of the load's displayed wrench, for translation and rotation."""
+    """Return the cumulative work (N, 2) [J] of the load's displayed wrench on the hand.
+
+    Columns: translation, rotation.
+    """
     arm, t = slave_arm(scenario), result.t
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [arm.num_joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))

@@ -1,10 +1,10 @@
 """Criteria of an excitation: condition numbers of the regressor V, A- and D-optimality (T45).
 
 =========== ====================================================================================
-kappa_w10   rows of V over noise sigma, columns times powers 0 to 2 of a length L. The default.
+kappa_w10   rows of V over noise sigma, columns times 1, L, L^2 (`CriterionScales`). Default.
 kappa10     V (10 columns) in SI units.
 kappa16     [1 V] (16 columns) in SI units.
-A16         rms of predicted over acceptable errors of phi.
+A16         rms of predicted over acceptable errors of phi, estimated with the offsets.
 D16         geometric mean of the error ellipsoid's 16 semi-axes over acceptable errors.
 =========== ====================================================================================
 """

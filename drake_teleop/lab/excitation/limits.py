@@ -109,7 +109,7 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
 def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
     """Write the largest use of each of `LIMIT_NAMES` over all samples, with gradients (T47).
 
-    Outputs: smooth and exact maximum (7,), and the gradient (7, 3, T, n) of the smooth one by
+    Outputs: `smooth` and exact maximum (7,), and the gradient (7, 3, T, n) of the smooth one by
     joint positions, velocities and accelerations.
     """
     gradient[:] = 0.0
@@ -304,16 +304,19 @@ def _write_clearance_use(
 
 
 @njit(cache=True)
-def capsule_distances(motions, rows, ends, radii, pairs):
-    """Return the distances (T, K) of K capsule pairs [m]; arguments as in `Limits`."""
-    distances = np.empty((len(motions), len(pairs)))
-    placed, nearest = np.empty(ends.shape), np.empty(5)
+def capsule_distances(motions, capsule_links, capsule_ends, capsule_radius, capsule_pairs):
+    """Return the distances (T, K) of K capsule pairs [m], negative for overlaps.
+
+    `motions` are from `write_link_motions`, others of `Limits`.
+    """
+    distances = np.empty((len(motions), len(capsule_pairs)))
+    placed, nearest = np.empty(capsule_ends.shape), np.empty(5)
     for t in range(len(motions)):
-        _transform_capsules(motions[t], rows, ends, placed)
-        for k in range(len(pairs)):
-            a, b = pairs[k]
+        _transform_capsules(motions[t], capsule_links, capsule_ends, placed)
+        for k in range(len(capsule_pairs)):
+            a, b = capsule_pairs[k]
             distance = _segment_distance_and_nearest_into(placed[a], placed[b], nearest)
-            distances[t, k] = distance - radii[a] - radii[b]
+            distances[t, k] = distance - capsule_radius[a] - capsule_radius[b]
     return distances
 
 

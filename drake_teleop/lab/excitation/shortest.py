@@ -185,7 +185,7 @@ class ShortestMotionProblem(DesignProblem):
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion; `near_home`: of one near the known motion."""
+        """Return the unknowns of a random motion; `near_home`: near `around` (None: home)."""
         if self._around is not None and near_home:
             other = _MAX_COEFFICIENT_VARIATION * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)

@@ -79,7 +79,7 @@ def scenario_text(
 
 
 def wall_of_plan(plan: StationPlan) -> Wall:
-    """Return the wall below the tool."""
+    """Return the horizontal wall, 1.5 swing amplitudes below the lowest tool point."""
     x, y, z = plan.lowest_tool_point_W
     return Wall(
         position=round_to_four_significant_digits([x, y, z - 1.5 * plan.swing_amplitude_m]),

@@ -41,20 +41,20 @@ class Factor:
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def level_values(self) -> Sequence[FactorValue]:
-        """Return the listed values, or `levels` numbers of the range."""
+        """Return the listed values, or `levels` numbers from `low` to `high`."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
 
     def value_at_share(self, share: float) -> FactorValue:
-        """Return the value at a share (0 to 1) of the range or the list."""
+        """Return the value at a share (0 to 1) from `low` to `high`, or of the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.level_values()
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: FactorValue) -> list[float]:
-        """Return the share (0 to 1) of the range, or an indicator of each word, flag or vector."""
+        """Return the share from `low` to `high`, or an indicator of each word, flag or vector."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:

@@ -108,7 +108,10 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
 
 
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
-    """Return the scenario over `network` with sigma 0, without environment, task and method."""
+    """Return the scenario with sigma 0, without environment, task and method.
+
+    `network` is a preset; None keeps the scenario's network.
+    """
     if network is not None and network not in PRESETS:
         remedy = suggest_name(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)

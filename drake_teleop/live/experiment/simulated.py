@@ -66,7 +66,10 @@ def simulate_participant(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run the remaining trials; `progress` receives the numbers of finished and all trials."""
+    """Run the remaining trials; `progress` receives the numbers of finished and all trials.
+
+    Keys of `stations`: indices of task and condition.
+    """
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
     while procedure.phase != END_PHASE:

@@ -53,7 +53,8 @@ def update_statistics(
 ):
     """Process one sample and write level, cusum and glr to memory[5:8].
 
-    `memory` (MEMORY_SIZE,) is zero at the start; `quiet_level` is CONTACT_END_LEVEL.
+    `memory` (MEMORY_SIZE,) is zero at the start, the sample is a row of `DetectorSamples`.
+    `parameters` are `NoiseFloor.compiled_parameters`, `quiet_level` is CONTACT_END_LEVEL.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -140,7 +141,10 @@ def _normalized_sum_of_last_innovations(memory, hold, widths):
 
 @njit(cache=True)
 def update_hysteresis(memory, statistic, enter, leave, hold, widths):
-    """Update the contact flag in the memory after `update_statistics`, and return it."""
+    """Update the contact flag in the memory after `update_statistics`, and return it.
+
+    Contact begins at `enter`, ends at `leave`; `widths` are `NoiseFloor.sum_widths`.
+    """
     if memory[FLAG_INDEX] == 0.0:
         if memory[STATISTICS_START + statistic] >= enter:
             memory[FLAG_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
@@ -177,8 +181,9 @@ class ContactDetector:
 
     Args:
         threshold: value of the statistic at which contact begins.
-        statistic: "level", "cusum" or "glr".
-        hold: contact ends after `hold` samples with a level below `CONTACT_END_LEVEL`.
+        statistic: "level" (norm of the normalised wrench), "cusum" or "glr", see the module.
+        hold: contact ends after more than `hold` consecutive samples with a level, and then a
+            normalised sum of innovations, below `CONTACT_END_LEVEL`.
         following: sample period over time constant of a mean that is subtracted from the contact
             wrench, updated while the level is below `CONTACT_END_LEVEL`; 0: no mean.
     """

@@ -124,7 +124,8 @@ class NoiseFloor:
 def noise_variances_into(held, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
     """Write the variances (6,) of a sample's contact wrench into `out`.
 
-    It updates the `held` squares of acceleration and alpha; `V` (6, 10) is scratch memory.
+    It updates the `held` squares of acceleration and alpha; `V` (6, 10) is scratch memory;
+    others: `NoiseFloor.compiled_parameters`.
     """
     held[0] = max(dot(acceleration, acceleration), fade * held[0])
     held[1] = max(dot(alpha, alpha), fade * held[1])
@@ -144,7 +145,7 @@ def noise_variances_into(held, s, omega, alpha, acceleration, variances, P, grow
 
 @njit(cache=True)
 def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, out):
-    """Write the noise sigma (N, 6) of a record's contact wrench into `out`."""
+    """Write the noise sigma (N, 6) of contact wrenches, as `noise_variances_into`, to `out`."""
     held, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, growth, fade)
     for k in range(s.shape[0]):
         noise_variances_into(held, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])

@@ -73,7 +73,11 @@ _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
 
 @njit(cache=True)
 def whitening_matrix(motion, phi, noise, model_var, n):
-    """Return the matrix (6, 6) that maps noise of an n-sample mean wrench to unit covariance."""
+    """Return the matrix (6, 6) that maps noise of an n-sample mean wrench to unit covariance.
+
+    `motion` (9,) is [s, omega, alpha]. `noise` begins with variances (15,) of a sample's wrench and
+    motion; `model_var` is that of the relative error of the load's wrench.
+    """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)

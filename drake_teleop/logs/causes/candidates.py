@@ -184,7 +184,7 @@ def _is_tilt_significant(state: FittedModel) -> bool:
 
 
 def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array, float, float]:
-    """Return the estimated gravity_W (3,), its angle [deg] and ratio to the described one."""
+    """Return the estimated gravity_W (3,), its angle [deg] and ratio to the description's."""
     given = state.data.gravity_W
     assert given is not None
     true = given - state.parameters_of_extension("gravity")[0]

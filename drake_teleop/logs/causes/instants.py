@@ -218,6 +218,7 @@ def delay_of_free_fit(data: BlockMeans) -> float:
     """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
 
     The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.
+    Return 0 if the smallest residual is at an end of the range.
     """
     reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

@@ -235,7 +235,6 @@ def _streams_of_draft_for_all_episodes(draft: Draft, fps: float) -> dict[str, An
 def _read_log_and_row_times(
     dataset: Dataset, streams: dict[str, Any], episode: Episode
 ) -> tuple[Log, Array]:
-    """Return the log of an episode, and the times (N,) of its rows on the log's clock [s]."""
     table = dataset.read_episode(episode)
     described = _description_of_episode(streams, episode, dataset.fps)
     source = f"{episode.file.name}: {episode.name}"

@@ -216,7 +216,7 @@ def fit_motion_to_load(
 ) -> PoseMotion:
     """Return the motion from poses of S with which a load fits a wrench best.
 
-    `coefficients` (6, 16) are the load's, Eq. (T73).
+    `coefficients` (6, 16) are the load's, Eq. (T73). Other arguments as for `estimate_from_poses`.
     """
     with one_blas_thread():
         motion, last, _ = _find_splines_and_delay(

@@ -1,4 +1,4 @@
-"""Recorded poses and IMU data."""
+"""Classes of recorded poses and IMU data, with block means."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ class ImuData:
 class PosesOfLog:
     """Poses of S in a log, with gravity (3,) in the world [m/s^2].
 
-    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are the described pose of frame P, which was recorded.
+    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are the pose of the recorded frame P in the log
+    description.
     """
 
     poses: Poses

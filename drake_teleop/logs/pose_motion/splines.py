@@ -345,7 +345,6 @@ def _normal_equations_of_rates(t: Array, x: Array, knots: Array, order: int) -> 
 
 
 def _derivative_coefficients_matrix(knots: Array, order: int) -> csr_array:
-    """Return the matrix from coefficients of a spline to those of its derivative."""
     change = eye_array(len(knots) - SPLINE_DEGREE - 1, format="csr")
     for k in range(order):
         inner, degree = knots[k : len(knots) - k], SPLINE_DEGREE - k

@@ -84,7 +84,8 @@ def smooth_derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return smoothed x (N, ...), dx/dt and d^2x/dt^2 by sliding polynomials of degree 5.
 
-    Filter of Savitzky and Golay (1964), window 1.8 / `bandwidth_hz` [s], at least 9 samples.
+    Filter of Savitzky and Golay (1964), window 1.8 / `bandwidth_hz` [s], at least 9 samples;
+    9 for None.
     """
     n = len(x)
     weights = polynomial_fit_weights(n, dt, bandwidth_hz)

@@ -172,7 +172,7 @@ class LeverArm:
     """Estimated position of the accelerometer.
 
     Attributes:
-        p_SoIo_S: (3,) position relative to the described one, in S [m].
+        p_SoIo_S: (3,) position minus `imu.position` of the log description, in S [m].
         deviations: (3,) standard deviations [m]; inf if undetermined.
         source: "pose" or "wrench".
     """
@@ -256,15 +256,15 @@ class Mounting:
     """Mounting of an IMU relative to the pose.
 
     Attributes:
-        R_SI: (3, 3) rotation from the described IMU axes to S.
-        lag_s: constant lag of the IMU's clock behind the pose's clock [s].
+        R_SI: (3, 3) rotation from the IMU axes of the log description to S.
+        lag_s: best constant lag of the IMU's clock behind the pose's, even with drift [s].
         mid_record_lag_s, mid_record_time_s: lag at mid-record, and this time on the pose's clock
             [s].
         clock_drift: growth of the lag [s/s]; 0 if insignificant.
         unexplained, unexplained_omega: unexplained shares of the variance of specific
             force and angular velocity (None without a gyroscope).
         is_mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
-        speed_ratio: angular speed of gyroscope over pose (RMS), or None.
+        speed_ratio: angular speed of gyroscope over pose (RMS); None if the pose hardly rotates.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
         lever_arm: position of the accelerometer; None without positions.
     """

@@ -103,7 +103,10 @@ class OrientationColumns:
             self._columns *= description.unit_in_si(described.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
-        """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
+        """Return an array (count, 4) for quaternions, possibly in the memory of the columns.
+
+        Write row k only after the columns are read up to row k.
+        """
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:

@@ -90,7 +90,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         - packet: (38,) for the slave
         - wrench_to_master: (6,) F_E_B to render at the hand [N, N m]
 
-    Arguments as for the base class.
+    Arguments as for `_PassivityEndBlock`.
     """
 
     __slots__ = ()
@@ -123,7 +123,7 @@ class PassivityAtSlave(_PassivityEndBlock):
         - packet: (38,) for the master
         - pose_to_slave: (7,) X_WS to follow
 
-    Arguments as for the base class.
+    Arguments as for `_PassivityEndBlock`.
     """
 
     __slots__ = ()

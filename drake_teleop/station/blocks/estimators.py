@@ -16,8 +16,6 @@ from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
 class _SamplePorts:
-    """Input ports for the parts of a sensor sample."""
-
     def __init__(self, system: LeafSystem) -> None:
         sizes = list(regressor.signal_sizes_of_sample(0).items())[:-1]
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]

@@ -53,7 +53,7 @@ class Perception:
     aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's lateral place")
 
     def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per `dt` [s]."""
+        """Return (4,) Weber fraction, threshold [N]; per `dt` [s] masking decay, low-pass gain."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])

@@ -7,7 +7,10 @@ NUM_PARAMETERS = 28  #: length of the parameter vector, which `method_parameters
 
 
 class SlotAllocator:
-    """Allocator of consecutive places in a vector of `size` numbers, from index `first`."""
+    """Allocator of consecutive places in a vector of `size` numbers, from index `first`.
+
+    A full vector raises an IndexError.
+    """
 
     def __init__(self, size: int, first: int = 0) -> None:
         self._size, self._next = size, first

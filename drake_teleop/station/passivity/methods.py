@@ -330,6 +330,6 @@ def record_command(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
     `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
-    the method may change.
+    the method may change; other arguments as for `slave_step`.
     """
     _call_record(steps[2], requested, command, pose, twist, p, memory)

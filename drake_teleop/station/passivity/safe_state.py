@@ -75,8 +75,8 @@ def _update_silence_time(alive, fault, T, watch):
 def master_limits_into(alive, fault, T, timeout, device_limits, displayed, watch, limits):
     """Write the limits (2,) of the rendered wrench [N, N m]; they fall to zero during silence.
 
-    `alive` means that a new packet of a healthy slave came; `fault` that data of the hand or the
-    slave are not finite. `timeout` [s] is the time without packets until the end is silent,
+    `alive` means that a new packet of a healthy sender came; `fault` that data of either end are
+    not finite. `timeout` [s] is the time without packets until the end is silent,
     `displayed` (6,) the displayed wrench. `watch` is the silence monitor, updated.
     """
     _update_silence_time(alive, fault, T, watch)
@@ -99,10 +99,10 @@ def master_limits_into(alive, fault, T, timeout, device_limits, displayed, watch
 
 @njit(cache=True)
 def slave_command_into(alive, fault, T, timeout, requested, watch, command):
-    """Write the command X_WS (7,) that is sent to the slave; during silence the slave stops.
+    """Write the command X_WS (7,) that is sent to the slave; during silence the slave brakes.
 
-    `requested` (7,) is the pose from the passivity method; other arguments as for
-    `master_limits_into`.
+    `requested` (7,) is the pose from the passivity method, `watch` from `initial_slave_monitor`.
+    Alive, fault, T and timeout: as for `master_limits_into`.
     """
     _update_silence_time(alive, fault, T, watch)
     last, before = watch[_LAST_COMMAND], watch[_COMMAND_BEFORE_LAST]
@@ -138,7 +138,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def fade_retreat_wrench(twist, T, p, memory, wrench):
-    """Reduce and store a wrench (6,) that pushes the hand, so that a released hand stays slow.
+    """Reduce and store a wrench (6,) that pushes the hand, so that a stylus stays slow if let go.
 
     It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this, but not
     below `SLAVE_MASS` times the hand's deceleration.

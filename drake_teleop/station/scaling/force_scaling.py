@@ -236,7 +236,7 @@ class ForceScaling(LeafSystem):
     """Block that scales contact wrench and load's wrench, and transforms them to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
-    and inertial parameters phi of gripper and object.
+    phi_gr `config.gripper_phi` (if null, all is gripper), and phi_obj the rest of the estimate.
 
     .. pydrake_system::
 

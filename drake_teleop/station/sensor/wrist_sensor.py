@@ -273,7 +273,7 @@ class WristSensor(LeafSystem):
         - slave_state: state [q; v] of the arm
         - joint_torque: (n,) present torque of the motors [N m]
         - torque_rate: (n,) rate of joint_torque [N m/s] (only with `ramps`)
-        - slave_acceleration: acceleration vdot of the arm, to detect unknown forces
+        - slave_acceleration: acceleration vdot of the arm, to detect forces that no input contains
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         - contact_results: contact results of the plant (only with surroundings)
@@ -281,10 +281,12 @@ class WristSensor(LeafSystem):
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
-        - step: [the last sample before now (16 + n) | its time [s] | memory]
+        - step: [last sample before now (16 + n), see `load.regressor` | its time [s] | memory]
 
-    The motors hold a torque, or with `ramps` its rate, for `hold_time` [s]. A force that the sensor
-    does not receive raises a DrakeTeleopError during simulation.
+    A force that no input contains raises a DrakeTeleopError during simulation.
+
+    Args:
+        hold_time: time for which the motors hold a torque, or with `ramps` its rate [s].
     """
 
     __slots__ = ONE_DICT

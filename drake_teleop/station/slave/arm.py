@@ -2,7 +2,7 @@
 
 For prismatic joints, read m for rad, N for N m, kg for kg m^2. The state ``x`` of a frame L has 21
 numbers in W: ``[s(3), omega(3), alpha(3), p_WL(3), R_WL(9, by rows)]`` with the specific force
-``s = a - g`` of its origin [m/s^2]."""
+``s = a - g`` of its origin [m/s^2]. Arguments `table` are `ArmModel.table`."""
 
 from __future__ import annotations
 
@@ -255,7 +255,6 @@ def _write_joint_axis_and_inertial_wrench(table: Array, row: int, x: Array, link
 
 @njit(cache=True)
 def _project_wrenches_on_joints(table: Array, link: Array, tau: Array) -> None:
-    """Sum the link wrenches from tip to base and project them to joint torques tau (n,) [N m]."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
         for k in range(6, 12):

@@ -210,6 +210,8 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
     """Return the inertia Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W.
 
+    J must have rank 6.
+
     Khatib, A unified approach for motion and force control of robot manipulators (1987).
     """
     n = arm.num_joints

@@ -187,7 +187,7 @@ def ParseTool(
 ) -> tuple[RigidBody, list[str]]:
     """Parse a tool, weld its root link to S by the joint "sensor_weld", and weld its own joints.
 
-    Return the root link, and the assumptions.
+    Return the root link, and texts about assumed or repaired data.
     """
     before, purpose = set(plant.GetJointIndices()), ModelPurpose(is_tool=True)
     instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)

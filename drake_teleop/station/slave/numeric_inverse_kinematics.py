@@ -304,6 +304,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
 
     The search starts at the reference (n,). Without a solution, the positions nearest to the pose
     are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the status of a singularity.
+    Rotation errors are multiplied by `orientation_length`.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts

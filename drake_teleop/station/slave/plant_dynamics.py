@@ -205,7 +205,7 @@ def _take_or_request_given_wrench(given, x, wrench_W):
 
 @njit(cache=True)
 def plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot of the state x under the contact wrench `wrench_W`."""
+    """Write xdot under the contact wrench `wrench_W`, see `contact_and_plant_rates_into`."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]

@@ -106,7 +106,10 @@ def end_of_tool_shapes(tool: Tool) -> list[float] | None:
 def AddTool(
     plant: MultibodyPlant, tool: Tool, sensor_frame: Frame, package_paths: tuple[Path, ...]
 ) -> tuple[RigidBody, list[str]]:
-    """Weld the tool to the sensor frame by the joint "sensor_weld"; return body and assumptions."""
+    """Weld the tool to the sensor frame by the joint "sensor_weld".
+
+    Return the body, and texts about assumed or repaired data.
+    """
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
     body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _tool_spatial_inertia(tool))

@@ -1,4 +1,4 @@
-"""Checks of numbers in the text of URDF and SDF models."""
+"""Checks and repair of inertias, lengths and joint limits in the text of URDF and SDF models."""
 
 from __future__ import annotations
 

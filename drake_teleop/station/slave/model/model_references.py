@@ -154,7 +154,10 @@ class ModelFiles:
         return self.sizes[real]
 
     def mesh_files(self) -> Iterator[Path]:
-        """Yield readable meshes of all links with their files, after `check_referenced_files`."""
+        """Yield readable meshes of all links, and files that these reference.
+
+        Call `check_referenced_files` first.
+        """
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
         for mesh in [mesh for path in texts for mesh in self._referenced_files(path, meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):

@@ -19,7 +19,7 @@ class RepairedModel(NamedTuple):
         text: XML for Drake's parser, with absolute mesh paths.
         assumptions: one text per kind of repair, with the names of changed links or joints.
         effort_limits: torque or force limits [N m, N] by joint; joints without an entry have none.
-        dependence_reasons: reasons why joints or links do not move independently, by name.
+        dependence_reasons: by name, why mimic joints or floating links depend on others.
         auxiliary_bodies: names of massless bodies, added between several joints of one body.
     """
 

@@ -128,7 +128,7 @@ def convert_meshes_and_write_text(
 
 
 def find_dependence_reasons(root: Element) -> dict[str, str]:
-    """Return the joints and links that do not move independently, with the reasons."""
+    """Return, by name, why joints (mimic) or links (floating) do not move independently."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         parent = joint_end(joint, "parent")
