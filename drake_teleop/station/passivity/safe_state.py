@@ -151,10 +151,7 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
         if size > 0.0:
             along = dot_of_group(wrench, velocity, g) / size
             slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
-            share = max(
-                2.0 - along / p[slots.RETREAT_SPEED][g],
-                p[slots.SLAVE_MASS][g] * slowing / size,
-                0.0,
-            )
+            fading = 2.0 - along / p[slots.RETREAT_SPEED][g]
+            share = max(fading, p[slots.SLAVE_MASS][g] * slowing / size, 0.0)
             scale_group(wrench, g, min(share, 1.0))
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
