@@ -124,10 +124,8 @@ class Master:
             parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
         else:
             sheet = self._data_sheet()
-            peaks, body = (
-                (sheet.peak_force, sheet.peak_torque),
-                (sheet.apparent_mass, sheet.inertia),
-            )
+            peaks = sheet.peak_force, sheet.peak_torque
+            body = sheet.apparent_mass, sheet.inertia
             friction = np.repeat([sheet.friction, sheet.friction_torque], 3)
             damping = np.repeat([sheet.damping, sheet.turning_damping], 3)
             workspace = sheet.centre, 0.5 * np.array(sheet.size), sheet.turn

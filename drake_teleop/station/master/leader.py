@@ -210,9 +210,8 @@ class LeaderDevice(HapticDeviceBase):
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
         if status != IkStatus.OK:
             place = ", ".join(f"{x:.3g}" for x in pose[4:])
-            what = (
-                f"the leader arm cannot reach ({place}) m in B (inverse kinematics: {status.name})"
-            )
+            cause = f"inverse kinematics: {status.name}"
+            what = f"the leader arm cannot reach ({place}) m in B ({cause})"
             remedy = "choose a pose that its joints reach, or another home"
             raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
         return q

@@ -79,9 +79,8 @@ _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6
 @njit(cache=True)
 def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
-    M[0, 0] = (
-        _M11_CONSTANT + _M11_COS2Q2 * math.cos(2.0 * q[1]) + _M11_COS2Q3 * math.cos(2.0 * q[2])
-    )
+    M[0, 0] = _M11_CONSTANT + _M11_COS2Q2 * math.cos(2.0 * q[1])
+    M[0, 0] += _M11_COS2Q3 * math.cos(2.0 * q[2])
     M[0, 0] += 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
     M[1, 1], M[2, 2] = _M22, _M33
     M[1, 2] = M[2, 1] = -_M23_MAX * math.sin(q[1] - q[2])
@@ -270,7 +269,7 @@ def check_limits(q: Array) -> None:
         at, least, most = np.degrees([angle, lower, upper])
         what = f"Phantom angle q2 - q3 would be {at:.1f} degrees, not -55 to 65"
         if i < 6:
-            what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, its range is "
-            what += f"{least:.1f} to {most:.1f}"
+            limits = f"its range is {least:.1f} to {most:.1f}"
+            what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, {limits}"
         remedy = "choose a start pose inside the device's workspace"
         raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
