@@ -80,7 +80,8 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_rendered_force_oscillation(result),
     )
     overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
-    return overlaps + [f"{condition} {_spans_text(spans)}" for condition, spans in found if spans]
+    texts = [f"{condition} {_spans_text(spans)}" for condition, spans in found if spans]
+    return [*overlaps, *texts]
 
 
 def find_spans(t: Array, happened: Flags, min_duration: float = 0.0) -> Spans:

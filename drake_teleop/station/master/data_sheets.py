@@ -124,12 +124,12 @@ class Master:
             parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
         else:
             sheet = self._data_sheet()
-            peaks = sheet.peak_force, sheet.peak_torque
+            limits = sheet.peak_force, sheet.peak_torque
             body = sheet.apparent_mass, sheet.inertia
-            friction = np.repeat([sheet.friction, sheet.friction_torque], 3)
+            dry = np.repeat([sheet.friction, sheet.friction_torque], 3)
             damping = np.repeat([sheet.damping, sheet.turning_damping], 3)
             workspace = sheet.centre, 0.5 * np.array(sheet.size), sheet.turn
-            parameters = DeviceParameters(*hand, *peaks, friction, damping, True, *body, *workspace)
+            parameters = DeviceParameters(*hand, *limits, dry, damping, True, *body, *workspace)
         return HapticDevice(as_compiled_arguments(parameters), self.model)
 
     @property
