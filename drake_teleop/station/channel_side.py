@@ -53,16 +53,11 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         return builder.Build()
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    block = TeleopChannel(
-        scenario.channel,
-        _passivity_with_arm_and_device(scenario),
-        RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
-        scales,
-        _rendered_over_contact_force(scenario),
-        start_pose(scenario.slave),
-        1 / scenario.rates.hand_hz,
-        scenario.simulation.seed,
-    )
+    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
+    passivity, start = _passivity_with_arm_and_device(scenario), start_pose(scenario.slave)
+    gain, period = _rendered_over_contact_force(scenario), 1 / scenario.rates.hand_hz
+    seed = scenario.simulation.seed
+    block = TeleopChannel(scenario.channel, passivity, R_WB, scales, gain, start, period, seed)
     channel = builder.AddNamedSystem("channel", block)
     own = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
     for name in own:

@@ -15,41 +15,23 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    models_dir,
-    output_folder,
-    refuse_to_replace_inputs,
-    write_json,
-)
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
+from drake_teleop.station import replay_file
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.master.phantom import serial_joint_angles
-from drake_teleop.station.replay_file import (
-    Canvas,
-    DisplayedNumber,
-    ForceArrow,
-    ReplayFile,
-    ShowFrame,
-    add_shapes,
-    frame_times,
-    set_plain_background,
-)
+from drake_teleop.station.replay_file import ForceArrow
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
+from drake_teleop.station.slave import surroundings
 from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.plant import (
     NominalSlave,
     ParseSlave,
     finalize_without_limit_warnings,
-)
-from drake_teleop.station.slave.surroundings import (
-    AddedEnvironment,
-    AddEnvironment,
-    MovingBodiesExceptLeaf,
-    joint_positions_of_pose,
 )
 
 Signals = Mapping[str, Array]
@@ -85,9 +67,9 @@ def replay_command(
     """
     logs = _find_logs(run)
     for folder in {run, *(log.parent for log in logs)}:
-        refuse_to_replace_inputs(out / "summary.json", folder / "summary.json")
+        files.refuse_to_replace_inputs(out / "summary.json", folder / "summary.json")
     films = []
-    with output_folder(out):
+    with files.output_folder(out):
         for log in logs:
             path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
             result = SimulationResult.scan_parquet(log)
@@ -95,7 +77,7 @@ def replay_command(
             films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
             if not quiet:
                 print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
-        write_json(out / "summary.json", {"films": films})
+        files.write_json(out / "summary.json", {"films": films})
     return {"films": films}
 
 
@@ -115,7 +97,8 @@ def write_replay(
         what = f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}"
         remedy = "give the log of a station with a simulated slave"
         raise DrakeTeleopError(what, where="replay", remedy=remedy)
-    times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
+    start, stop = float(result.t[0]), float(result.t[-1])
+    times, slow_motion = replay_file.frame_times(start, stop, slow_motion)
     rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time
     # Read each signal of a log on disk once, and keep only the displayed rows.
     moving = [name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)]
@@ -124,7 +107,7 @@ def write_replay(
     contact = np.zeros(len(result.t), dtype=bool)
     if "true_contact_wrench_W" in result:
         contact = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    film = ReplayFile(
+    film = replay_file.ReplayFile(
         scenario.description or "A run of the station",
         times,
         slow_motion,
@@ -134,14 +117,14 @@ def write_replay(
         curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
 
-    def make_scene(meshcat: Meshcat) -> ShowFrame:
+    def make_scene(meshcat: Meshcat) -> replay_file.ShowFrame:
         scene = ReplayScene(meshcat, scenario, signals)
         return lambda replay_time, frame: scene.show_sample(replay_time, signals, frame)
 
     film.write(path, make_scene)
 
 
-def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:
+def _displayed_numbers(signals: Signals) -> list[replay_file.DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
     forces = [("Measured at the wrist", measured, BLUE)]
     if "contact_wrench_S" in signals:
@@ -149,8 +132,8 @@ def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:
     if "force_to_master" in signals:
         forces.append(("Shown to the hand", signals["force_to_master"][:, :3], ""))
     return [
-        DisplayedNumber(name, "N", np.linalg.norm(force, axis=1), colour, has_arrow=colour != "")
-        for name, force, colour in forces
+        replay_file.DisplayedNumber(name, "N", np.linalg.norm(f, axis=1), colour, colour != "")
+        for name, f, colour in forces
     ]
 
 
@@ -187,7 +170,7 @@ class ReplayScene:
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
-        self.canvas: Canvas = meshcat
+        self.canvas: replay_file.Canvas = meshcat
         self.plant, self._shapes = MultibodyPlant(time_step=0.0), SceneGraph()
         self.plant.RegisterAsSourceForSceneGraph(self._shapes)
         self._parsed = ParseSlave(self.plant, scenario.slave)
@@ -195,9 +178,9 @@ class ReplayScene:
         nominal = NominalSlave(scenario.slave)
         self._joints, self._tip = nominal.arm.num_joints, nominal.tip
         AddSkeleton(self.plant, self._sensor)
-        touched = AddedEnvironment([], None)
+        touched = surroundings.AddedEnvironment([], None)
         if scenario.surroundings is not None:
-            touched = AddEnvironment(self.plant, scenario.surroundings)
+            touched = surroundings.AddEnvironment(self.plant, scenario.surroundings)
         self._sheet = touched.leaf_instance
         self._master = None
         if "master_state" in recorded:
@@ -205,7 +188,7 @@ class ReplayScene:
         finalize_without_limit_warnings(self.plant)
         self._moving_bodies = {
             MOVING_BODY_POSE_PREFIX + k: body
-            for k, body in MovingBodiesExceptLeaf(self.plant, touched).items()
+            for k, body in surroundings.MovingBodiesExceptLeaf(self.plant, touched).items()
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._draw_bodies_and_yield_moving_ones(meshcat))
@@ -228,7 +211,7 @@ class ReplayScene:
         for body in (plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())):
             path = f"/station/{int(body.index())}_{body.name()}"
             shapes = plant.GetVisualGeometriesForBody(body)
-            add_shapes(meshcat, path, inspector, shapes)
+            replay_file.add_shapes(meshcat, path, inspector, shapes)
             if shapes and plant.IsAnchored(body):
                 meshcat.SetTransform(path, plant.EvalBodyPoseInWorld(self.context, body))
             elif shapes:
@@ -264,7 +247,7 @@ class ReplayScene:
         X_WF = joint.frame_on_parent().CalcPoseInWorld(self.context)
         X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
         q, first = self.plant.GetPositions(self.context), joint.position_start()
-        moved = joint_positions_of_pose(joint, X_WF.inverse() @ X_WBody @ X_BM)
+        moved = surroundings.joint_positions_of_pose(joint, X_WF.inverse() @ X_WBody @ X_BM)
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 
@@ -308,7 +291,7 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
         return _ReplayDevice(arm.instance, hand, grip, lambda q: q[order])
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
-    (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
+    (master,) = Parser(plant, "master").AddModels(str(files.models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
@@ -327,13 +310,13 @@ def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_tabl
         height = _TABLE_HEIGHT_M - 0.03
         for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
             draw_box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL_COLOUR)
-    surroundings = scenario.surroundings
-    for k, part in enumerate(() if surroundings is None else surroundings.parts):
+    touched = scenario.surroundings
+    for k, part in enumerate(() if touched is None else touched.parts):
         stand = part.floor_stand
         if stand is not None and stand.height > 0:
             size = stand.size_x, stand.size_y, stand.height
             centre = stand.centre_x, stand.centre_y, stand.height / 2
             draw_box(f"plinth_{k}" if k else "plinth", size, centre, _STEEL_COLOUR)
-    set_plain_background(meshcat)
+    replay_file.set_plain_background(meshcat)
     aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W
     meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

@@ -315,20 +315,16 @@ class SimulationResult:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td style='text-align:left'><code>{html.escape(spec.name)}</code></td>"
-            f"<td style='text-align:left'>{html.escape(_components_text(spec))}</td>"
-            f"<td style='text-align:left'>{html.escape(spec.description)}</td></tr>"
-            for spec in self.specs
-        )
-        head = "".join(
-            f"<th style='text-align:left'>{title}</th>"
-            for title in ("signal", "components [unit]", "what it is")
-        )
-        return (
-            f"<b>SimulationResult</b>: {self._time_range_text()}"
-            f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
-        )
+        left, rows = " style='text-align:left'", ""
+        for spec in self.specs:
+            texts = spec.name, _components_text(spec), spec.description
+            name, components, description = map(html.escape, texts)
+            rows += f"<tr><td{left}><code>{name}</code></td><td{left}>{components}</td>"
+            rows += f"<td{left}>{description}</td></tr>"
+        titles = "signal", "components [unit]", "what it is"
+        head = "".join(f"<th{left}>{title}</th>" for title in titles)
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        return f"<b>SimulationResult</b>: {self._time_range_text()}{table}"
 
 
 class _SignalsOnDisk(Mapping[str, Array]):

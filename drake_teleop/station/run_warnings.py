@@ -13,10 +13,7 @@ from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import (
-    passivity_with_arm_mass,
-    slave_wrench_power_scale,
-)
+from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
@@ -77,16 +74,14 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_faults(result),
         _check_limits(result, scenario, arm),
         _check_channel(result, scenario),
-        _check_joint_tracking_and_oscillation(result, scenario, arm),
+        _check_joints(result, scenario, arm),
         _check_hand_oscillation(result),
         _check_contact_chatter(result),
         _check_rendered_force_oscillation(result),
     )
     overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
-    return [
-        *overlaps,
-        *(f"{condition} {_spans_text(spans)}" for condition, spans in found if spans),
-    ]
+    texts = [f"{condition} {_spans_text(spans)}" for condition, spans in found if spans]
+    return [*overlaps, *texts]
 
 
 def find_spans(t: Array, happened: Flags, min_duration: float = 0.0) -> Spans:
@@ -151,7 +146,7 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
             joints = result["master_state"][:, : device.num_joints]
             full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
         elif device.peak_torque.all():
-            full |= _is_displayed_torque_at_limit(shown[:, 3:], result["master_state"], device)
+            full |= _is_torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
         yield "the device displays its largest force or torque", spans
         ended = device.is_any_axis_at_end_stop(result["master_state"][:, : device.num_joints])
@@ -240,9 +235,7 @@ def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joint_tracking_and_oscillation(
-    result: SimulationResult, scenario: Scenario, arm: ArmModel
-) -> Warnings:
+def _check_joints(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
@@ -318,9 +311,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     )
 
 
-def _is_displayed_torque_at_limit(
-    torque: Array, master_state: Array, device: HapticDevice
-) -> Flags:
+def _is_torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
     full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):

@@ -1,6 +1,5 @@
 """Scenarios: configuration of a station as dataclasses, read from YAML."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 import dataclasses
 import os
@@ -130,9 +129,7 @@ class Scenario:
     def surroundings(self) -> Environment | None:
         """All objects that the tool can touch as one `Environment`, or None."""
         things = self._touchables
-        if not things:
-            return None
-        return things[0] if len(things) == 1 else SeveralObjects(things)
+        return SeveralObjects(things) if len(things) > 1 else next(iter(things), None)
 
     @property
     def first_sheet_spring(self) -> SheetSpring | None:

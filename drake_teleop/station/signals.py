@@ -49,30 +49,18 @@ SIGNALS = {
         ("specific_force_S", ("s_x s_y s_z", "m/s^2"), "a - g at So, at sample_time"),
         ("angular_velocity_S", ("omega_x omega_y omega_z", "rad/s"), "of S, at sample_time"),
         ("angular_acceleration_S", ("alpha_x alpha_y alpha_z", "rad/s^2"), "of S, at sample_time"),
-        (
-            "saturated",
-            ("saturated", "1"),
-            "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after"
-            " a lost reading",
-        ),
-        (
-            "joint_position",
-            _joint_components(6, "rad"),
-            "encoder readings of the slave, at sample_time",
-        ),
-        (
-            "sample_time",
-            ("t", "s"),
-            "time of the wrist sensor's sample in this row; other signals are of t",
-        ),
+        ("saturated", ("saturated", "1"),
+         "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after a"
+         " lost reading"),
+        ("joint_position", _joint_components(6, "rad"),
+         "encoder readings of the slave, at sample_time"),
+        ("sample_time", ("t", "s"),
+         "time of the wrist sensor's sample in this row; other signals are of t"),
         ("load_estimate", _LOAD_ESTIMATE_COMPONENTS, "offsets and phi, Eq. (7)"),
         ("slave_state", _joint_state_components(6), "true joint angles and velocities, at t"),
         ("joint_torque", _joint_components(6, "N m"), "of the slave's motors"),
-        (
-            "load_state",
-            ("state", "1"),
-            "of the monitored load: 0 learning, 1 settled, 2 disturbed, 3 another load",
-        ),
+        ("load_state", ("state", "1"),
+         "of the monitored load: 0 learning, 1 settled, 2 disturbed, 3 another load"),
         ("true_contact_wrench_W", _WRENCH_COMPONENTS, "environment on the tool, about Wo, in W"),
         ("sheet_state", ("z v_z", "m,m/s"), "deflection of the sheet spring's end, upwards"),
         ("intent", _POSE_COMPONENTS, "intended pose of the stylus, X_BE"),
@@ -86,39 +74,27 @@ SIGNALS = {
         ("scaled_wrench_S", _WRENCH_COMPONENTS, "F' of Fig. 2, before the scale to the master"),
         ("contact_wrench_S", _WRENCH_COMPONENTS, "Eq. (13), calculated contact wrench"),
         ("fault", ("fault", "1"), "of sample or load estimate, 0 = none"),
-        (
-            "force_to_master",
-            _WRENCH_COMPONENTS,
-            "wrench that the device displays, within its limits",
-        ),
+        ("force_to_master", _WRENCH_COMPONENTS,
+         "wrench that the device displays, within its limits"),
         ("fault_at_hand", ("fault", "1"), "of the wrench command at the device, 0 = none"),
-        (
-            "task_state",
-            ("phase outcome noticed threshold trust", "1,1,1,N,1"),
-            "of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
-            " smallest detected force at the hand; share of approach_speed (docs/operator.md)",
-        ),
+        ("task_state", ("phase outcome noticed threshold trust", "1,1,1,N,1"),
+         "of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
+         " smallest detected force at the hand; share of approach_speed (docs/operator.md)"),
         ("pose_received", _POSE_COMPONENTS, "setpoint X_WS of the slave after the channel"),
-        (
-            "ports",
-            _CHANNEL_PORT_COMPONENTS,
-            "energy into the channel at its ends, in the master's power units; time since the last"
-            " packet at each end; energy of the slave's wrench along the command",
-        ),
+        ("ports", _CHANNEL_PORT_COMPONENTS,
+         "energy into the channel at its ends, in the master's power units; time since the last"
+         " packet at each end; energy of the slave's wrench along the command"),
         ("contact", ("contact", "1"), "1 while the slave's detector reports contact"),
         ("contact_at_hand", ("contact", "1"), "contact flag after the channel, at the master"),
     )
-}
+}  # fmt: skip
 
 
 def signal_of(name: str, size: int) -> Signal:
     """Return the description of a signal with `size` components, for any number of joints."""
     if name.startswith(MOVING_BODY_POSE_PREFIX):
-        return _signal(
-            name,
-            *_POSE_COMPONENTS,
-            f"where the body {name.removeprefix(MOVING_BODY_POSE_PREFIX)} is, in W, at t",
-        )
+        body = name.removeprefix(MOVING_BODY_POSE_PREFIX)
+        return _signal(name, *_POSE_COMPONENTS, f"where the body {body} is, in W, at t")
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal

@@ -104,11 +104,9 @@ def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
             what = FAULT_WARNINGS[Fault(int(log.data()[column][0, k]))]
-            raise DrakeTeleopError(
-                f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}",
-                where="simulation.on_fault",
-                remedy="set it to continue, and the run goes on in its safe state",
-            )
+            what = f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}"
+            remedy = "set it to continue, and the run goes on in its safe state"
+            raise DrakeTeleopError(what, where="simulation.on_fault", remedy=remedy)
     return int(log.num_samples())
 
 

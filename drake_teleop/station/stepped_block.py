@@ -8,13 +8,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
 
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import Array
@@ -46,7 +40,7 @@ class SteppedBlock(DoubleOnly, LeafSystem):
         """Declare an output port with `part` of the step's result of index `result`."""
         block: Any = weakref.ref(self)
 
-        def copy_part(context: Context, output: BasicVector) -> None:
+        def copy_part(context: Context, output: Any) -> None:
             output.SetFromVector(block()._step_results(context)[result][part])
 
         self.DeclareVectorOutputPort(name, part.stop - part.start, copy_part, self._after_step)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
@@ -33,16 +32,21 @@ def connect_ports(
 
     A DrakeTeleopError is raised if a port is missing or the sizes differ.
     """
-    output = source.HasOutputPort(name) and source.GetOutputPort(name)
-    port = target.HasInputPort(entry) and target.GetInputPort(entry)
-    _check_port_exists(output, source, f"output port '{name}'")
-    _check_port_exists(port, target, f"input port '{entry}'")
+    remedy = "docs/station.md lists the ports that each side has"
+    for has_port, port_text, block in (
+        (source.HasOutputPort(name), f"output port '{name}'", source),
+        (target.HasInputPort(entry), f"input port '{entry}'", target),
+    ):
+        if not has_port:
+            what = f"the block has no {port_text}"
+            raise DrakeTeleopError(what, where=block.get_name(), remedy=remedy)
+    output, port = source.GetOutputPort(name), target.GetInputPort(entry)
     if output.size() != port.size():
         raise DrakeTeleopError(
             f"its output port '{name}' has {output.size()} numbers, but input port '{entry}' of "
             f"{target.get_name()} expects {port.size()}",
             where=source.get_name(),
-            remedy="docs/station.md lists the ports that each side has",
+            remedy=remedy,
         )
     builder.Connect(output, port)
 
@@ -82,9 +86,3 @@ def build_with_log(
     diagram = builder.Build()
     diagram.set_name(title)
     return diagram
-
-
-def _check_port_exists(port: Any, side: System, what: str) -> None:
-    if not port:
-        remedy = "docs/station.md lists the ports that each side has"
-        raise DrakeTeleopError(f"the block has no {what}", where=side.get_name(), remedy=remedy)

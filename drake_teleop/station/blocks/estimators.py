@@ -10,22 +10,18 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from drake_teleop.common.blocks import DoubleOnly
 from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.load import regressor
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.regressor import (
-    FIRST_JOINT_INDEX,
-    SAMPLE_SPECIFIC_FORCE,
-    signal_sizes_of_sample,
-)
 from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
 class _SamplePorts:
     def __init__(self, system: LeafSystem) -> None:
-        sizes = list(signal_sizes_of_sample(0).items())[:-1]
+        sizes = list(regressor.signal_sizes_of_sample(0).items())[:-1]
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
 
     def Eval(self, context: Context) -> Array:
-        sample, first = np.zeros(FIRST_JOINT_INDEX), 0
+        sample, first = np.zeros(regressor.FIRST_JOINT_INDEX), 0
         for port in self._ports:
             # Unconnected: `saturated` is 0.
             if port.size() > 1 or port.HasValue(context):
@@ -70,14 +66,11 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
         initial: ArrayLike | None = None,
         config: load_estimator.LoadEstimatorConfig | None = None,
     ) -> None:
-        super().__init__(
-            load_estimator.LoadEstimatorConfig(enabled=True) if config is None else config,
-            finite_array("noise_std", noise_std, 6),
-            np.zeros(9) if motion_std is None else finite_array("motion_std", motion_std, 9),
-            period,
-            FIRST_JOINT_INDEX,
-            np.zeros(16) if initial is None else finite_array("initial", initial, 16),
-        )
+        config = load_estimator.LoadEstimatorConfig(enabled=True) if config is None else config
+        noise = finite_array("noise_std", noise_std, 6)
+        motion = np.zeros(9) if motion_std is None else finite_array("motion_std", motion_std, 9)
+        start = np.zeros(16) if initial is None else finite_array("initial", initial, 16)
+        super().__init__(config, noise, motion, period, regressor.FIRST_JOINT_INDEX, start)
 
     def _declare_sample_ports(self, size: int) -> Any:
         return _SamplePorts(self)
@@ -128,6 +121,6 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
         gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W
-        acceleration = sample[SAMPLE_SPECIFIC_FORCE] + gravity
+        acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE] + gravity
         update = contact_detection.update_contact_flag_with_sample
         return bool(update(memory, sample, estimate, acceleration, self._settings))

@@ -15,23 +15,11 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity import methods, safe_state
-from drake_teleop.station.passivity.memory import (
-    CHANNEL_FILL_TIME_LEFT,
-    LOAD_WRENCH,
-    MEMORY_SIZE,
-    WRENCH_LIMIT,
-    SlotAllocator,
-)
+from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.packet import (
-    CONTACT_FLAG,
-    PACKET_LOAD_WRENCH,
-    PACKET_SIZE,
-    SENDER_INPUTS_FINITE,
-    dot_of_group,
-    pose_difference_into,
-)
+from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 from drake_teleop.station.stepped_block import SteppedBlock
 
 _NETWORK_CHOICES = ("custom", *PRESETS)
@@ -48,13 +36,10 @@ class Channel(NetworkConfig):
     network: str = choice("custom", _NETWORK_CHOICES, "a preset, or custom for these fields")
     backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
     timeout: float | None = quantity(
-        None,
-        "s",
-        1e-3,
-        MAX_TIMEOUT_S,
+        None, "s", 1e-3, MAX_TIMEOUT_S,
         "silence after which an end enters its safe state; null: 1.5 times the longest silence in "
         "a minute of this network, at least 0.1 s",
-    )
+    )  # fmt: skip
 
     def networks_of_directions(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
         """Return the networks of both directions: forward (master to slave) and backward."""
@@ -74,17 +59,15 @@ class Channel(NetworkConfig):
         """Return the silence [s] before an end's safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
-        longest = [
-            network.longest_silence(line, direction, period)
-            for direction, line in enumerate(self.networks_of_directions())
-        ]
-        return min(max(_TIMEOUT_PER_LONGEST_SILENCE * max(longest), MIN_TIMEOUT_S), MAX_TIMEOUT_S)
+        lines = enumerate(self.networks_of_directions())
+        longest = max(network.longest_silence(line, k, period) for k, line in lines)
+        return min(max(_TIMEOUT_PER_LONGEST_SILENCE * longest, MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.
 _MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
-_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + sum(_MONITOR_SIZES)
-_layout = SlotAllocator(_ENDS_STATE_SIZE)
+_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_MONITOR_SIZES)
+_layout = slots.SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
 _LAST_FINITE_MASTER_POSE_AND_FLAG = _layout.vector(8)
@@ -93,16 +76,16 @@ _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
 _MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _MONITOR_SIZES)
-MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
+MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = map(_layout.vector, [slots.MEMORY_SIZE] * 2)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
 _R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
 # Recorded values, see `ports` of `TeleopChannel`.
 PORTS_SIGNAL_SIZE = 8
-_layout = SlotAllocator(PORTS_SIGNAL_SIZE)
+_layout = slots.SlotAllocator(PORTS_SIGNAL_SIZE)
 _WORK_OF_HAND_WRENCH, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
 _SILENCE_TIMES_OF_ENDS, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
-_layout = SlotAllocator(7)
+_layout = slots.SlotAllocator(7)
 _RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
 _ZERO_LOAD_WRENCH = np.zeros(6)
 
@@ -151,7 +134,7 @@ def step_channel(
     """
     k = int(ends[_STEP_COUNT])
     ends[_STEP_COUNT] += 1.0
-    received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
+    received, packet = np.zeros(fields.PACKET_SIZE), np.empty(fields.PACKET_SIZE)
     _, fresh = network.receive_packet(backward_parameters, backward, k, received)
     step_master_end(
         steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
@@ -191,19 +174,19 @@ def step_master_end(
         _convert_wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
-    healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
+    healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
     safe_state.master_limits_into(
-        healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits
+        healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, watch, limits
     )
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
         packet,
     )  # fmt: skip
     if not valid:
-        packet[SENDER_INPUTS_FINITE] = 0.0
+        packet[fields.SENDER_INPUTS_FINITE] = 0.0
     _convert_wrench_to_master(held, frame, wrench_received[_RECEIVED_WRENCH])
-    wrench_received[_RECEIVED_CONTACT_FLAG] = received[CONTACT_FLAG]
+    wrench_received[_RECEIVED_CONTACT_FLAG] = received[fields.CONTACT_FLAG]
 
 
 @njit(cache=True)
@@ -222,7 +205,7 @@ def step_slave_end(
         twist[i] = dx[i] / T
     for g in range(2):
         work[g] += dot_of_group(held, dx, g)
-    load = memory[LOAD_WRENCH]
+    load = memory[slots.LOAD_WRENCH]
     if not (are_finite_and_in_range(wrench_B) and are_finite_and_in_range(load_B)):
         valid = False
         ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
@@ -239,14 +222,14 @@ def step_slave_end(
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_TIME_WITH_VALID_SLAVE_WRENCH] += T
     copy_into(wrench, 0, held, 0, 6)
-    healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
+    healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
         steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
         packet,
     )  # fmt: skip
     if not valid:
-        packet[SENDER_INPUTS_FINITE] = 0.0
-    packet[CONTACT_FLAG] = contact
+        packet[fields.SENDER_INPUTS_FINITE] = 0.0
+    packet[fields.CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
     safe_state.slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
@@ -324,16 +307,9 @@ class TeleopChannel(SteppedBlock):
     __slots__ = ()
 
     def __init__(
-        self,
-        channel: Channel,
-        passivity: PassivityConfig,
-        R_WB: Array,
-        scales: Array,
-        force_scale: float,
-        start: Array,
-        period: float,
-        seed: int,
-    ) -> None:
+        self, channel: Channel, passivity: PassivityConfig, R_WB: Array, scales: Array,
+        force_scale: float, start: Array, period: float, seed: int,
+    ) -> None:  # fmt: skip
         super().__init__()
         # Forward, the slave reads the command one step later. Backward, the master takes its step
         # before the slave.
@@ -353,8 +329,8 @@ class TeleopChannel(SteppedBlock):
         self._contact = self.DeclareVectorInputPort("contact", 1)
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_state_of_ends(passivity.method, parameters, start)
-        carried = np.zeros(PACKET_SIZE if self._uses_load else PACKET_LOAD_WRENCH.start)
-        initial = [network.initial_network_state(line, carried) for line in lines]
+        size = fields.PACKET_SIZE if self._uses_load else fields.PACKET_LOAD_WRENCH.start
+        initial = [network.initial_network_state(line, np.zeros(size)) for line in lines]
         receivers, in_transit = zip(*initial, strict=True)
         results = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7)]
         self._initial_arguments = (passivity.method, parameters)
@@ -377,7 +353,7 @@ class TeleopChannel(SteppedBlock):
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
         ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = slave
-        ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fill_time_s
+        ends[SLAVE_METHOD_MEMORY][slots.CHANNEL_FILL_TIME_LEFT] = fill_time_s
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)
 

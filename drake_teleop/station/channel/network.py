@@ -17,14 +17,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.packet import (
-    PACKET_LOAD_WRENCH,
-    POSE,
-    VELOCITY,
-    WRENCH,
-    has_arrived,
-    move_pose_into,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import has_arrived, move_pose_into
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 MAX_DELAY_S = 10.0  # [s], bounds the memory
@@ -113,13 +107,9 @@ _IS_BAD_STATE, _NEWEST_ARRIVED_PACKET, _NEWEST_READ_PACKET, _SILENT_STEPS, _LAST
 
 
 def network_parameters(
-    config: NetworkConfig,
-    seed: int,
-    direction: int,
-    period: float,
-    min_steps: int = 0,
+    config: NetworkConfig, seed: int, direction: int, period: float, min_steps: int = 0,
     delays: NDArray[np.int64] | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Return the parameters of one direction for `send_packet` and `receive_packet`.
 
     Args:
@@ -194,11 +184,9 @@ def _read_delay_trace(path: Path, period: float) -> Array:
     ):
         if bad.any():
             first = int(np.argmax(bad))
-            raise DrakeTeleopError(
-                f"row {table.line_in_file(first)}, {values[first]:g}, {what}",
-                where=f"{path}:{column}",
-                remedy="give seconds, sorted by time; an empty delay is a lost packet",
-            )
+            what = f"row {table.line_in_file(first)}, {values[first]:g}, {what}"
+            remedy = "give seconds, sorted by time; an empty delay is a lost packet"
+            raise DrakeTeleopError(what, where=f"{path}:{column}", remedy=remedy)
     sent = np.arange(math.floor(age[-1] / period + 0.5) + 1) * period
     row = np.searchsorted(age, sent + 1e-6 * period, side="right") - 1
     return np.where(lost, -1.0, np.floor(delay / period + 0.5))[row]
@@ -302,10 +290,10 @@ def receive_packet(p, state, k, packet):
 
 @njit(cache=True)
 def _apply_silence_policy(policy, silent, packet):
-    velocity, pose = packet[VELOCITY], packet[POSE]
+    velocity, pose = packet[fields.VELOCITY], packet[fields.POSE]
     if policy == _SILENCE_POLICY_ZERO:
         velocity[:] = 0.0
-        packet[WRENCH] = packet[PACKET_LOAD_WRENCH] = 0.0
+        packet[fields.WRENCH] = packet[fields.PACKET_LOAD_WRENCH] = 0.0
     elif policy == _SILENCE_POLICY_EXTRAPOLATE and has_arrived(packet):
         move_pose_into(pose, velocity * min(silent, MAX_POSE_EXTRAPOLATION_S), pose)
         if silent > MAX_POSE_EXTRAPOLATION_S:

@@ -83,19 +83,13 @@ _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_DATA_SHEET_FIELD_NAMES = (
-    *("apparent_mass", "friction", "peak_force", "size"),
-    *("turn", "resolution", "turn_resolution", "rate_hz"),
-)
+_COLUMNS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
+_sheets = {
+    name: DeviceFigures(**dict(zip(_COLUMNS.split(), copy.deepcopy(row), strict=True)))
+    for name, row in _DATA_SHEETS.items()
+}
 #: Data sheets by name, for `Master.figures`.
-FIGURES = Registry(
-    "device",
-    {
-        name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELD_NAMES, copy.deepcopy(row), strict=True)))
-        for name, row in _DATA_SHEETS.items()
-    },
-    DeviceFigures,
-)
+FIGURES = Registry("device", _sheets, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
@@ -107,11 +101,9 @@ class Master:
     """Settings of the haptic device, with its start position."""
 
     model: str = choice(
-        PHANTOM_NAME,
-        (PHANTOM_NAME, "custom", LEADER_NAME),
-        "device; custom: `figures` only; leader: arm from a file",
-        FIGURES,
-    )
+        PHANTOM_NAME, (PHANTOM_NAME, "custom", LEADER_NAME),
+        "device; custom: `figures` only; leader: arm from a file", FIGURES,
+    )  # fmt: skip
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )
@@ -131,19 +123,13 @@ class Master:
             resistance = self.friction.coulomb, self.friction.viscous
             parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
         else:
-            figures = self._data_sheet()
-            parameters = DeviceParameters(
-                *hand,
-                figures.peak_force,
-                figures.peak_torque,
-                np.repeat([figures.friction, figures.friction_torque], 3),
-                np.repeat([figures.damping, figures.turning_damping], 3),
-                mass=figures.apparent_mass,
-                inertia=figures.inertia,
-                workspace_centre=figures.centre,
-                half_workspace=0.5 * np.array(figures.size),
-                max_rotation=figures.turn,
-            )
+            sheet = self._data_sheet()
+            limits = sheet.peak_force, sheet.peak_torque
+            body = sheet.apparent_mass, sheet.inertia
+            dry = np.repeat([sheet.friction, sheet.friction_torque], 3)
+            damping = np.repeat([sheet.damping, sheet.turning_damping], 3)
+            workspace = sheet.centre, 0.5 * np.array(sheet.size), sheet.turn
+            parameters = DeviceParameters(*hand, *limits, dry, damping, True, *body, *workspace)
         return HapticDevice(as_compiled_arguments(parameters), self.model)
 
     @property
@@ -153,11 +139,9 @@ class Master:
     def check_pose_mode(self, what: str) -> None:
         """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
         if self.is_joint_leader:
-            raise DrakeTeleopError(
-                f"{what} cannot use a leader arm that commands joints",
-                where="master.leader.leads",
-                remedy="set it to pose: the rendered force is the same",
-            )
+            what = f"{what} cannot use a leader arm that commands joints"
+            remedy = "set it to pose: the rendered force is the same"
+            raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
 
     def encoder_steps(self) -> Array:
         """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""

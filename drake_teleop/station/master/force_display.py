@@ -13,30 +13,21 @@ from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range,
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.master import dynamics
 from drake_teleop.station.master.device_parameters import DeviceParameters
-from drake_teleop.station.master.dynamics import (
-    HapticDeviceBase,
-    gravity_compensation_torque_into,
-    jacobian_into,
-)
+from drake_teleop.station.passivity import safe_state
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
-from drake_teleop.station.passivity.safe_state import (
-    MASTER_MONITOR_SIZE,
-    STOP_TIME_S,
-    initial_master_monitor,
-    master_limits_into,
-)
 
 # Vector from the device: joint positions, and memory of the last period: last valid positions,
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
-_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
+_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + safe_state.MASTER_MONITOR_SIZE)
 _JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
 DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
 _IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
-_SAFE_STATE_MONITOR_SLOTS = _layout.vector(MASTER_MONITOR_SIZE)
+_SAFE_STATE_MONITOR_SLOTS = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
 _DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
@@ -52,7 +43,7 @@ def initial_display_state(q: Array, parameters: DeviceParameters) -> Array:
     display = np.zeros(_SAFE_STATE_MONITOR_SLOTS.stop)
     display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
     peaks = _peak_force_and_torque_of_device(parameters)
-    display[_SAFE_STATE_MONITOR_SLOTS] = initial_master_monitor(peaks)
+    display[_SAFE_STATE_MONITOR_SLOTS] = safe_state.initial_master_monitor(peaks)
     return display
 
 
@@ -83,7 +74,7 @@ def limit_wrench_into(wrench, parameters, J, displayed):
 @njit(cache=True)
 def motor_torque_into(displayed, q, parameters, J, torque):
     """Write motor torques (6,), J^T `displayed` plus gravity compensation at q, into `torque`."""
-    gravity_compensation_torque_into(q, parameters, torque)
+    dynamics.gravity_compensation_torque_into(q, parameters, torque)
     for i in range(6):
         for k in range(6):
             torque[i] += J[k, i] * displayed[k]
@@ -104,7 +95,7 @@ def step_display(wrench, device, parameters, period, J, drive):
     if not are_finite_and_in_range(wrench):
         fault = _WRENCH_FAULT
     displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_WRENCH_SLOTS], fault
-    jacobian_into(q, parameters, J)
+    dynamics.jacobian_into(q, parameters, J)
     limit_wrench_into(wrench, parameters, J, displayed)
     if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED_SLOT] != 0.0:
         _fade_wrench_after_fault(device, parameters, period, drive)
@@ -118,10 +109,11 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
     fault = drive[_FAULT_SLOT] != _NO_FAULT
     drive[_FAULT_AGE_SLOT] = 0.0 if fault else device[_FAULT_AGE_SLOT] + period
     # Complete within STOP_TIME_S, so that the direction does not jump either.
-    share = 0.0 if fault else period / max(STOP_TIME_S + period - drive[_FAULT_AGE_SLOT], period)
+    left = safe_state.STOP_TIME_S + period - drive[_FAULT_AGE_SLOT]
+    share = 0.0 if fault else period / max(left, period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
-    master_limits_into(
+    safe_state.master_limits_into(
         not fault, fault, period, 0.0, device_limits, last, drive[_SAFE_STATE_MONITOR_SLOTS], limits
     )
     drive[_IS_WRENCH_REDUCED_SLOT] = 0.0
@@ -192,7 +184,7 @@ class ForceDisplay(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: HapticDeviceBase) -> None:
+    def __init__(self, period: float, device: dynamics.HapticDeviceBase) -> None:
         super().__init__()
         self._period = period
         self._parameters = device.parameters

@@ -20,16 +20,8 @@ from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, 
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
-from drake_teleop.station.slave.arm import (
-    DAMPING_COLUMN,
-    LAST_ROW_GRAVITY_COLUMN,
-    ArmModel,
-    forward_dynamics,
-    forward_kinematics,
-    inverse_dynamics,
-    jacobian,
-    jacobian_and_pose,
-)
+from drake_teleop.station.slave import arm as serial_arm
+from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
@@ -51,7 +43,7 @@ def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, m
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
-    forward_kinematics(arm, q, R_BE, p_BE)
+    serial_arm.forward_kinematics(arm, q, R_BE, p_BE)
     copy_into(wrench, 0, hand_wrench_minus_weight, 0, 6)  # becomes the wrench about the origin of B
     moment = cross(vector_at(p_BE, 0), vector_at(hand_wrench_minus_weight, 0))
     for i in range(3):
@@ -63,14 +55,14 @@ def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, m
         tau[i] -= joint_table[_DAMPING_ROW, i] * v[i]
         lower, upper, stiffness, damping = joint_table[_MIN_Q_ROW : _STOP_DAMPING_ROW + 1, i]
         tau[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
-    forward_dynamics(arm, q, v, tau, wrench, vdot)
+    serial_arm.forward_dynamics(arm, q, v, tau, wrench, vdot)
 
 
 @njit(cache=True)
 def _update_pose_and_twist(arm, q, v, pose, twist):
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
-    jacobian_and_pose(arm, q, J, x)
+    serial_arm.jacobian_and_pose(arm, q, J, x)
     turn = quaternion_of_matrix(x[12:].reshape((3, 3)))
     same = 0.0
     for i in range(4):
@@ -93,8 +85,8 @@ def limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, F, 
     """
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
-    inverse_dynamics(arm_without_hand, q, still, still, torque)
-    jacobian(arm, q, J)
+    serial_arm.inverse_dynamics(arm_without_hand, q, still, still, torque)
+    serial_arm.jacobian(arm, q, J)
     for i in range(n):
         torque[i] *= joint_table[_CARRIED_WEIGHT_SHARE_ROW, i]
         for k in range(6):
@@ -115,17 +107,14 @@ def step_leader(
     """
     n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
-    if (
-        are_finite_and_in_range(hand_wrench)
-        and are_finite_and_in_range(drive[:6])
-        and are_finite_and_in_range(state)
-    ):
+    valid = are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6])
+    if valid and are_finite_and_in_range(state):
         F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
         for i in range(3):
             F[i], F[3 + i] = drive[i], drive[5 - i]
         copy_into(applied, 0, hand_wrench, 0, 6)
         # The arm's own gravity vector may have any direction.
-        g = arm[n, LAST_ROW_GRAVITY_COLUMN : LAST_ROW_GRAVITY_COLUMN + 3]
+        g = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN : serial_arm.LAST_ROW_GRAVITY_COLUMN + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
@@ -153,7 +142,7 @@ def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
-    jacobian(arm, q, J)
+    serial_arm.jacobian(arm, q, J)
     for i in range(n):
         torque = 0.0
         for k in range(6):
@@ -220,12 +209,11 @@ class LeaderDevice(HapticDeviceBase):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
         if status != IkStatus.OK:
-            raise DrakeTeleopError(
-                f"the leader arm cannot reach ({', '.join(f'{x:.3g}' for x in pose[4:])}) m in B"
-                f" (inverse kinematics: {status.name})",
-                where="pose_master",
-                remedy="choose a pose that its joints reach, or another home",
-            )
+            place = ", ".join(f"{x:.3g}" for x in pose[4:])
+            cause = f"inverse kinematics: {status.name}"
+            what = f"the leader arm cannot reach ({place}) m in B ({cause})"
+            remedy = "choose a pose that its joints reach, or another home"
+            raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
@@ -236,12 +224,10 @@ class LeaderDevice(HapticDeviceBase):
     def check_limits(self, q: Array) -> None:
         lower, upper = self.joint_table[[_MIN_Q_ROW, _MAX_Q_ROW]]
         for k in np.flatnonzero((q < lower) | (q > upper)):
-            raise DrakeTeleopError(
-                f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
-                f" {lower[k]:.3g} to {upper[k]:.3g} (rad or m)",
-                where="master.leader.home",
-                remedy="start within the limits of its joints",
-            )
+            joint, limits = self.arm.joint_names[k], f"{lower[k]:.3g} to {upper[k]:.3g} (rad or m)"
+            what = f"leader joint {joint} would be at {q[k]:.3g}, outside its limits {limits}"
+            remedy = "start within the limits of its joints"
+            raise DrakeTeleopError(what, where="master.leader.home", remedy=remedy)
 
     def is_any_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
         """Return flags (N,): True if a motor has `share` of its torque limit or more.
@@ -256,14 +242,14 @@ class LeaderDevice(HapticDeviceBase):
 
     def jacobian(self, q: Array) -> Array:
         J = np.empty((6, self.num_joints))
-        jacobian(self.arm.table, np.asarray(q), J)
+        serial_arm.jacobian(self.arm.table, np.asarray(q), J)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
-        own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, DAMPING_COLUMN]
+        own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, serial_arm.DAMPING_COLUMN]
         slope = self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
         return np.diag(own + include_coulomb_slope * slope)
 
@@ -300,7 +286,7 @@ class LeaderArm(DeviceBlock):
     __slots__ = ()
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        gravity = np.linalg.norm(device.arm.table[-1, LAST_ROW_GRAVITY_COLUMN:][:3])
+        gravity = np.linalg.norm(device.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])
         hand_weight = float(device.parameters.hand_mass * gravity)
         constants = (*device.compiled_constants, hand_weight)
         super().__init__(period, device, q_initial, step_leader, constants)

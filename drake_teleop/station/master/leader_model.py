@@ -15,14 +15,8 @@ from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.leader import LeaderDevice, make_leader_joint_table
-from drake_teleop.station.slave.arm import (
-    PHI_COLUMN,
-    ROTATION_COLUMN,
-    ROTOR_COLUMN,
-    TRANSLATION_COLUMN,
-    ArmModel,
-    forward_kinematics,
-)
+from drake_teleop.station.slave import arm as serial_arm
+from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, values_per_joint
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParsedArm, ParseModel
@@ -111,13 +105,13 @@ class Leader:
 def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     # The base moves so that E is at p_BE (3,) at home.
     R, p = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(arm.table, home, R, p)
+    serial_arm.forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
-    table[0, TRANSLATION_COLUMN:PHI_COLUMN] += p_BE - p
+    table[0, serial_arm.TRANSLATION_COLUMN : serial_arm.PHI_COLUMN] += p_BE - p
     # R rotates the hand's frame into B, so that E has B's axes at home.
-    R_LS = table[n, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
-    table[n, ROTATION_COLUMN:TRANSLATION_COLUMN] = (R_LS @ R.T).ravel()
-    phi = table[n, PHI_COLUMN:ROTOR_COLUMN]
+    R_LS = table[n, serial_arm.ROTATION_COLUMN : serial_arm.TRANSLATION_COLUMN].reshape(3, 3)
+    table[n, serial_arm.ROTATION_COLUMN : serial_arm.TRANSLATION_COLUMN] = (R_LS @ R.T).ravel()
+    phi = table[n, serial_arm.PHI_COLUMN : serial_arm.ROTOR_COLUMN]
     inertia = inertia_about_origin(phi)
     phi[1:4], phi[4:] = R @ phi[1:4], (R @ inertia @ R.T)[np.triu_indices(3)]
     return dataclasses.replace(arm, table=table)

@@ -19,17 +19,10 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
+from drake_teleop.common import vectors
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    cross,
-    dot,
-    plus,
-    quaternion_product,
-    scale_vector,
-    solve_by_cholesky,
-)
 from drake_teleop.station.master.device_parameters import end_stop_force
 
 GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
@@ -64,30 +57,21 @@ FRICTION_TANH_RAD_S = 0.01  # rad/s, estimate
 _MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD = 300.0, 1.5  # main axes
 _WRIST_STOP_STIFFNESS_N_M_RAD, _WRIST_STOP_DAMPING_N_M_S_RAD = 5.0, 0.01
 
+# Moments of inertia of the point masses of the links.
+_LINK_1_INERTIA = L1**2 * (MASS_A + MASS_C / 4)
+_LINK_2_INERTIA, _LINK_3_INERTIA = L2**2 * MASS_A / 4, L3**2 * MASS_C
 # M11 = _M11_CONSTANT + _M11_COS2Q2 cos 2 q2 + _M11_COS2Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
-_M11_CONSTANT = INERTIA_BASE_YY + 0.5 * (
-    sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
-    + L1**2 * (MASS_A + MASS_C / 4)
-    + L2**2 * MASS_A / 4
-    + L3**2 * MASS_C
-)
-_M11_COS2Q2 = 0.5 * (
-    INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + L1**2 * (MASS_A + MASS_C / 4)
-)
-_M11_COS2Q3 = 0.5 * (
-    INERTIA_A[1]
-    - INERTIA_A[2]
-    + INERTIA_DF[1]
-    - INERTIA_DF[2]
-    - L2**2 * MASS_A / 4
-    - L3**2 * MASS_C
-)
+_bodies = sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
+_constant_terms = _bodies + _LINK_1_INERTIA + _LINK_2_INERTIA + _LINK_3_INERTIA
+_M11_CONSTANT = INERTIA_BASE_YY + 0.5 * _constant_terms
+_cosine_terms = INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + _LINK_1_INERTIA
+_M11_COS2Q2 = 0.5 * _cosine_terms
+_cosine_terms = INERTIA_A[1] - INERTIA_A[2] + INERTIA_DF[1] - INERTIA_DF[2]
+_M11_COS2Q3 = 0.5 * (_cosine_terms - _LINK_2_INERTIA - _LINK_3_INERTIA)
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
-_M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
-_M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
-_REFLECTED_MOTOR_INERTIA_1, _REFLECTED_MOTOR_INERTIA_2, _REFLECTED_MOTOR_INERTIA_3 = (
-    gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS
-)
+_M22 = INERTIA_BE[0] + INERTIA_C[0] + _LINK_1_INERTIA
+_M33 = INERTIA_A[0] + INERTIA_DF[0] + _LINK_2_INERTIA + _LINK_3_INERTIA
+_REFLECTED_MOTOR_INERTIAS = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
 _GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
 _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
@@ -95,14 +79,10 @@ _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6
 @njit(cache=True)
 def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
-    M[0, 0] = (
-        _M11_CONSTANT
-        + _M11_COS2Q2 * math.cos(2.0 * q[1])
-        + _M11_COS2Q3 * math.cos(2.0 * q[2])
-        + 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
-    )
-    M[1, 1] = _M22
-    M[2, 2] = _M33
+    M[0, 0] = _M11_CONSTANT + _M11_COS2Q2 * math.cos(2.0 * q[1])
+    M[0, 0] += _M11_COS2Q3 * math.cos(2.0 * q[2])
+    M[0, 0] += 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
+    M[1, 1], M[2, 2] = _M22, _M33
     M[1, 2] = M[2, 1] = -_M23_MAX * math.sin(q[1] - q[2])
 
 
@@ -132,9 +112,8 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
-    M[0, 0] += _REFLECTED_MOTOR_INERTIA_1
-    M[1, 1] += _REFLECTED_MOTOR_INERTIA_2
-    M[2, 2] += _REFLECTED_MOTOR_INERTIA_3
+    for i in range(3):
+        M[i, i] += _REFLECTED_MOTOR_INERTIAS[i]
     tip_mass = WRIST_MASS_KG + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.
@@ -183,13 +162,13 @@ def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
     # moments of inertia give no gyroscopic moment.
     omega, alpha = (0.0, 0.0, v[0]), (0.0, 0.0, 0.0)
     for k in range(2, 6):
-        turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
-        alpha = plus(alpha, cross(omega, turn))
-        omega = plus(omega, turn)
+        turn = vectors.scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
+        alpha = vectors.plus(alpha, vectors.cross(omega, turn))
+        omega = vectors.plus(omega, turn)
         if k >= 3:
             inertia = WRIST_LINK_INERTIA_KG_M2 + (hand_inertia if k == 5 else 0.0)
             for i in range(k + 1):
-                torque[i] -= inertia * dot((J[3, i], J[4, i], J[5, i]), alpha)
+                torque[i] -= inertia * vectors.dot((J[3, i], J[4, i], J[5, i]), alpha)
 
 
 @njit(cache=True)
@@ -223,7 +202,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
             vdot[i] += J[k, i] * hand_wrench[k]
     _subtract_coriolis_torque(q, v, J, device.hand_mass, device.hand_inertia, vdot)
     _add_friction_and_end_stops(q, v, device.dry_friction, device.damping, vdot)
-    solve_by_cholesky(M, vdot, 6)
+    vectors.solve_by_cholesky(M, vdot, 6)
 
 
 @njit(cache=True)
@@ -236,7 +215,7 @@ def pose_into(q, pose):
     # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
     a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
     b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    w, x, y, z = quaternion_product(a, b)
+    w, x, y, z = vectors.quaternion_product(a, b)
     pose[0] = w * c6 - x * s6
     pose[1] = x * c6 + w * s6
     pose[2] = y * c6 + z * s6
@@ -283,18 +262,14 @@ def is_any_axis_at_end_stop(q: Array) -> NDArray[np.bool_]:
 
 
 def check_limits(q: Array) -> None:
-    margin = 1e-9
-    for i in range(6):
-        if not JOINT_LOWER_RAD[i] - margin <= q[i] <= JOINT_UPPER_RAD[i] + margin:
-            raise DrakeTeleopError(
-                f"Phantom joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
-                f"{np.degrees(JOINT_LOWER_RAD[i]):.1f} to {np.degrees(JOINT_UPPER_RAD[i]):.1f}",
-                where="pose_master",
-                remedy="choose a start pose inside the device's workspace",
-            )
-    if not Q2_MINUS_Q3_RANGE_RAD[0] - margin <= q[1] - q[2] <= Q2_MINUS_Q3_RANGE_RAD[1] + margin:
-        raise DrakeTeleopError(
-            f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
-            where="pose_master",
-            remedy="choose a start pose inside the device's workspace",
-        )
+    ranges = [*zip(JOINT_LOWER_RAD, JOINT_UPPER_RAD, strict=True), Q2_MINUS_Q3_RANGE_RAD]
+    for i, (angle, (lower, upper)) in enumerate(zip([*q, q[1] - q[2]], ranges, strict=True)):
+        if lower - 1e-9 <= angle <= upper + 1e-9:
+            continue
+        at, least, most = np.degrees([angle, lower, upper])
+        what = f"Phantom angle q2 - q3 would be {at:.1f} degrees, not -55 to 65"
+        if i < 6:
+            limits = f"its range is {least:.1f} to {most:.1f}"
+            what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, {limits}"
+        remedy = "choose a start pose inside the device's workspace"
+        raise DrakeTeleopError(what, where="pose_master", remedy=remedy)

@@ -16,6 +16,7 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_bits, random_normal
 from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.station.operator import task as tasks
 from drake_teleop.station.operator.minimum_jerk import (
     PLAN_SIZE,
     PLAN_START_INDEX,
@@ -28,17 +29,6 @@ from drake_teleop.station.operator.perception import (
     CONTACT_NOTICED_INDEX,
     DETECTION_THRESHOLD_INDEX,
     Perception,
-)
-from drake_teleop.station.operator.task import (
-    KIND_INSERT,
-    KIND_PRESS,
-    KIND_REACH,
-    TASK_CLASSES,
-    Insert,
-    Movement,
-    Press,
-    Reach,
-    Task,
 )
 
 DECISION_PERIOD_S = 0.005
@@ -82,7 +72,7 @@ TaskParameters = namedtuple(
 
 
 def pack_operator_parameters(
-    training: OperatorTraining, perception: Perception, movement: Movement
+    training: OperatorTraining, perception: Perception, movement: tasks.Movement
 ) -> OperatorParameters:
     there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_EFFECT_DELAY_S
     delays = perception.vision_delay + there_and_back, perception.reaction_time + there_and_back
@@ -94,17 +84,17 @@ def pack_operator_parameters(
     return as_compiled_arguments(OperatorParameters(*own, *vision, **dataclasses.asdict(movement)))
 
 
-def pack_task_parameters(task: Task) -> TaskParameters:
-    start = TASK_CLASSES.index(type(task)), task.t_start, task.timeout, task.translation
+def pack_task_parameters(task: tasks.Task) -> TaskParameters:
+    start = tasks.TASK_CLASSES.index(type(task)), task.t_start, task.timeout, task.translation
     along: Any = np.array(task.translation) / task.target_distance
     criteria: tuple[float, ...]
-    if isinstance(task, Reach):
+    if isinstance(task, tasks.Reach):
         packed = TaskParameters(*start, along, task.width / 2, task.dwell)
     else:
         radius, standoff = max(0.25 * task.standoff, 1e-3), task.standoff
-        if isinstance(task, Press):
+        if isinstance(task, tasks.Press):
             criteria = task.hold, standoff, task.force, task.tolerance
-        elif isinstance(task, Insert):
+        elif isinstance(task, tasks.Insert):
             along, criteria = [0.0, 0.0, -1.0], (task.dwell, standoff, task.push, 0.0, task.depth)
         else:
             criteria = task.dwell, standoff
@@ -253,7 +243,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     elif state[PHASE_INDEX] == PHASE_APPROACHING:
         _approach_contact(task, person, time, seen_W, felt, state, memory)
     elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_MOVE_TIME]:
-        if task.kind == KIND_PRESS:
+        if task.kind == tasks.KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
             _update_criterion_with_hysteresis(memory, time, True, True)
@@ -269,11 +259,11 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 @njit(cache=True)
 def _perceived_standoff_target_into(task, person, out):
     depth = 0.0
-    if task.kind != KIND_REACH:
+    if task.kind != tasks.KIND_REACH:
         depth = person.depth_error * _draw_normal_number(person, 0, 15)
     for i in range(3):
         out[i] = task.goal[i] + (depth - task.standoff) * task.approach_axis[i]
-        if task.kind == KIND_INSERT and i < 2:
+        if task.kind == tasks.KIND_INSERT and i < 2:
             out[i] += person.aim_error * _draw_normal_number(person, 0, 13 + i)
 
 
@@ -297,7 +287,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
     off = math.sqrt(off)
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
     met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
-    if task.kind == KIND_REACH:
+    if task.kind == tasks.KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
             return
@@ -311,7 +301,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
 
 @njit(cache=True)
 def _approach_contact(task, person, time, seen_W, felt, state, memory):
-    inserts = task.kind == KIND_INSERT
+    inserts = task.kind == tasks.KIND_INSERT
     if state[CONTACT_PERCEIVED_INDEX] > 0.0 and (not inserts or _is_tool_stuck(task, person, felt)):
         plan_stop(memory, time)
         phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING

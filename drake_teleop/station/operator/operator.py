@@ -7,25 +7,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    copy_into,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    rotate_vector,
-)
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into
 from drake_teleop.station.operator.perception import Perception, update_perception_into
-from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
+from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch
 from drake_teleop.station.passivity.packet import are_vectors_finite, limit_group
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
@@ -153,7 +146,7 @@ def intended_motion_into(packed, start, t, pose, twist):
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
-    copy_into(pose, 4, start, 4, 3)
+    vectors.copy_into(pose, 4, start, 4, 3)
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]
@@ -166,9 +159,9 @@ def intended_motion_into(packed, start, t, pose, twist):
         for k in range(3):
             pose[4 + k] += level * row[6 + k]
             twist[k] += rate * row[6 + k]
-        turn = quaternion_exponential((level * row[9], level * row[10], level * row[11]))
-        orientation = quaternion_product(turn, orientation)
-        omega = rotate_vector(turn, omega)
+        turn = vectors.quaternion_exponential((level * row[9], level * row[10], level * row[11]))
+        orientation = vectors.quaternion_product(turn, orientation)
+        omega = vectors.rotate_vector(turn, omega)
         omega = (omega[0] + rate * row[9], omega[1] + rate * row[10], omega[2] + rate * row[11])
     for k in range(4):
         pose[k] = orientation[k]
@@ -198,9 +191,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     rotational B].
     """
     intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    error = quaternion_logarithm(
-        quaternion_product(intended, conjugate_quaternion((pose[0], pose[1], pose[2], pose[3])))
-    )
+    inverse = vectors.conjugate_quaternion((pose[0], pose[1], pose[2], pose[3]))
+    error = vectors.quaternion_logarithm(vectors.quaternion_product(intended, inverse))
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
@@ -311,53 +303,31 @@ class Operator(LeafSystem):
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("Operator: a task requires the arguments training, arm and tip")
-            self._declare_task(config, config.task, training, arm, tip)
+            senses, period = config.perception, decision.DECISION_PERIOD_S
+            nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
+            view_delay = senses.vision_delay + training.backward_delay_s
+            self._seen_displacements = _make_ring_buffer(view_delay, np.zeros(3))
+            self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
+            person = decision.pack_operator_parameters(training, senses, config.movement)
+            task_and_person = decision.pack_task_parameters(config.task), person
+            hand_and_arm = senses.compiled_parameters(period), hand.mass, arm.table
+            self._task_parameters = (*task_and_person, *hand_and_arm, np.array(tip, dtype=float))
+            self._joints = arm.num_joints
+            self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+            memories = decision.initial_memory(), feeling.initial_memory()
+            buffers = self._seen_displacements.ravel(), self._perceived_forces.ravel()
+            state = (np.zeros(decision.STATE_SIZE), *memories, *buffers)
+            self._groups = [self.DeclareDiscreteState(part) for part in state]
+            self.DeclareStateOutputPort("task_state", self._groups[0])
+            update = self._update_perception_and_decision
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
             moving.add(self.discrete_state_ticket(self._groups[1]))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
-    def _declare_task(
-        self,
-        config: OperatorConfig,
-        task: Task,
-        training: OperatorTraining,
-        arm: ArmModel,
-        tip: Array,
-    ) -> None:
-        senses = config.perception
-        nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
-        self._seen_displacements = _make_ring_buffer(
-            senses.vision_delay + training.backward_delay_s, np.zeros(3)
-        )
-        self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
-        self._task_parameters = (
-            decision.pack_task_parameters(task),
-            decision.pack_operator_parameters(training, senses, config.movement),
-            senses.compiled_parameters(decision.DECISION_PERIOD_S),
-            config.hand.mass,
-            arm.table,
-            np.array(tip, dtype=float),
-        )
-        self._joints = arm.num_joints
-        self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
-        state = (
-            np.zeros(decision.STATE_SIZE),
-            decision.initial_memory(),
-            feeling.initial_memory(),
-            self._seen_displacements.ravel(),
-            self._perceived_forces.ravel(),
-        )
-        self._groups = [self.DeclareDiscreteState(part) for part in state]
-        self.DeclareStateOutputPort("task_state", self._groups[0])
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            decision.DECISION_PERIOD_S, 0.0, self._update_perception_and_decision
-        )
-
-    def _update_perception_and_decision(
-        self, context: Context, discrete_state: DiscreteValues
-    ) -> None:
-        state = [discrete_state.get_mutable_value(group) for group in self._groups]
+    def _update_perception_and_decision(self, context: Context, states: DiscreteValues) -> None:
+        state = [states.get_mutable_value(group) for group in self._groups]
         state[3] = state[3].reshape(self._seen_displacements.shape)
         state[4] = state[4].reshape(self._perceived_forces.shape)
         stylus = self._wrench.Eval(context), self._twist.Eval(context)

@@ -93,10 +93,8 @@ class Movement:
 def check_target_beyond_standoff(task: Task, where: str) -> None:
     """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
-    if task.target_distance <= least:
-        raise DrakeTeleopError(
-            f"the target is {task.target_distance:g} m from the tool's start, not above {least:g}"
-            " m (its radius or standoff)",
-            where=f"{where}.translation",
-            remedy="choose a target farther from the tool's start",
-        )
+    if (at := task.target_distance) <= least:
+        rule = f"{least:g} m (its radius or standoff)"
+        what = f"the target is {at:g} m from the tool's start, not above {rule}"
+        remedy = "choose a target farther from the tool's start"
+        raise DrakeTeleopError(what, where=f"{where}.translation", remedy=remedy)

@@ -9,13 +9,7 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.passivity.memory import (
-    DISSIPATED_ENERGY,
-    MEMORY_SIZE,
-    RECEIVED_ENERGY,
-    SENT_ENERGY,
-    STORED_ENERGY,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
 #: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
@@ -31,18 +25,13 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
         pair: wrench over the step to k: `held` f_(k-1), `backward` f_k or `mean` of both.
     """
     if pair not in WEIGHT_OF_PRESENT_WRENCH:
-        raise DrakeTeleopError(
-            f"'{pair}' is unknown",
-            where="pair",
-            remedy=f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}",
-        )
+        remedy = f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}"
+        raise DrakeTeleopError(f"'{pair}' is unknown", where="pair", remedy=remedy)
     wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
-        raise DrakeTeleopError(
-            f"expected shapes (N, 6) and (N, 7), found {wrench.shape} and {pose.shape}",
-            where="wrench, pose",
-            remedy="give one wrench and one pose per sample",
-        )
+        what = f"expected shapes (N, 6) and (N, 7), found {wrench.shape} and {pose.shape}"
+        remedy = "give one wrench and one pose per sample"
+        raise DrakeTeleopError(what, where="wrench, pose", remedy=remedy)
     work = np.zeros((len(wrench), 2))
     _cumulative_work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
     return work
@@ -77,11 +66,8 @@ class EnergyBalance:
 
 def energy_balance(memory: Array) -> EnergyBalance:
     """Return the energy balance of one end's `memory` (..., MEMORY_SIZE); zeros without one."""
-    if memory.shape[-1] != MEMORY_SIZE:
-        raise DrakeTeleopError(
-            f"expected shape (..., {MEMORY_SIZE}), found {memory.shape}",
-            where="memory",
-            remedy="give the memory of one channel end",
-        )
-    parts = STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY
+    if memory.shape[-1] != slots.MEMORY_SIZE:
+        what = f"expected shape (..., {slots.MEMORY_SIZE}), found {memory.shape}"
+        raise DrakeTeleopError(what, where="memory", remedy="give the memory of one channel end")
+    parts = slots.STORED_ENERGY, slots.RECEIVED_ENERGY, slots.SENT_ENERGY, slots.DISSIPATED_ENERGY
     return EnergyBalance(*(memory[..., part].copy() for part in parts))

@@ -3,7 +3,6 @@
 Without an energy balance, an unstable loop stays unstable, but its limit cycle is bounded.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,23 +3,13 @@
 docs/theory.md, (T39). There is no energy balance: any delay makes the channel active.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import (
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    LAST_PORT_WRENCH,
-    SERVO_D,
-    SERVO_K,
-    own_memory,
-    own_parameters,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
@@ -32,10 +22,10 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters; pairs are for translation and rotation.
-_layout = own_parameters()
+_layout = slots.own_parameters()
 _COUPLING_STIFFNESS, _COUPLING_DAMPING = _layout.vector(2), _layout.vector(2)
 _SLAVE_FEEDBACK_GAIN, _HAND_FEEDBACK_GAIN = _layout.number(), _layout.number()
-_POSE_DIFFERENCE = own_memory().vector(6)
+_POSE_DIFFERENCE = slots.own_memory().vector(6)
 
 
 @settings
@@ -44,29 +34,20 @@ class FourChannelConfig:
     """Parameters of the four-channel architecture."""
 
     stiffness: list[float] = quantity(
-        [100.0, 1.0],
-        "N/m, N m/rad",
-        0.0,
-        1e6,
+        [100.0, 1.0], "N/m, N m/rad", 0.0, 1e6,
         "stiffness of C_m, the spring between the hand and the received pose of the slave",
-    )
+    )  # fmt: skip
     damping: list[float] = quantity(
         [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper of C_m, parallel to its spring"
     )
     slave_feedback: float = quantity(
-        0.0,
-        "1",
-        -1.0,
-        10.0,
+        0.0, "1", -1.0, 10.0,
         "C5, gain of the contact force at the slave; that of the hand's force is C3 = 1 + C5",
-    )
+    )  # fmt: skip
     hand_feedback: float = quantity(
-        0.0,
-        "1",
-        -1.0,
-        10.0,
+        0.0, "1", -1.0, 10.0,
         "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
-    )
+    )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
         p[_COUPLING_STIFFNESS], p[_COUPLING_DAMPING] = self.stiffness, self.damping
@@ -98,9 +79,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         for i in range(6):
             g, gain = i // 3, p[_SLAVE_FEEDBACK_GAIN]
             force = (1.0 + gain) * received[WRENCH][i] + gain * wrench[i]
-            shift[i] = (force + p[SERVO_D][g] * received[VELOCITY][i]) / p[SERVO_K][g]
-        move_pose_into(received[POSE], shift, memory[COMMAND_POSE])
-        copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
-    copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+            shift[i] = (force + p[slots.SERVO_D][g] * received[VELOCITY][i]) / p[slots.SERVO_K][g]
+        move_pose_into(received[POSE], shift, memory[slots.COMMAND_POSE])
+        copy_into(memory, slots.COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    copy_into(command, 0, memory, slots.COMMAND.start, 13)
+    copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

@@ -3,7 +3,6 @@
 docs/theory.md, "The energy ledger", has the equations of these steps.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.ledger_slave import (
     ANGLE_PER_LENGTH,
     CONTACT_DIRECTION,
@@ -41,14 +41,6 @@ from drake_teleop.station.passivity.ledger_slave import (
     update_contact_direction,
     work_along,
     wrench_component_along,
-)
-from drake_teleop.station.passivity.memory import (
-    COMMAND_POSE,
-    LAST_PORT_WRENCH,
-    SENT_ENERGY,
-    SLAVE_PER_MASTER_MOTION,
-    STORED_ENERGY,
-    own_memory,
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
@@ -98,7 +90,7 @@ _DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # o
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
 # Memory. The first places are those of `ledger_slave`, up to `CONTACT_DIRECTION`.
-_layout = own_memory()
+_layout = slots.own_memory()
 _layout.vector(CONTACT_DIRECTION.stop - FILTERED_OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
@@ -124,19 +116,13 @@ class LedgerConfig:
     """Parameters of the passivity method "ledger"."""
 
     initial: list[float] = quantity(
-        [0.12, 0.011],
-        "J",
-        0.0,
-        1e3,
+        [0.12, 0.011], "J", 0.0, 1e3,
         "E_0, energy of both ends together at the start; the drag adds the rest of the reserves",
-    )
+    )  # fmt: skip
     reserve: list[float] = quantity(
-        [0.1, 0.01],
-        "J",
-        1e-9,
-        1e3,
+        [0.1, 0.01], "J", 1e-9, 1e3,
         "reserve of the slave: scaled kinetic energy of its fastest motion",
-    )
+    )  # fmt: skip
     hand_reserve: list[float] = quantity(
         [0.02, 1e-3], "J", 1e-9, 1e3, "reserve of the master, to push the hand back"
     )
@@ -147,18 +133,15 @@ class LedgerConfig:
         [0.01, 1e-3], "N, N m", 0.0, 1e3, "contact threshold of the wrench at the hand"
     )
     encoder_step: list[float] | None = quantity(
-        None,
-        "m, rad",
-        0.0,
-        0.1,
+        None, "m, rad", 0.0, 0.1,
         "position and rotation step of the device's encoders; null: as in the device's data sheet",
         length=2,
-    )
+    )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
         p[INITIAL_LEDGER_ENERGY] = self.initial
         p[SLAVE_RESERVE], p[MASTER_RESERVE] = self.reserve, self.hand_reserve
-        scales = p[SLAVE_PER_MASTER_MOTION]
+        scales = p[slots.SLAVE_PER_MASTER_MOTION]
         p[DRAG_WRENCH], p[CONTACT_THRESHOLD] = self.drag / scales, self.touch / scales
         p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], scales)
         p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * scales / scales[0]) ** 2
@@ -166,8 +149,8 @@ class LedgerConfig:
 
 def initialize(p: Array, memory: Array) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
-    memory[STORED_ENERGY] = p[INITIAL_LEDGER_ENERGY] / 2.0
-    memory[SERVO_MODEL_POSE] = memory[COMMAND_POSE]
+    memory[slots.STORED_ENERGY] = p[INITIAL_LEDGER_ENERGY] / 2.0
+    memory[SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
 
 
 def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
@@ -191,7 +174,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
-        memory[STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
+        memory[slots.STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
     if has_arrived(received):
         pose_difference_into(pose, received[POSE], offset_to_slave)
@@ -211,13 +194,13 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         level = p[MASTER_RESERVE][g]
         if memory[IN_CONTACT] > 0.0:
             level += RESERVE_SHARE_AT_MASTER * p[SLAVE_RESERVE][g]
-        surplus = max(memory[STORED_ENERGY][g] - level, 0.0)
-        memory[SENT_ENERGY][g] += surplus
-        memory[STORED_ENERGY][g] -= surplus
+        surplus = max(memory[slots.STORED_ENERGY][g] - level, 0.0)
+        memory[slots.SENT_ENERGY][g] += surplus
+        memory[slots.STORED_ENERGY][g] -= surplus
         _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
-        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-        packet[PACKET_LEDGER_LEVEL][g] = memory[STORED_ENERGY][g]
+        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        packet[PACKET_LEDGER_LEVEL][g] = memory[slots.STORED_ENERGY][g]
     fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
         steady[i] = -memory[_LOST_HAND_MOTION][i]
@@ -241,10 +224,10 @@ def _store_hand_step_without_flicker(dx, p, memory):
 
 @njit(cache=True)
 def _update_hand_ledger(g, dx, in_contact, p, memory):
-    work, ledger = dot_of_group(memory[LAST_PORT_WRENCH], dx, g), memory[STORED_ENERGY]
+    work, ledger = dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g), memory[slots.STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
     if work < 0.0 and in_contact and ledger[g] > _HAND_INPUT_SENDING_LEVEL * p[MASTER_RESERVE][g]:
-        memory[SENT_ENERGY][g] -= work
+        memory[slots.SENT_ENERGY][g] -= work
     else:
         ledger[g] -= work
 
@@ -388,7 +371,7 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
     size = length_of_group(wrench, g)
-    most = MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g]
+    most = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
     if fading[g] > 0.0 and size > most:
         scale_group(wrench, g, most / size)
     else:
@@ -407,7 +390,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         if displacement >= 0.0:
             cost += size * _MAX_HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
     unused = _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]
-    most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(memory[STORED_ENERGY][g] - unused, 0.0)
+    most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)
     if share * cost > most:
         share = most / cost
@@ -419,7 +402,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _permitted_braking_share(g, dx, T, p, memory):
-    if memory[STORED_ENERGY][g] >= _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]:
+    if memory[slots.STORED_ENERGY][g] >= _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[FILTERED_OWN_VELOCITY]
     along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)
@@ -430,9 +413,9 @@ def _permitted_braking_share(g, dx, T, p, memory):
 def _add_drag_force(g, received, dx, T, p, memory, wrench):
     velocity, drag, active = memory[FILTERED_OWN_VELOCITY], 0.0, memory[_IS_DRAG_ACTIVE]
     speed = length_of_group(velocity, g)
-    own_level = memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g]
+    own_level = memory[slots.STORED_ENERGY][g] / p[MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.
-    slave_energy = received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
+    slave_energy = received[PACKET_LEDGER_LEVEL][g] + memory[slots.SENT_ENERGY][g]
     lowest = min(own_level, slave_energy / p[SLAVE_RESERVE][g])
     in_contact = memory[IN_CONTACT] > 0.0
     if (in_contact and own_level < _DRAG_OFF_LEVEL) or (not in_contact and lowest < _DRAG_ON_LEVEL):

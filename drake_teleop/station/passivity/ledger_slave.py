@@ -9,28 +9,12 @@ import math
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.contact_fit import (
     NUM_CONTACT_FIT_SUMS,
     force_change_by_slip,
     force_without_slip_steps,
     update_contact_fit,
-)
-from drake_teleop.station.passivity.memory import (
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    DISSIPATED_ENERGY,
-    LAST_PORT_WRENCH,
-    LOAD_WRENCH,
-    RECEIVED_ENERGY,
-    SENT_ENERGY,
-    SERVO_D,
-    SERVO_K,
-    SLAVE_MASS,
-    STEP_COUNT,
-    STORED_ENERGY,
-    own_memory,
-    own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
@@ -90,12 +74,12 @@ PACKET_LEDGER_LEVEL = SECOND_ENERGY_COUNTER
 NEWEST_SLAVE_PACKET = METHOD_INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
-_layout = own_parameters()
+_layout = slots.own_parameters()
 INITIAL_LEDGER_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
 DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
-_layout = own_memory()
+_layout = slots.own_memory()
 FILTERED_OWN_VELOCITY, IN_CONTACT = _layout.vector(6), _layout.number()
 MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
 SERVO_MODEL_POSE, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
@@ -169,29 +153,29 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
+    error, now, velocity = command[:6], memory[slots.COMMAND_POSE], memory[slots.COMMAND_TWIST]
     connected = has_arrived(received)
     memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
     kept = 1.0 - T / _LONGEST_DELAY_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
-    trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
-    memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
+    trip = (memory[slots.STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T if connected else 0.0
+    memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip, 0.0)
     filter_velocity(twist, min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0), memory)
-    contact, load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH]
+    contact, load = memory[_CONTACT_WRENCH], memory[slots.LOAD_WRENCH]
     filtered = memory[_FILTERED_LOAD_WRENCH]
     for i in range(6):
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
     delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)
-    share = min(T / delay, 1.0) if memory[STEP_COUNT] > 0.0 else 1.0
+    share = min(T / delay, 1.0) if memory[slots.STEP_COUNT] > 0.0 else 1.0
     for i in range(6):
         filtered[i] += share * (load[i] - filtered[i])
     for g in range(2):
         _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
     _identify_contact(received, in_contact, dx, contact, T, p, memory)
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
         pose_difference_into(received[POSE], now, error)
@@ -202,7 +186,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     move_pose_into(now, error, now)
     _limit_command_to_motor_energy(now, pose, twist, p, memory)
     _step_servo_model(received, connected, T, p, memory, error)
-    copy_into(command, 0, memory, COMMAND.start, 13)
+    copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT] > 0.0:
         normal = memory[CONTACT_DIRECTION]
@@ -213,9 +197,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
         size = length_of_group(memory[CONTACT_DIRECTION], g)
-        compliance += size * size / (_SERVO_STIFFNESS_FACTOR * p[SERVO_K][g])
-        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-        packet[PACKET_LEDGER_LEVEL][g] = memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g]
+        compliance += size * size / (_SERVO_STIFFNESS_FACTOR * p[slots.SERVO_K][g])
+        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        level = memory[slots.STORED_ENERGY][g] - memory[slots.RECEIVED_ENERGY][g]
+        packet[PACKET_LEDGER_LEVEL][g] = level
     packet[PACKET_CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
     packet[ROUND_TRIP] = memory[_LONGEST_ROUND_TRIP]
     packet[PACKET_CONTACT_STIFFNESS] = memory[_STIFFNESS_SHARE] * k / (1.0 + k * compliance)
@@ -224,15 +209,15 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
-    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_PORT_WRENCH], dx, g))
+    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g))
     new = count_newly_received_energy(g, received, memory)
-    ledger, input_energy = memory[STORED_ENERGY], memory[_ENERGY_IN_CONTACT]
+    ledger, input_energy = memory[slots.STORED_ENERGY], memory[_ENERGY_IN_CONTACT]
     reserve = p[SLAVE_RESERVE][g]
     ledger[g] += new
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
     speed = length_of_group(twist, g)
-    kinetic = 0.5 * SLAVE_MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
+    kinetic = 0.5 * SLAVE_MASS_FACTOR * p[slots.SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _ENERGY_SEND_RATE
     free, returned = ledger[g] - kinetic, 0.0
@@ -244,15 +229,15 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
     lost = max(ledger[g] - returned - _MAX_SLAVE_ENERGY_IN_RESERVES * reserve, 0.0)
-    memory[SENT_ENERGY][g] += returned
-    memory[DISSIPATED_ENERGY][g] += lost
+    memory[slots.SENT_ENERGY][g] += returned
+    memory[slots.DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
     memory[_AVAILABLE_MOTOR_ENERGY][g] = ledger[g] - kinetic
 
 
 @njit(cache=True)
 def _servo_lag_s(p):
-    return 2.0 * math.sqrt(p[SLAVE_MASS][0] / p[SERVO_K][0])
+    return 2.0 * math.sqrt(p[slots.SLAVE_MASS][0] / p[slots.SERVO_K][0])
 
 
 @njit(cache=True)
@@ -361,8 +346,8 @@ def _max_force_change_by_slip(wrench, normal_force, T, p, memory):
 
 @njit(cache=True)
 def _generate_command(received, connected, T, p, memory, error):
-    velocity, normal, feed = memory[COMMAND_TWIST], memory[CONTACT_DIRECTION], received[VELOCITY]
-    compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
+    velocity, feed = memory[slots.COMMAND_TWIST], received[VELOCITY]
+    normal, compliance, beyond_wall, inward_speed = memory[CONTACT_DIRECTION], 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
         beyond_wall = memory[_SLAVE_WALL_DEPTH] - work_along(normal, error)
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
@@ -380,8 +365,9 @@ def _generate_command(received, connected, T, p, memory, error):
             error[i] *= rate
             if feeds_forward:
                 error[i] += feed[i] + compliance * inward_speed * p[WRENCH_METRIC][g] * normal[i]
-        available = max(memory[STORED_ENERGY][g] - UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], 0.0)
-        limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * p[SLAVE_MASS][g])))
+        unused, mass = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], p[slots.SLAVE_MASS][g]
+        available = max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
+        limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * mass)))
         for i in range(3 * g, 3 * g + 3):
             error[i] -= velocity[i]
         limit_group(error, g, acceleration * T)
@@ -395,12 +381,13 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
-        K, D = _SERVO_STIFFNESS_FACTOR * p[SERVO_K][g], _SERVO_DAMPING_FACTOR * p[SERVO_D][g]
+        K = _SERVO_STIFFNESS_FACTOR * p[slots.SERVO_K][g]
+        D = _SERVO_DAMPING_FACTOR * p[slots.SERVO_D][g]
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = K * motor_wrench[i] - D * twist[i]
         if _limit_motor_wrench(g, D, twist, p, memory):
             changed = True
-            velocity = memory[COMMAND_TWIST]
+            velocity = memory[slots.COMMAND_TWIST]
             is_faster = length_of_group(velocity, g) > length_of_group(twist, g)
             if is_faster or dot_of_group(velocity, twist, g) < 0.0:
                 for i in range(3 * g, 3 * g + 3):
@@ -417,7 +404,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[FILTERED_OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed = length_of_group(motor_wrench, g), length_of_group(twist, g)
-    mass = SLAVE_MASS_FACTOR * p[SLAVE_MASS][g]
+    mass = SLAVE_MASS_FACTOR * p[slots.SLAVE_MASS][g]
     stands = length_of_group(velocity, g) < _SLAVE_STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
     margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_AVAILABLE_MOTOR_ENERGY][g]
     pushes = dot_of_group(motor_wrench, twist, g) > 0.0
@@ -455,8 +442,8 @@ def _step_servo_model(received, connected, T, p, memory, error):
     if connected:
         pose_difference_into(received[POSE], model, error)
     for i in range(6):
-        mass = p[SLAVE_MASS][i // 3]
-        stiff, damped = p[SERVO_K][i // 3] / mass, p[SERVO_D][i // 3] / mass
+        mass = p[slots.SLAVE_MASS][i // 3]
+        stiff, damped = p[slots.SERVO_K][i // 3] / mass, p[slots.SERVO_D][i // 3] / mass
         velocity[i] = (velocity[i] + T * stiff * error[i]) / (1.0 + T * damped + T * T * stiff)
         error[i] = T * velocity[i]
     move_pose_into(model, error, model)
@@ -467,5 +454,5 @@ def record_command(requested, command, pose, twist, p, memory):
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_command_to_motor_energy(command, pose, twist, p, memory):
-                copy_into(memory, COMMAND_POSE.start, command, 0, 7)
+                copy_into(memory, slots.COMMAND_POSE.start, command, 0, 7)
             return

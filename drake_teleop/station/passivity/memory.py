@@ -50,15 +50,12 @@ _METHOD_MEMORY_SLICE = _layout.rest()
 _command_layout = SlotAllocator(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command_layout.vector(7), _command_layout.rest()
 
+# Limit, servo and mass are in the master's power units.
 _parameter_layout = SlotAllocator(NUM_PARAMETERS)
-#: Largest force and torque at the hand, in the master's power units [N, N m].
-WRENCH_LIMIT = _parameter_layout.vector(2)
-#: K of the slave's servo, in the master's power units [N/m, N m/rad].
-SERVO_K = _parameter_layout.vector(2)
-#: D of the slave's servo, in the master's power units [N s/m, N m s/rad].
-SERVO_D = _parameter_layout.vector(2)
-#: Mass of the slave at its tool, in the master's power units [kg, kg m^2].
-SLAVE_MASS = _parameter_layout.vector(2)
+WRENCH_LIMIT = _parameter_layout.vector(2)  #: largest force and torque at the hand [N, N m]
+SERVO_K = _parameter_layout.vector(2)  #: K of the slave's servo [N/m, N m/rad]
+SERVO_D = _parameter_layout.vector(2)  #: D of the slave's servo [N s/m, N m s/rad]
+SLAVE_MASS = _parameter_layout.vector(2)  #: mass of the slave at its tool [kg, kg m^2]
 #: Factors from the master's power units to the wrench at the hand, for force and torque.
 SLAVE_PER_MASTER_MOTION = _parameter_layout.vector(2)
 #: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion

@@ -4,7 +4,6 @@ All poses, twists and wrenches are in world axes W. Wrenches are in the *master'
 wrench times motion of the slave's command is the work at the hand, docs/theory.md (T29).
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -38,24 +37,10 @@ from drake_teleop.station.passivity import (
     two_layer,
     wave,
 )
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.four_channel import FourChannelConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.memory import (
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    LAST_HEALTHY_SENT_PACKET,
-    MEMORY_SIZE,
-    NUM_PARAMETERS,
-    RETREAT_SPEED,
-    SERVO_D,
-    SERVO_K,
-    SLAVE_MASS,
-    SLAVE_PER_MASTER_MOTION,
-    STEP_COUNT,
-    WRENCH_LIMIT,
-)
 from drake_teleop.station.passivity.packet import (
     PACKET_NUMBER,
     PACKET_SIZE,
@@ -156,40 +141,28 @@ _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 @dataclass
 class _CommonMethodConfig:
     method: str = choice(
-        "none",
-        (),
+        "none", (),
         "passivity method of the channel; two_layer, pspm, four_channel and force_limit are"
-        " references for comparison",
-        METHODS,
-    )
+        " references for comparison", METHODS,
+    )  # fmt: skip
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest rendered force at the hand")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
-        [0.1, 1.0],
-        "m/s, rad/s",
-        1e-3,
-        1e3,
+        [0.1, 1.0], "m/s, rad/s", 1e-3, 1e3,
         "speed of the hand along the wrench where it starts to fade; zero at twice this speed",
-    )
+    )  # fmt: skip
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
     )
     servo_damping: list[float] = quantity(
-        [3.5e3, 117.0],
-        "N s/m, N m s/rad",
-        0.0,
-        1e8,
+        [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8,
         "D of the slave's servo, in the slave's units (E)",
-    )
+    )  # fmt: skip
     slave_mass: list[float] | None = quantity(
-        None,
-        "kg, kg m^2",
-        1e-6,
-        1e6,
+        None, "kg, kg m^2", 1e-6, 1e6,
         "mass of arm and tool at the tool, in the slave's units; null: 15.13, 0.5 (E), with ledger"
-        " mass and servo of the station's arm at the start",
-        length=2,
-    )
+        " mass and servo of the station's arm at the start", length=2,
+    )  # fmt: skip
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
 
 
@@ -238,14 +211,14 @@ def method_parameters(
             torque: force scale over kinematic scale.
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
     """
-    p = np.zeros(NUM_PARAMETERS)
-    p[WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
-    p[SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
-    p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
-    p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
-    p[SLAVE_PER_MASTER_MOTION] = motion_scale
+    p = np.zeros(slots.NUM_PARAMETERS)
+    p[slots.WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
+    p[slots.SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
+    p[slots.SERVO_D] = np.multiply(config.servo_damping, power_scale)
+    p[slots.SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
+    p[slots.SLAVE_PER_MASTER_MOTION] = motion_scale
     fades = config.method != "none"
-    p[RETREAT_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf
+    p[slots.RETREAT_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf
     own = config.method_config()
     if own is not None:
         own.pack_into(p)
@@ -258,9 +231,9 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.
     """
     own = METHODS[METHODS.check(method, "passivity.method")]
-    memory = np.zeros(MEMORY_SIZE)
-    memory[COMMAND_POSE] = pose
-    memory[LAST_HEALTHY_SENT_PACKET][POSE] = pose
+    memory = np.zeros(slots.MEMORY_SIZE)
+    memory[slots.COMMAND_POSE] = pose
+    memory[slots.LAST_HEALTHY_SENT_PACKET][POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -289,12 +262,12 @@ def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
 def _set_packet_number_and_health(healthy, memory, packet):
     if healthy:
         packet[SENDER_INPUTS_FINITE] = 1.0
-        copy_into(memory, LAST_HEALTHY_SENT_PACKET.start, packet, 0, PACKET_SIZE)
+        copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, LAST_HEALTHY_SENT_PACKET.start, PACKET_SIZE)
+        copy_into(packet, 0, memory, slots.LAST_HEALTHY_SENT_PACKET.start, PACKET_SIZE)
         packet[SENDER_INPUTS_FINITE] = 0.0
-    packet[PACKET_NUMBER] = memory[STEP_COUNT]
-    memory[STEP_COUNT] += 1.0
+    packet[PACKET_NUMBER] = memory[slots.STEP_COUNT]
+    memory[slots.STEP_COUNT] += 1.0
 
 
 @njit(cache=True)
@@ -343,8 +316,8 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
     packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = are_vectors_finite((received, pose, twist, dx, wrench))
     if not healthy:
-        memory[COMMAND_TWIST] = 0.0
-        copy_into(command, 0, memory, COMMAND.start, 13)
+        memory[slots.COMMAND_TWIST] = 0.0
+        copy_into(command, 0, memory, slots.COMMAND.start, 13)
     else:
         _call_slave(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet

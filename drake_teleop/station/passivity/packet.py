@@ -19,24 +19,16 @@ from drake_teleop.station.passivity.memory import RECEIVED_ENERGY, SlotAllocator
 
 PACKET_SIZE = 38
 _layout = SlotAllocator(PACKET_SIZE)
-#: Number of the packet, counted by its sender.
-PACKET_NUMBER = _layout.number()
+PACKET_NUMBER = _layout.number()  #: number of the packet, counted by its sender
 #: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
 SENDER_INPUTS_FINITE = _layout.number()
-#: X_WS [qw qx qy qz px py pz] of the sender.
-POSE = _layout.vector(7)
-#: Twist of the sender [v; omega], in W.
-VELOCITY = _layout.vector(6)
-#: Wrench at the sender [f; tau], in W, in the master's power units.
-WRENCH = _layout.vector(6)
-#: Numbers that the method defines, such as a cumulative integral.
-METHOD_INTEGRAL = _layout.vector(6)
-#: Cumulative energy that the receiver may use, by group [J].
-CUMULATIVE_ENERGY = _layout.vector(2)
-#: Second energy counter, by group [J].
-SECOND_ENERGY_COUNTER = _layout.vector(2)
-#: 1 while the slave's detector reports contact.
-CONTACT_FLAG = _layout.number()
+POSE = _layout.vector(7)  #: X_WS [qw qx qy qz px py pz] of the sender
+VELOCITY = _layout.vector(6)  #: twist of the sender [v; omega], in W
+WRENCH = _layout.vector(6)  #: wrench at the sender [f; tau], in W, in the master's power units
+METHOD_INTEGRAL = _layout.vector(6)  #: numbers of the method, such as a cumulative integral
+CUMULATIVE_ENERGY = _layout.vector(2)  #: cumulative energy that the receiver may use, by group [J]
+SECOND_ENERGY_COUNTER = _layout.vector(2)  #: second energy counter, by group [J]
+CONTACT_FLAG = _layout.number()  #: 1 while the slave's detector reports contact
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
 #: field, because only `ledger` uses it; with other methods it is not transmitted.
 PACKET_LOAD_WRENCH = _layout.vector(6)

@@ -3,7 +3,6 @@
 A spring pulls each end to a set position as near to the requested one as the energy permits.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 
@@ -13,19 +12,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import (
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    DISSIPATED_ENERGY,
-    LAST_PORT_WRENCH,
-    SENT_ENERGY,
-    SERVO_D,
-    SERVO_K,
-    STORED_ENERGY,
-    own_memory,
-    own_parameters,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
     POSE,
@@ -41,11 +28,11 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters, for translation and rotation.
-_layout = own_parameters()
+_layout = slots.own_parameters()
 _INITIAL_ENERGY, _MAX_STORED_ENERGY = _layout.vector(2), _layout.vector(2)
 _SPRING_STIFFNESS, _HAND_DAMPING = _layout.vector(2), _layout.vector(2)
 # Memory: set position minus actual position; requested value of this offset.
-_layout = own_memory()
+_layout = slots.own_memory()
 _SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.vector(6)
 
 
@@ -56,12 +43,9 @@ class PspmConfig:
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
-        [0.015, 3e-4],
-        "J",
-        0.0,
-        1e6,
+        [0.015, 3e-4], "J", 0.0, 1e6,
         "largest E; the master sends the rest to the slave, the slave discards it",
-    )
+    )  # fmt: skip
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"
     )
@@ -76,15 +60,16 @@ class PspmConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[STORED_ENERGY] = p[_INITIAL_ENERGY]
+    memory[slots.STORED_ENERGY] = p[_INITIAL_ENERGY]
 
 
 @njit(cache=True)
 def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
-    damped = -dot_of_group(memory[LAST_PORT_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
-    ledger = memory[STORED_ENERGY]
+    damped = -dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
+    damped -= 0.5 * stiffness * (stored - before)
+    ledger = memory[slots.STORED_ENERGY]
     energy = ledger[g] + damped
     energy += count_newly_received_energy(g, received, memory)
     available = stored + 2.0 * energy / stiffness
@@ -94,11 +79,11 @@ def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memor
     energy -= 0.5 * stiffness * (dot_of_group(offset, offset, g) - stored)
     surplus = max(energy - p[_MAX_STORED_ENERGY][g], 0.0)
     if shuffle:
-        memory[SENT_ENERGY][g] += surplus
+        memory[slots.SENT_ENERGY][g] += surplus
     else:
-        memory[DISSIPATED_ENERGY][g] += surplus
+        memory[slots.DISSIPATED_ENERGY][g] += surplus
     ledger[g] = energy - surplus
-    packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
+    packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
 
 
 @njit(cache=True)
@@ -123,31 +108,32 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
-    now, held, K, D = memory[COMMAND_POSE], memory[LAST_PORT_WRENCH], p[SERVO_K], p[SERVO_D]
+    now, held = memory[slots.COMMAND_POSE], memory[slots.LAST_PORT_WRENCH]
+    K, D = p[slots.SERVO_K], p[slots.SERVO_D]
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
     if has_arrived(received):
         pose_difference_into(received[POSE], pose, requested)
-        copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+        copy_into(memory, slots.COMMAND_TWIST.start, received, VELOCITY.start, 6)
     for g in range(2):
         _modulate_set_position(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
     move_pose_into(pose, offset, now)
-    copy_into(command, 0, memory, COMMAND.start, 13)
+    copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    offset, other, held = memory[_SPRING_DEFLECTION], np.empty(6), memory[LAST_PORT_WRENCH]
-    K, D = p[SERVO_K], p[SERVO_D]
+    offset, other, held = memory[_SPRING_DEFLECTION], np.empty(6), memory[slots.LAST_PORT_WRENCH]
+    K, D = p[slots.SERVO_K], p[slots.SERVO_D]
     pose_difference_into(command, pose, offset)
     pose_difference_into(requested, pose, other)
     for i in range(6):
         held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
-    copy_into(memory, COMMAND_POSE.start, command, 0, 7)
+    copy_into(memory, slots.COMMAND_POSE.start, command, 0, 7)
     for g in range(2):
         increase = dot_of_group(offset, offset, g) - dot_of_group(other, other, g)
-        memory[STORED_ENERGY][g] -= 0.5 * K[g] * increase
+        memory[slots.STORED_ENERGY][g] -= 0.5 * K[g] * increase

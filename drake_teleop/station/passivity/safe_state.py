@@ -11,13 +11,7 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import (
-    FILTERED_HAND_VELOCITY,
-    LAST_PORT_WRENCH,
-    RETREAT_SPEED,
-    SLAVE_MASS,
-    SlotAllocator,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import (
     dot_of_group,
     length_of_group,
@@ -32,13 +26,13 @@ RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
 _HAND_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
-_layout = SlotAllocator(MASTER_MONITOR_SIZE)
+_layout = slots.SlotAllocator(MASTER_MONITOR_SIZE)
 SILENCE_TIME = _layout.number()  #: time without packets [s], also at the slave
 _PRESENT_HAND_WRENCH_LIMITS = _layout.vector(2)  # present limits
 _WRENCH_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
 _CONNECTED_TIME = _layout.number()  # time since the last silence
 # Monitor state of the slave.
-_layout = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME + 1)
+_layout = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME + 1)
 _TIME_SINCE_STOP_BEGAN = _layout.number()  # time since it began to stop
 _TIME_SINCE_RESUME_BEGAN = _layout.number()  # time since it began to resume
 _COMMAND_AT_STOP_START = _layout.vector(7)  # command when it began to stop
@@ -65,8 +59,7 @@ def initial_slave_monitor(pose: Array) -> Array:
     """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_TIME] = np.inf
-    for part in (_COMMAND_AT_STOP_START, _LAST_COMMAND, _COMMAND_BEFORE_LAST):
-        watch[part] = pose
+    watch[_COMMAND_AT_STOP_START] = watch[_LAST_COMMAND] = watch[_COMMAND_BEFORE_LAST] = pose
     return watch
 
 
@@ -150,7 +143,7 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
     It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this, but not
     below `SLAVE_MASS` times the hand's deceleration.
     """
-    velocity, rate = memory[FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
+    velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):
         velocity[i] += rate * (twist[i] - velocity[i])
     for g in range(2):
@@ -158,6 +151,7 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
         if size > 0.0:
             along = dot_of_group(wrench, velocity, g) / size
             slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
-            share = max(2.0 - along / p[RETREAT_SPEED][g], p[SLAVE_MASS][g] * slowing / size, 0.0)
+            fading = 2.0 - along / p[slots.RETREAT_SPEED][g]
+            share = max(fading, p[slots.SLAVE_MASS][g] * slowing / size, 0.0)
             scale_group(wrench, g, min(share, 1.0))
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)

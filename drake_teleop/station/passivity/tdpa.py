@@ -4,7 +4,6 @@
 slave's wrench.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 
@@ -14,22 +13,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import (
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    DISSIPATED_ENERGY,
-    LAST_PORT_WRENCH,
-    RECEIVED_ENERGY,
-    SENT_ENERGY,
-    SERVO_D,
-    SERVO_K,
-    SLAVE_PER_MASTER_MOTION,
-    STEP_COUNT,
-    STORED_ENERGY,
-    own_memory,
-    own_parameters,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
     MAX_HAND_WRENCH_RATE,
@@ -64,16 +48,16 @@ _FULL_DRAG_HAND_SPEED = (0.02, 0.2)
 _NEWEST_MASTER_PACKET, _PACKET_SLAVE_ENERGY = METHOD_INTEGRAL.start, SECOND_ENERGY_COUNTER
 
 # Parameters; reserve, drag and stiffness in the master's power units.
-_layout = own_parameters()
+_layout = slots.own_parameters()
 _WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = (_layout.number() for _ in range(3))
 _TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))
 _MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
-_layout = own_memory()
+_layout = slots.own_memory()
 _WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
-_layout = own_memory()
+_layout = slots.own_memory()
 _SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
@@ -87,29 +71,20 @@ class TdpaConfig:
     """Parameters of the time-domain passivity approach (TDPA)."""
 
     release: float = quantity(
-        0.02,
-        "s",
-        0.0,
-        10.0,
+        0.02, "s", 0.0, 10.0,
         "time in which a reduced wrench returns to its full value (force-jump filter)",
-    )
+    )  # fmt: skip
     drain_rate: float = quantity(
         200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"
     )
     drift_rate: float = quantity(
-        20.0,
-        "1/s",
-        0.0,
-        1e3,
+        20.0, "1/s", 0.0, 1e3,
         "rate of the correction of a withheld command, within the available energy",
-    )
+    )  # fmt: skip
     speed: list[float] = quantity(
-        [1.0, 10.0],
-        "m/s, rad/s",
-        1e-3,
-        1e3,
+        [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
         "largest speed of the slave's command; its kinetic energy may be created at an impact",
-    )
+    )  # fmt: skip
     reserve: list[float] = quantity(
         [2e-3, 1e-4], "J", 0.0, 1e3, "part of the hand's input that the master keeps"
     )
@@ -117,19 +92,17 @@ class TdpaConfig:
         [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than the reserve"
     )
     hand_stiffness: list[float] = quantity(
-        [0.0, 0.0],
-        "N/m, N m/rad",
-        0.0,
-        1e5,
+        [0.0, 0.0], "N/m, N m/rad", 0.0, 1e5,
         "stiffness of the hand for the filter of the returned wrench; 0: no filter",
-    )
+    )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
         p[_WRENCH_RELEASE_TIME], p[_LEDGER_DRAIN_RATE] = self.release, self.drain_rate
         p[_COMMAND_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
         p[_TARGET_RESERVE] = self.reserve
-        p[_DRAG_WRENCH] = np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION])
-        p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[SLAVE_PER_MASTER_MOTION]))
+        scales = p[slots.SLAVE_PER_MASTER_MOTION]
+        p[_DRAG_WRENCH] = np.divide(self.drag, scales)
+        p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(scales))
 
 
 def charged_tdpa_config() -> TdpaConfig:
@@ -142,7 +115,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     drain = min(T * p[_LEDGER_DRAIN_RATE], 1.0)
     release = T / p[_WRENCH_RELEASE_TIME] if p[_WRENCH_RELEASE_TIME] > 0.0 else 1.0
     copy_into(wrench, 0, received, WRENCH.start, 6)
-    ledger, kept = memory[STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
+    ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     withheld = memory[_WITHHELD_WRENCH_SHARE]
     for g in range(2):
         ledger[g] += count_newly_received_energy(g, received, memory)
@@ -151,27 +124,28 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         drained = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
-            max_decrease = MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g]
-            least = length_of_group(memory[LAST_PORT_WRENCH], g) - max_decrease
+            max_decrease = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            least = length_of_group(memory[slots.LAST_PORT_WRENCH], g) - max_decrease
             share = min(share, max(drain * stored / drained, least / length_of_group(wrench, g)))
             share = min(share, stored / drained)
         withheld[g] = 1.0 - share
-        memory[DISSIPATED_ENERGY][g] += (1.0 - share) * drained
+        memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * drained
         scale_group(wrench, g, share)
         _add_drag_force(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
         _charge_hand_work_to_ledger(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
             ledger[g] -= surplus
-            memory[SENT_ENERGY][g] += surplus
-        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
+            memory[slots.SENT_ENERGY][g] += surplus
+        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
 
 
 @njit(cache=True)
 def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
-    drag, level = p[_DRAG_WRENCH][g], memory[STORED_ENERGY][g] + memory[_MASTER_RESERVED_ENERGY][g]
+    drag = p[_DRAG_WRENCH][g]
+    level = memory[slots.STORED_ENERGY][g] + memory[_MASTER_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_TARGET_RESERVE][g]:
         damping = drag / max(length_of_group(dx, g), _FULL_DRAG_HAND_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
@@ -181,19 +155,19 @@ def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 @njit(cache=True)
 def _charge_hand_work_to_ledger(g, drained, p, memory):
-    ledger, kept = memory[STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
+    ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)
     else:
         more = min(-_KEPT_HAND_INPUT_SHARE * drained, max(p[_TARGET_RESERVE][g] - kept[g], 0.0))
-        memory[SENT_ENERGY][g] -= drained + more
+        memory[slots.SENT_ENERGY][g] -= drained + more
     kept[g] = max(kept[g] + more, 0.0)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
+    copy_into(memory, _LAST_COMMAND.start, memory, slots.COMMAND_POSE.start, 7)
     for g in range(2):
         count_newly_received_energy(g, received, memory)
         work = dot_of_group(wrench, dx, g)
@@ -205,13 +179,13 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         available = _energy_available_to_slave(memory, g)
         credit = min(memory[_SLAVE_WORK_IN][g], memory[_COMMAND_WORK_IN][g]) + min(available, 0.0)
         # Output beyond the received energy is compensated before energy is sent.
-        memory[SENT_ENERGY][g] = max(memory[SENT_ENERGY][g], credit)
-        memory[STORED_ENERGY][g] = available
-        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-        packet[_PACKET_SLAVE_ENERGY][g] = memory[STORED_ENERGY][g]
+        memory[slots.SENT_ENERGY][g] = max(memory[slots.SENT_ENERGY][g], credit)
+        memory[slots.STORED_ENERGY][g] = available
+        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        packet[_PACKET_SLAVE_ENERGY][g] = memory[slots.STORED_ENERGY][g]
         _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
-    copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+    copy_into(command, 0, memory, slots.COMMAND.start, 13)
+    copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, memory[_FILTERED_SLAVE_WRENCH], packet)
 
 
@@ -222,8 +196,8 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
     if hand > 0.0:
         gain = max(_estimate_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
-        round_trip = max(memory[STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
-        lag = round_trip + p[SERVO_D][g] / p[SERVO_K][g]
+        round_trip = max(memory[slots.STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
+        lag = round_trip + p[slots.SERVO_D][g] / p[slots.SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
         onset_rate = min(T / _SLOW_WRENCH_ONSET_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
@@ -232,7 +206,7 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
         else:
             if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
-                memory[_QUICK_ONSET_PACKET][g] = memory[STEP_COUNT]
+                memory[_QUICK_ONSET_PACKET][g] = memory[slots.STEP_COUNT]
             awaited = received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET][g]
             if lag > _SLOW_WRENCH_ONSET_S and awaited:
                 rate = 0.0
@@ -245,7 +219,7 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
 def _estimate_contact_stiffness(g, dx, wrench, T, memory):
     size, stiffness = length_of_group(dx, g), memory[_CONTACT_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_AVERAGING_TRAVEL[g] * T:
-        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[LAST_PORT_WRENCH], dx, g)
+        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
         forget = min(size / _STIFFNESS_AVERAGING_TRAVEL[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
@@ -254,13 +228,13 @@ def _estimate_contact_stiffness(g, dx, wrench, T, memory):
 @njit(cache=True)
 def _energy_available_to_slave(memory, g):
     used = max(memory[_SLAVE_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g])
-    return memory[RECEIVED_ENERGY][g] - used
+    return memory[slots.RECEIVED_ENERGY][g] - used
 
 
 @njit(cache=True)
 def _advance_command(received, wrench, T, p, memory):
-    now, withheld = memory[COMMAND_POSE], memory[_WITHHELD_COMMAND_MOTION]
-    step = memory[COMMAND_TWIST]
+    now, withheld = memory[slots.COMMAND_POSE], memory[_WITHHELD_COMMAND_MOTION]
+    step = memory[slots.COMMAND_TWIST]
     remaining_share = 1.0 - min(T * p[_COMMAND_DRIFT_RATE], 1.0)
     pose_difference_into(received[POSE], now, step)
     for i in range(6):
@@ -271,7 +245,7 @@ def _advance_command(received, wrench, T, p, memory):
         available = max(_energy_available_to_slave(memory, g), 0.0)
         if pressing > available:
             scale_group(step, g, available / pressing)
-            memory[DISSIPATED_ENERGY][g] += pressing - available
+            memory[slots.DISSIPATED_ENERGY][g] += pressing - available
             pressing = available
         memory[_COMMAND_WORK_OUT][g] += max(pressing, 0.0)
         memory[_COMMAND_WORK_IN][g] += max(-pressing, 0.0)
@@ -286,7 +260,7 @@ def _add_command_work(command, sign, memory):
     step = np.empty(6)
     pose_difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
-        work = sign * dot_of_group(memory[LAST_PORT_WRENCH], step, g)
+        work = sign * dot_of_group(memory[slots.LAST_PORT_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0
         memory[_COMMAND_WORK_IN][g] += into
         memory[_COMMAND_WORK_OUT][g] += into - work
@@ -298,5 +272,5 @@ def record_command(requested, command, pose, twist, p, memory):
         if command[i] != requested[i]:
             _add_command_work(requested, -1.0, memory)
             _add_command_work(command, 1.0, memory)
-            copy_into(memory, COMMAND_POSE.start, command, 0, 7)
+            copy_into(memory, slots.COMMAND_POSE.start, command, 0, 7)
             return

@@ -3,27 +3,13 @@
 The tank of each end must contain the energy that the wrench can use until the next step.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import (
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    DISSIPATED_ENERGY,
-    LAST_PORT_WRENCH,
-    SENT_ENERGY,
-    SERVO_D,
-    SERVO_K,
-    SLAVE_MASS,
-    STORED_ENERGY,
-    own_memory,
-    own_parameters,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
     POSE,
@@ -41,13 +27,13 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters; pairs are for translation and rotation.
-_layout = own_parameters()
+_layout = slots.own_parameters()
 _SEND_RATE, _MAX_TANK_DRAIN_RATE = _layout.number(), _layout.number()
 _INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (_layout.vector(2) for _ in range(3))
 _DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = _layout.vector(2), _layout.vector(2)
 _TANK_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
-_layout = own_memory()
+_layout = slots.own_memory()
 _SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = _layout.vector(6), _layout.vector(6)
 
 
@@ -62,12 +48,9 @@ class TwoLayerConfig:
     )
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy of a tank at the start")
     level: list[float] = quantity(
-        [0.01, 2e-4],
-        "J",
-        0.0,
-        1e3,
+        [0.01, 2e-4], "J", 0.0, 1e3,
         "level below which a damper on the hand fills the master's tank",
-    )
+    )  # fmt: skip
     capacity: list[float] = quantity(
         [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; the rest is discarded"
     )
@@ -87,13 +70,13 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[STORED_ENERGY] = p[_INITIAL_TANK_ENERGY]
+    memory[slots.STORED_ENERGY] = p[_INITIAL_TANK_ENERGY]
 
 
 @njit(cache=True)
 def _exchange_tank_energy(received, dx, T, p, memory, packet):
-    ledger, sent_so_far = memory[STORED_ENERGY], memory[SENT_ENERGY]
-    held, capacity = memory[LAST_PORT_WRENCH], p[_TANK_CAPACITY]
+    ledger, sent_so_far = memory[slots.STORED_ENERGY], memory[slots.SENT_ENERGY]
+    held, capacity = memory[slots.LAST_PORT_WRENCH], p[_TANK_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
         level += count_newly_received_energy(g, received, memory)
@@ -101,7 +84,7 @@ def _exchange_tank_energy(received, dx, T, p, memory, packet):
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
-        memory[DISSIPATED_ENERGY][g] += lost
+        memory[slots.DISSIPATED_ENERGY][g] += lost
         ledger[g] = level - lost
         packet[CUMULATIVE_ENERGY][g] = sent_so_far[g]
 
@@ -113,7 +96,8 @@ def _max_step_work(f, dx, g, acceleration, T):
 
 @njit(cache=True)
 def _limit_wrench_to_tank(f, dx, g, acceleration, T, memory):
-    cost, level = _max_step_work(f, dx, g, acceleration, T), max(memory[STORED_ENERGY][g], 0.0)
+    cost = _max_step_work(f, dx, g, acceleration, T)
+    level = max(memory[slots.STORED_ENERGY][g], 0.0)
     if cost > level:
         scale_group(f, g, level / cost)
 
@@ -121,7 +105,7 @@ def _limit_wrench_to_tank(f, dx, g, acceleration, T, memory):
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     _exchange_tank_energy(received, dx, T, p, memory, packet)
-    ledger, requested = memory[STORED_ENERGY], received[WRENCH]
+    ledger, requested = memory[slots.STORED_ENERGY], received[WRENCH]
     for g in range(2):
         damping = p[_DAMPING_PER_MISSING_ENERGY][g] * max(p[_TARGET_TANK_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
@@ -139,19 +123,20 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     spring, brake = memory[_SERVO_SPRING_WRENCH], memory[_SERVO_DAMPER_WRENCH]
     _exchange_tank_energy(received, dx, T, p, memory, packet)
-    target = memory[COMMAND_POSE]
+    target = memory[slots.COMMAND_POSE]
     if has_arrived(received):
         target = received[POSE]
     pose_difference_into(target, pose, spring)
-    motor_wrench, K, D = memory[LAST_PORT_WRENCH], p[SERVO_K], p[SERVO_D]
+    motor_wrench, K, D = memory[slots.LAST_PORT_WRENCH], p[slots.SERVO_K], p[slots.SERVO_D]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             spring[i] *= K[g]
             brake[i] = -D[g] * twist[i]
             motor_wrench[i] = spring[i] + brake[i]
-        mass, own_acceleration = p[SLAVE_MASS][g], p[MAX_PORT_ACCELERATION][g]
+        mass, own_acceleration = p[slots.SLAVE_MASS][g], p[MAX_PORT_ACCELERATION][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        available = max(memory[STORED_ENERGY][g] - _TANK_RESERVE_SHARE * p[_TANK_CAPACITY][g], 0.0)
+        kept = _TANK_RESERVE_SHARE * p[_TANK_CAPACITY][g]
+        available = max(memory[slots.STORED_ENERGY][g] - kept, 0.0)
         acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
         if _max_step_work(motor_wrench, dx, g, acceleration, T) > available:
             acceleration = own_acceleration + length_of_group(brake, g) / mass
@@ -165,16 +150,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             _limit_wrench_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
-    move_pose_into(pose, spring, memory[COMMAND_POSE])
-    copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
-    copy_into(command, 0, memory, COMMAND.start, 13)
+    move_pose_into(pose, spring, memory[slots.COMMAND_POSE])
+    copy_into(memory, slots.COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    spring, held = memory[_SERVO_SPRING_WRENCH], memory[LAST_PORT_WRENCH]
-    K, D = p[SERVO_K], p[SERVO_D]
+    spring, held = memory[_SERVO_SPRING_WRENCH], memory[slots.LAST_PORT_WRENCH]
+    K, D = p[slots.SERVO_K], p[slots.SERVO_D]
     pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

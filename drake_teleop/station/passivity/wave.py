@@ -4,7 +4,6 @@ docs/theory.md, (T33) to (T36). The receiver filters the integral of the wave wi
 energy, so jitter and loss create no energy.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 
@@ -12,20 +11,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import (
-    CHANNEL_FILL_TIME_LEFT,
-    COMMAND,
-    COMMAND_POSE,
-    COMMAND_TWIST,
-    DISSIPATED_ENERGY,
-    LAST_PORT_WRENCH,
-    RECEIVED_ENERGY,
-    SENT_ENERGY,
-    SLAVE_PER_MASTER_MOTION,
-    STORED_ENERGY,
-    own_memory,
-    own_parameters,
-)
+from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
     MAX_HAND_WRENCH_RATE,
@@ -42,12 +28,12 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters.
-_layout = own_parameters()
+_layout = slots.own_parameters()
 WAVE_IMPEDANCE = _layout.vector(2)
 _WAVE_FILTER_TIME, _MATCHING_DAMPER_SHARE = _layout.number(), _layout.number()
 _MAX_SILENCE_BEFORE_HOLD, _POSE_DRIFT_CORRECTION_RATE = _layout.number(), _layout.number()
 # Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
-_layout = own_memory()
+_layout = slots.own_memory()
 _FILTERED_WAVE_INTEGRAL, _SENT_WAVE_INTEGRAL, _FILTERED_WAVE = (_layout.vector(6) for _ in range(3))
 _SILENCE_TIME, _POSE_DRIFT = _layout.number(), _layout.vector(6)
 # At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
@@ -60,12 +46,9 @@ class WaveConfig:
     """Parameters of the wave variables."""
 
     impedance: list[float] = quantity(
-        [10.0, 0.05],
-        "N s/m, N m s/rad",
-        1e-6,
-        1e6,
+        [10.0, 0.05], "N s/m, N m s/rad", 1e-6, 1e6,
         "wave impedance b, for translation and rotation",
-    )
+    )  # fmt: skip
     filter: float = quantity(
         0.003, "s", 0.0, 10.0, "time constant of the filter of the received wave, at both ends"
     )
@@ -73,12 +56,9 @@ class WaveConfig:
         1.0, "1", 0.0, 100.0, "damping at the slave's end divided by b; at 1 it reflects no wave"
     )
     patience: float = quantity(
-        0.03,
-        "s",
-        0.0,
-        10.0,
+        0.03, "s", 0.0, 10.0,
         "silence after which the slave keeps its command until the next packet",
-    )
+    )  # fmt: skip
     drift_rate: float = quantity(
         2.0, "1/s", 0.0, 1e3, "rate of the drift correction where it takes no work"
     )
@@ -91,7 +71,7 @@ class WaveConfig:
 
 @njit(cache=True)
 def _filter_received_wave(received, T, p, memory):
-    ledger, played = memory[STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
+    ledger, played = memory[slots.STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
     wave, integral = memory[_FILTERED_WAVE], received[METHOD_INTEGRAL]
     for g in range(2):
         ledger[g] += count_newly_received_energy(g, received, memory)
@@ -124,15 +104,15 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
-            most = MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g]
-            if _limit_wrench_change(g, energy, dx, most, memory[LAST_PORT_WRENCH], wrench):
+            most = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            if _limit_wrench_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
                 memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
-        memory[SENT_ENERGY][g] += max(left, 0.0)
+        memory[slots.SENT_ENERGY][g] += max(left, 0.0)
     copy_into(packet, METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
-    copy_into(packet, CUMULATIVE_ENERGY.start, memory, SENT_ENERGY.start, 2)
+    copy_into(packet, CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -154,10 +134,10 @@ def _limit_wrench_change(g, energy, dx, max_change, held, wrench):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
+    now, step = memory[slots.COMMAND_POSE], memory[slots.COMMAND_TWIST]
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
-    if memory[CHANNEL_FILL_TIME_LEFT] > 0.0:
-        memory[CHANNEL_FILL_TIME_LEFT] -= T
+    if memory[slots.CHANNEL_FILL_TIME_LEFT] > 0.0:
+        memory[slots.CHANNEL_FILL_TIME_LEFT] -= T
         step[:] = 0.0
         _reflect_wave_while_channel_fills(received, wrench, T, p, memory)
     elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE_BEFORE_HOLD]:
@@ -171,15 +151,15 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         step[:] = 0.0
         _reflect_wave_at_held_command(wrench, T, p, memory)
     copy_into(packet, METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
-    copy_into(packet, CUMULATIVE_ENERGY.start, memory, SENT_ENERGY.start, 2)
-    copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
+    copy_into(packet, CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
+    copy_into(command, 0, memory, slots.COMMAND.start, 13)
+    copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def _reflect_wave(received, wrench, T, p, memory):
-    wave, step = memory[_FILTERED_WAVE], memory[COMMAND_TWIST]
+    wave, step = memory[_FILTERED_WAVE], memory[slots.COMMAND_TWIST]
     integral = memory[_SENT_WAVE_INTEGRAL]
     _filter_received_wave(received, T, p, memory)
     for g in range(2):
@@ -189,13 +169,13 @@ def _reflect_wave(received, wrench, T, p, memory):
             integral[i] += T * wave[i] + math.sqrt(2.0 / b) * (T * wrench[i] - damper * step[i])
         damped = damper * dot_of_group(step, step, g) / T
         left = 0.5 * T * dot_of_group(wave, wave, g) + dot_of_group(wrench, step, g) - damped
-        memory[DISSIPATED_ENERGY][g] += damped
-        memory[SENT_ENERGY][g] += max(left, 0.0)
+        memory[slots.DISSIPATED_ENERGY][g] += damped
+        memory[slots.SENT_ENERGY][g] += max(left, 0.0)
 
 
 @njit(cache=True)
 def _reflect_wave_at_held_command(wrench, T, p, memory):
-    wave, ledger = memory[_FILTERED_WAVE], memory[STORED_ENERGY]
+    wave, ledger = memory[_FILTERED_WAVE], memory[slots.STORED_ENERGY]
     played, integral = memory[_FILTERED_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
@@ -203,7 +183,7 @@ def _reflect_wave_at_held_command(wrench, T, p, memory):
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if energy <= ledger[g]:
             ledger[g] -= energy
-            memory[SENT_ENERGY][g] += energy
+            memory[slots.SENT_ENERGY][g] += energy
             for i in range(3 * g, 3 * g + 3):
                 played[i] += T * wave[i]
                 integral[i] -= T * wave[i]
@@ -211,22 +191,23 @@ def _reflect_wave_at_held_command(wrench, T, p, memory):
 
 @njit(cache=True)
 def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
-    wave, ledger, accounted = memory[_FILTERED_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
-    played, integral = memory[_FILTERED_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
+    wave, accounted = memory[_FILTERED_WAVE], memory[slots.RECEIVED_ENERGY]
+    ledger, played = memory[slots.STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
+    integral = memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
         accounted[g] = max(accounted[g], received[CUMULATIVE_ENERGY][g])
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
             integral[i] -= T * wave[i]
             played[i] = received[METHOD_INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
-        memory[SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
+        memory[slots.SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
         ledger[g] = 0.5 * (T + p[_WAVE_FILTER_TIME]) * dot_of_group(wave, wave, g)
 
 
 @njit(cache=True)
 def _correct_pose_drift(received, wrench, T, p, memory):
-    drift, step = memory[_POSE_DRIFT], memory[COMMAND_TWIST]
-    pose_difference_into(received[POSE], memory[COMMAND_POSE], drift)
+    drift, step = memory[_POSE_DRIFT], memory[slots.COMMAND_TWIST]
+    pose_difference_into(received[POSE], memory[slots.COMMAND_POSE], drift)
     for g in range(2):
         if dot_of_group(wrench, drift, g) >= 0.0:
             for i in range(3 * g, 3 * g + 3):
