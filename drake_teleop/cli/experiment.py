@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 def experiment_command(
-    study: str | Path,
-    out: Path,
-    *,
-    participant: int | None = None,
-    simulated: int = 0,
-    **page: Any,
+    study: str | Path, out: Path, *, participant: int | None = None, simulated: int = 0, **page: Any
 ) -> pl.DataFrame:
     """Continue the experiment in folder `out` and return its result table.
 
@@ -64,10 +59,7 @@ def next_participant(
 def _simulate_participants(
     experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
 ) -> None:
-    from drake_teleop.live.experiment.simulated import (
-        make_apparatuses,
-        simulate_participant,
-    )
+    from drake_teleop.live.experiment.simulated import make_apparatuses, simulate_participant
 
     stations = make_apparatuses(experiment, scenarios)
 

@@ -500,11 +500,7 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
 @option.sensor_range
 @option.output_folder("export")
 def export(
-    identification: Path,
-    to: str,
-    sensor_pose: tuple[float, ...] | None,
-    sign: str,
-    **loop: Any,
+    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **loop: Any
 ) -> None:
     """Write a load for a robot, model or controller.
 
@@ -750,10 +746,7 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 @cli.command()
 @click.argument("folder", type=option.PATH_TYPE)
 @click.option(
-    "--arm",
-    required=True,
-    type=option.PATH_TYPE,
-    help="Arm model: URDF, SDF, MJCF or .dmd.yaml.",
+    "--arm", required=True, type=option.PATH_TYPE, help="Arm model: URDF, SDF, MJCF or .dmd.yaml."
 )
 @option.sensor_frame(required=True)
 @option.package_paths
