@@ -11,14 +11,8 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from drake_teleop.cli.options import refuse_without_model
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    write_json,
-    write_picture,
-    write_table,
-)
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
@@ -77,7 +71,7 @@ def excite_command(
     """
     tolerance = None if until is None else parse_tolerance(until)
     setup = LoadScenario(scenario)
-    make_folder(out)  # fail early for a bad path
+    files.make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
         read = stage("Read the robot")
         if model is None:
@@ -129,13 +123,13 @@ def excite_command(
             reached |= {"reliable": PROBABILITY_ALL_WITHIN_TOLERANCE}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.design_cpu_time_s}
-    with output_folder(out):
-        write_table(out / "trajectory.csv", trajectory_table(found))
+    with files.output_folder(out):
+        files.write_table(out / "trajectory.csv", trajectory_table(found))
         found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
-        write_picture(out / "excitation.png", draw_trajectory(found))
+        files.write_picture(out / "excitation.png", draw_trajectory(found))
         write_motion_replay(out / "excitation.html", found)
-        write_json(out / "session.json", session)
-        write_json(out / "summary.json", summary)
+        files.write_json(out / "session.json", session)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         _print_summary(summary, out)
     return summary | session
