@@ -158,8 +158,7 @@ def _wrench_table(found: EliminatedLog) -> pl.DataFrame:
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
     for name in ("contact", "scaled", "non_contact", "measured"):
-        values = getattr(found, name)
-        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
+        columns |= {f"{name}_{c}": getattr(found, name)[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     if found.causal is not None:
         for name in ("contact", "scaled"):
             values = getattr(found.causal, name)

@@ -473,8 +473,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
     """
     from drake_teleop.cli.calibrate import calibrate_command
 
-    summary = calibrate_command(source, out, **options)
-    return 0 if summary["all_known"] else 1
+    return 0 if calibrate_command(source, out, **options)["all_known"] else 1
 
 
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
@@ -728,8 +727,7 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     collisions. Check the 3D replay, excitation.html, before a robot runs the motion.
     """
     if options["until"] is not None:
-        remedy = "remove it or --until"
-        option.refuse_given_options("criterion", "period", "seconds", remedy=remedy)
+        option.refuse_given_options("criterion", "period", "seconds", remedy="remove it or --until")
     from drake_teleop.cli.excitation import excite_command
 
     excite_command(scenario, out, **options)

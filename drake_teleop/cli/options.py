@@ -267,8 +267,7 @@ def sigma(text: str) -> Callable[[Any], Any]:
 def separate_sigmas(command: Any) -> Any:
     text = "Scale of the load's {} alone.  [default: value of --sigma]"
     for part in ("inertia", "weight"):
-        option = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))
-        command = option(command)
+        command = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))(command)
     return command
 
 

@@ -143,8 +143,7 @@ class Ros2Source(streams.Source):
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
-        best_effort = ReliabilityPolicy.BEST_EFFORT
-        newest = QoSProfile(depth=_MAX_QUEUED_MESSAGES, reliability=best_effort)
+        newest = QoSProfile(depth=_MAX_QUEUED_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT)
         options = {"callback": receive, "qos_profile": newest, "raw": True}
         return node.create_subscription(kind, f"/{topic}", **options), receive
 

@@ -87,8 +87,7 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
         return fit
-    theta = consistent_least_squares(gram, right, theta)
-    return replace(fit, form=fit.form._replace(theta=theta))
+    return replace(fit, form=fit.form._replace(theta=consistent_least_squares(gram, right, theta)))
 
 
 def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:

@@ -77,8 +77,7 @@ def _compile_library(compiler: str, sources: c99.Files, compiled: list[str]) -> 
         for file, text in sources.items():
             (folder / file).write_text(str(text), encoding="utf-8")
         options = [*c99.CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
-        command = [compiler, *options, *compiled, "-o", "library.so"]
-        subprocess.run(command, cwd=folder, check=True)
+        subprocess.run([compiler, *options, *compiled, "-o", "library.so"], cwd=folder, check=True)
         return (folder / "library.so").read_bytes()
 
 
