@@ -15,14 +15,11 @@ from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
+from drake_teleop.lab.excitation import shortest
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, trajectory_sensor_motion
 from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import (
-    PROBABILITY_ALL_WITHIN_TOLERANCE,
-    design_shortest_motion,
-)
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.station.scenario import LoadScenario
@@ -109,7 +106,7 @@ def excite_command(
             )
         else:
             report = stage("Shorten the motion")
-            result = design_shortest_motion(
+            result = shortest.design_shortest_motion(
                 robot,
                 tolerance,
                 harmonics=3 if harmonics is None else harmonics,
@@ -120,7 +117,7 @@ def excite_command(
             found = result.excitation
             names, shares = tolerance.required_entry_names, result.errors_over_tolerances.tolist()
             reached = {"until": str(tolerance), "reached": dict(zip(names, shares, strict=True))}
-            reached |= {"reliable": PROBABILITY_ALL_WITHIN_TOLERANCE}
+            reached |= {"reliable": shortest.PROBABILITY_ALL_WITHIN_TOLERANCE}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.design_cpu_time_s}
     with files.output_folder(out):
