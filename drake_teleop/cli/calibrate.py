@@ -86,12 +86,9 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
         table.add_column(heading, justify="left" if heading == "unit" else "right")
     table.add_column("settled", width=_PROGRESS_CELLS)
     table.add_column("verdict")
-    units = [
-        tolerances.QUANTITY_UNITS[name]
-        for name in tolerances.QUANTITY_NAMES
-        for entry in tolerance.required_entry_names
-        if name in entry
-    ]
+    # The first word of an entry's name is its quantity.
+    entries = [entry.split()[0] for entry in tolerance.required_entry_names]
+    units = [tolerances.QUANTITY_UNITS[name] for name in entries]
     values = sizes = np.full(len(units), np.nan)
     if evaluation.identified_log is not None:
         phi = evaluation.identified_log.identification.phi

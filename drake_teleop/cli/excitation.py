@@ -20,6 +20,7 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, trajectory_sensor_motion
 from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
+from drake_teleop.load.identification import PARAMETER_NAMES, PARAMETER_UNITS
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.station.scenario import LoadScenario
@@ -35,9 +36,6 @@ CRITERION_TEXTS = {
     "A16": "rms of predicted errors over acceptable ones",
     "D16": "geometric mean of predicted errors over acceptable ones",
 }
-_OFFSET_NAMES = ("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz")
-_PHI_NAMES = ("m", "m_cx", "m_cy", "m_cz", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
-_PARAMETER_UNITS = (*3 * ["N"], *3 * ["N m"], "kg", *3 * ["kg m"], *6 * ["kg m^2"])
 
 
 def excite_command(
@@ -134,7 +132,7 @@ def excite_command(
 
 def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
     robot, trajectory = excitation.robot, excitation.trajectory
-    names = (*_OFFSET_NAMES, *_PHI_NAMES)
+    names = [name.replace(" c_", "_c") for name in PARAMETER_NAMES]
     return {
         "robot": robot.name,
         "criterion": excitation.criterion,
@@ -151,7 +149,7 @@ def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
-            for name, unit, std in zip(names, _PARAMETER_UNITS, excitation.deviations, strict=True)
+            for name, unit, std in zip(names, PARAMETER_UNITS, excitation.deviations, strict=True)
         },
         "noise": {
             "force [N]": robot.criterion_scales.wrench_noise[0],

@@ -30,7 +30,6 @@ _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
 CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
-_PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
 # coefficient that is rounding.
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_COMBINATION_COEFFICIENT = 1e-12, 1e-6
@@ -69,7 +68,7 @@ class ParameterCombination:
     text: str
 
     def __str__(self) -> str:
-        unit = _PARAMETER_UNITS[self.leading_index]
+        unit = identification.PARAMETER_UNITS[self.leading_index]
         return f"{self.text} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
