@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drake_teleop.cli.options import refuse_without_model
@@ -24,9 +25,6 @@ from drake_teleop.load.identification import PARAMETER_NAMES, PARAMETER_UNITS
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.station.scenario import LoadScenario
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 #: Meaning of each printed criterion.
 CRITERION_TEXTS = {

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import polars as pl
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
@@ -11,9 +13,6 @@ from drake_teleop.live.experiment.procedure import plan_trials
 from drake_teleop.live.experiment.results import write_results
 from drake_teleop.live.experiment.store import MAX_PARTICIPANT_NUMBER, TrialStore, open_trial_store
 from drake_teleop.station.scenario import Scenario
-
-if TYPE_CHECKING:
-    import polars as pl
 
 
 def experiment_command(
