@@ -26,6 +26,7 @@ PARAMETER_NAMES = (
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
+"""Unit of each parameter."""
 
 MAX_IDENTIFIED_STD_SHARE = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""

@@ -12,13 +12,13 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITY_NAMES = ("mass", "com", "inertia")
-"""Names of the quantities whose accuracy a tolerance can require."""
+"""Quantities whose accuracy a tolerance can require."""
 NAMES_OF_ENTRIES = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 }
-"""Names of the numbers that each quantity consists of."""
+"""Numbers that each quantity consists of."""
 QUANTITY_UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
 """Unit of each quantity in printed values."""
 
