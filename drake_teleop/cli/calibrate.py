@@ -15,14 +15,7 @@ from rich.text import Text
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.files import make_folder, write_json, write_picture
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
-from drake_teleop.load.tolerance import (
-    QUANTITY_NAMES,
-    QUANTITY_UNITS,
-    Tolerance,
-    display_values_of_required_entries,
-    parse_tolerance,
-    tolerances_in_display_units,
-)
+from drake_teleop.load import tolerance as tolerances
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
 from drake_teleop.robots.connections import open_source_and_recorder
 
@@ -45,7 +38,7 @@ def calibrate_command(
 
     `until` is the required accuracy of the load, `largest` the range of the sensor: [N, N m].
     """
-    tolerance = parse_tolerance(until)
+    tolerance = tolerances.parse_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
     stream, recorder = open_source_and_recorder(source, limits, **stream_options)
@@ -86,24 +79,21 @@ def calibrate_command(
     return summary
 
 
-def make_progress_table(evaluation: RecordEvaluation, tolerance: Tolerance) -> Group:
+def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tolerance) -> Group:
     table = Table(title=f"{evaluation.record_length_s:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
     table.add_column("settled", width=_PROGRESS_CELLS)
     table.add_column("verdict")
-    units = [
-        QUANTITY_UNITS[name]
-        for name in QUANTITY_NAMES
-        for entry in tolerance.required_entry_names
-        if name in entry
-    ]
+    # The first word of an entry's name is its quantity.
+    entries = [entry.split()[0] for entry in tolerance.required_entry_names]
+    units = [tolerances.QUANTITY_UNITS[name] for name in entries]
     values = sizes = np.full(len(units), np.nan)
     if evaluation.identified_log is not None:
         phi = evaluation.identified_log.identification.phi
-        values = display_values_of_required_entries(tolerance, phi)
-        sizes = tolerances_in_display_units(tolerance, phi)
+        values = tolerances.display_values_of_required_entries(tolerance, phi)
+        sizes = tolerances.tolerances_in_display_units(tolerance, phi)
     for k, entry in enumerate(tolerance.required_entry_names):
         half = evaluation.relative_half_widths[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
@@ -134,7 +124,7 @@ def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
     return "almost" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
 
 
-def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
+def draw_settling(looks: list[RecordEvaluation], tolerance: tolerances.Tolerance) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

@@ -4,37 +4,27 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drake_teleop.cli.options import refuse_without_model
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    write_json,
-    write_picture,
-    write_table,
-)
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
+from drake_teleop.lab.excitation import shortest
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, trajectory_sensor_motion
 from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import (
-    PROBABILITY_ALL_WITHIN_TOLERANCE,
-    design_shortest_motion,
-)
+from drake_teleop.load.identification import PARAMETER_NAMES, PARAMETER_UNITS
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.station.scenario import LoadScenario
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 #: Meaning of each printed criterion.
 CRITERION_TEXTS = {
@@ -44,9 +34,6 @@ CRITERION_TEXTS = {
     "A16": "rms of predicted errors over acceptable ones",
     "D16": "geometric mean of predicted errors over acceptable ones",
 }
-_OFFSET_NAMES = ("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz")
-_PHI_NAMES = ("m", "m_cx", "m_cy", "m_cz", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
-_PARAMETER_UNITS = (*3 * ["N"], *3 * ["N m"], "kg", *3 * ["kg m"], *6 * ["kg m^2"])
 
 
 def excite_command(
@@ -77,7 +64,7 @@ def excite_command(
     """
     tolerance = None if until is None else parse_tolerance(until)
     setup = LoadScenario(scenario)
-    make_folder(out)  # fail early for a bad path
+    files.make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
         read = stage("Read the robot")
         if model is None:
@@ -115,7 +102,7 @@ def excite_command(
             )
         else:
             report = stage("Shorten the motion")
-            result = design_shortest_motion(
+            result = shortest.design_shortest_motion(
                 robot,
                 tolerance,
                 harmonics=3 if harmonics is None else harmonics,
@@ -126,16 +113,16 @@ def excite_command(
             found = result.excitation
             names, shares = tolerance.required_entry_names, result.errors_over_tolerances.tolist()
             reached = {"until": str(tolerance), "reached": dict(zip(names, shares, strict=True))}
-            reached |= {"reliable": PROBABILITY_ALL_WITHIN_TOLERANCE}
+            reached |= {"reliable": shortest.PROBABILITY_ALL_WITHIN_TOLERANCE}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.design_cpu_time_s}
-    with output_folder(out):
-        write_table(out / "trajectory.csv", trajectory_table(found))
+    with files.output_folder(out):
+        files.write_table(out / "trajectory.csv", trajectory_table(found))
         found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
-        write_picture(out / "excitation.png", draw_trajectory(found))
+        files.write_picture(out / "excitation.png", draw_trajectory(found))
         write_motion_replay(out / "excitation.html", found)
-        write_json(out / "session.json", session)
-        write_json(out / "summary.json", summary)
+        files.write_json(out / "session.json", session)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         _print_summary(summary, out)
     return summary | session
@@ -143,7 +130,7 @@ def excite_command(
 
 def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
     robot, trajectory = excitation.robot, excitation.trajectory
-    names = (*_OFFSET_NAMES, *_PHI_NAMES)
+    names = [name.replace(" c_", "_c") for name in PARAMETER_NAMES]
     return {
         "robot": robot.name,
         "criterion": excitation.criterion,
@@ -160,7 +147,7 @@ def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
-            for name, unit, std in zip(names, _PARAMETER_UNITS, excitation.deviations, strict=True)
+            for name, unit, std in zip(names, PARAMETER_UNITS, excitation.deviations, strict=True)
         },
         "noise": {
             "force [N]": robot.criterion_scales.wrench_noise[0],

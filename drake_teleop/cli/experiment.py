@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import polars as pl
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
@@ -12,17 +14,9 @@ from drake_teleop.live.experiment.results import write_results
 from drake_teleop.live.experiment.store import MAX_PARTICIPANT_NUMBER, TrialStore, open_trial_store
 from drake_teleop.station.scenario import Scenario
 
-if TYPE_CHECKING:
-    import polars as pl
-
 
 def experiment_command(
-    study: str | Path,
-    out: Path,
-    *,
-    participant: int | None = None,
-    simulated: int = 0,
-    **page: Any,
+    study: str | Path, out: Path, *, participant: int | None = None, simulated: int = 0, **page: Any
 ) -> pl.DataFrame:
     """Continue the experiment in folder `out` and return its result table.
 
@@ -64,10 +58,7 @@ def next_participant(
 def _simulate_participants(
     experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
 ) -> None:
-    from drake_teleop.live.experiment.simulated import (
-        make_apparatuses,
-        simulate_participant,
-    )
+    from drake_teleop.live.experiment.simulated import make_apparatuses, simulate_participant
 
     stations = make_apparatuses(experiment, scenarios)
 

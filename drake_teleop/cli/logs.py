@@ -10,27 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
-from drake_teleop.common.files import (
-    output_folder,
-    to_json_data,
-    write_json,
-    write_picture,
-    write_table,
-)
+from drake_teleop.common import files
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import Identification, load_of_object
+from drake_teleop.logs import figures
 from drake_teleop.logs.contact import summarize_contacts
-from drake_teleop.logs.figures import (
-    notes_on_object_alone,
-    shares_of_samples_above_force,
-    summarize_detected_contact,
-    summarize_load,
-    summarize_log,
-    summarize_object_alone,
-    summarize_record_part,
-    summarize_wrenches,
-)
 from drake_teleop.logs.processing import (
     DetectedLog,
     EliminatedLog,
@@ -59,9 +44,9 @@ def identify_command(
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else load_of_object(result, gripper_load)
-    summary = summarize_log(log, found, cutoff_hz, result.delay_s) | {
+    summary = figures.summarize_log(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
-        **summarize_load(result),
+        **figures.summarize_load(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
         "determined": found.base_parameters.text_lines(),
@@ -72,24 +57,24 @@ def identify_command(
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
         "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
         "causes": [asdict(cause) for cause in found.causes],
-        "loads": [summarize_record_part(stretch) for stretch in found.loads],
+        "loads": [figures.summarize_record_part(stretch) for stretch in found.loads],
     }
     if alone is not None:
-        summary |= {"gripper": str(gripper), "object": summarize_object_alone(alone)}
-        summary["notes"] += notes_on_object_alone(alone)
-    summary = to_json_data(summary)
+        summary |= {"gripper": str(gripper), "object": figures.summarize_object_alone(alone)}
+        summary["notes"] += figures.notes_on_object_alone(alone)
+    summary = files.to_json_data(summary)
     from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, stack_pictures
     from drake_teleop.logs.report import write_report
 
-    with output_folder(out):
+    with files.output_folder(out):
         result.save(out / "identification.json")
         if alone is not None:
             alone.save(out / "object.json")
-        write_picture(out / "fit.png", draw_fit(found))
-        write_picture(out / "knowledge.png", draw_spectrum_and_intervals(found))
+        files.write_picture(out / "fit.png", draw_fit(found))
+        files.write_picture(out / "knowledge.png", draw_spectrum_and_intervals(found))
         stack_pictures(out / "fit.png", out / "knowledge.png", out / "report.png")
         write_report(out / "report.html", found, summary, alone)
-        write_json(out / "summary.json", summary)
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         print_identification(summary, out)
     return summary
@@ -133,7 +118,7 @@ def eliminate_command(
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
-    summary = summarize_log(log, found, cutoff_hz, found.delay_s) | {
+    summary = figures.summarize_log(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": None if gripper is None else str(gripper),
         **scales,
@@ -152,15 +137,17 @@ def eliminate_command(
         summary["notes"] += found.detection.notes
     elif not found.log.static:
         summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
-    summary = to_json_data(
-        summary | summarize_wrenches(found) | summarize_detected_contact(found, causal_tare_s)
+    summary = files.to_json_data(
+        summary
+        | figures.summarize_wrenches(found)
+        | figures.summarize_detected_contact(found, causal_tare_s)
     )
     from drake_teleop.logs.pictures import draw_elimination
 
-    with output_folder(out):
-        write_table(out / "contact_wrench.parquet", _wrench_table(found))
-        write_picture(out / "contact_wrench.png", draw_elimination(found))
-        write_json(out / "summary.json", summary)
+    with files.output_folder(out):
+        files.write_table(out / "contact_wrench.parquet", _wrench_table(found))
+        files.write_picture(out / "contact_wrench.png", draw_elimination(found))
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         print_elimination(summary, out)
     return summary
@@ -171,8 +158,7 @@ def _wrench_table(found: EliminatedLog) -> pl.DataFrame:
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
     for name in ("contact", "scaled", "non_contact", "measured"):
-        values = getattr(found, name)
-        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
+        columns |= {f"{name}_{c}": getattr(found, name)[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     if found.causal is not None:
         for name in ("contact", "scaled"):
             values = getattr(found.causal, name)
@@ -195,7 +181,7 @@ def detect_command(
     """Detect contact in a log, write statistics and contact flags, return the summary."""
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated
-    summary = summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
+    summary = figures.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
         "load": None if load is None else str(load),
         "free": None if free is None else str(free),
         "free_s": found.free_duration_s,
@@ -206,17 +192,19 @@ def detect_command(
         "above_threshold": found.is_above_threshold.mean(),
         "in_contact": found.touched.mean(),
         "force_threshold": found.force_threshold,
-        "above_force_threshold": shares_of_samples_above_force(eliminated, found.force_threshold),
+        "above_force_threshold": figures.shares_of_samples_above_force(
+            eliminated, found.force_threshold
+        ),
         "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),
     }
     summary["notes"] += found.notes
-    summary = to_json_data(summary)
+    summary = files.to_json_data(summary)
     from drake_teleop.logs.pictures import draw_detection
 
-    with output_folder(out):
-        write_table(out / "detection.parquet", _detection_table(found))
-        write_picture(out / "detection.png", draw_detection(found))
-        write_json(out / "summary.json", summary)
+    with files.output_folder(out):
+        files.write_table(out / "detection.parquet", _detection_table(found))
+        files.write_picture(out / "detection.png", draw_detection(found))
+        files.write_json(out / "summary.json", summary)
     if not quiet:
         print_detection(summary, out)
     return summary

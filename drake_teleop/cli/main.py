@@ -18,12 +18,15 @@ from drake_teleop.common.interruption import INTERRUPTED_EVENT, install_interrup
 from drake_teleop.common.version import __version__
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    context_settings=dict(
+        help_option_names=["-h", "--help"], max_content_width=100, show_default=True
+    )
+)
 @click.version_option(__version__, prog_name="drake-teleop")
-@click.option(
+@option.path(
     "--register",
     "scripts",
-    type=option.PATH_TYPE,
     multiple=True,
     metavar="FILE",
     help="Python file that registers your own parts (docs/extend.md); may be repeated.",
@@ -65,9 +68,8 @@ def reproduce(out: Path, **options: Any) -> int:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE, required=False)
-@click.option(
+@option.path(
     "--inputs",
-    type=option.PATH_TYPE,
     metavar="DIR",
     help="Folder of `drive --record`; repeat this session with identical results.",
 )
@@ -95,7 +97,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE, default="contact_transition")
-@click.option("--record", type=option.PATH_TYPE, metavar="DIR", help="Record the session in DIR.")
+@option.path("--record", metavar="DIR", help="Record the session in DIR.")
 @click.option(
     "--port",
     type=option.IntegerInRange(0, 65535),
@@ -112,11 +114,9 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 @click.option(
     "--study", metavar="FILE", help="Experiment with participants; SCENARIO is then unused."
 )
-@click.option(
+@option.path(
     "--results",
-    type=option.PATH_TYPE,
     default=Path("out/experiment"),
-    show_default=True,
     metavar="DIR",
     help="Folder for results of --study; the same folder continues an experiment.",
 )
@@ -130,6 +130,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
     "--simulated",
     type=option.IntegerInRange(0, 9999),
     default=0,
+    show_default=False,
     help="Number of participants to simulate in --study; 0: people, on the page.",
 )
 def drive(
@@ -220,7 +221,6 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
     "--method",
     type=option.RegisteredName("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
-    show_default=True,
     help="Least squares; whitened: weighted by noise; robust: also without disturbed samples;"
     " consistent: also possible for a rigid body.",
 )
@@ -256,12 +256,11 @@ def identify(log: Path, out: Path, **options: Any) -> None:
     type=option.FiniteNumber(0, 1),
     help="With --gripper: kept share of the object's non-contact wrench; not with other scales.",
 )
-@click.option(
+@option.choice(
     "--offsets",
-    type=click.Choice(["record", "load"]),
-    default="record",
-    show_default=True,
-    help="Source of the sensor offsets: LOG (record) or the load file (load).",
+    ["record", "load"],
+    "record",
+    "Source of the sensor offsets: LOG (record) or the load file (load).",
 )
 @click.option(
     "--untouched",
@@ -304,12 +303,11 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 @click.argument("log", type=option.PATH_TYPE)
 @option.load_file(default="identified from LOG itself")
 @option.free_motion_log
-@click.option(
+@option.choice(
     "--statistic",
-    type=click.Choice(["level", "cusum", "glr"]),
-    default="level",
-    show_default=True,
-    help="Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.",
+    ["level", "cusum", "glr"],
+    "level",
+    "Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.",
 )
 @option.output_folder("detect")
 @option.cutoff_hz
@@ -347,9 +345,8 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 @click.argument("path", type=option.PATH_TYPE)
 @option.load_file()
 @click.option("--identify", is_flag=True, help="Identify the load from all episodes.")
-@click.option(
+@option.path(
     "--description",
-    type=option.PATH_TYPE,
     metavar="FILE",
     help="Log description, for all episodes, without `file`.  [default: drafted from the episodes]",
 )
@@ -371,16 +368,22 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @cli.command()
 @click.argument("source")
 @option.load_file(required=True)
-@click.option("--out", "sink", default="-", metavar="SINK", help="Destination.  [default: stdout]")
+@click.option(
+    "--out",
+    "sink",
+    default="-",
+    show_default=False,
+    metavar="SINK",
+    help="Destination.  [default: stdout]",
+)
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
 @option.rate_hz("Rate of the wrenches; not needed for replay:, rtde:// and netft://.")
 @click.option("--predicted", is_flag=True, help="Extrapolate the results over the low-pass lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
-@click.option(
+@option.path(
     "--free",
-    type=option.PATH_TYPE,
     metavar="LOG",
     help="Log of free motion, whose noise sets the threshold of contact flags, as for `detect`.",
 )
@@ -449,7 +452,6 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
 @click.option(
     "--until",
     default="mass 0.5 %, com 0.5 mm, inertia 5 %",
-    show_default=True,
     metavar="TOLERANCE",
     help="Required accuracy; mass, com or inertia may be left out.",
 )
@@ -457,7 +459,6 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     "--seconds",
     type=option.FiniteNumber(1, 36000),
     default=120.0,
-    show_default=True,
     help="Maximum duration of the recording [s].",
 )
 @option.stream_options
@@ -472,8 +473,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
     """
     from drake_teleop.cli.calibrate import calibrate_command
 
-    summary = calibrate_command(source, out, **options)
-    return 0 if summary["all_known"] else 1
+    return 0 if calibrate_command(source, out, **options)["all_known"] else 1
 
 
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
@@ -488,23 +488,18 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
 @click.argument("identification", type=option.PATH_TYPE)
 @click.option("--to", required=True, type=_EXPORT_FORMAT_TYPE, help="Robot or file format.")
 @option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
-@click.option(
+@option.choice(
     "--sign",
-    type=click.Choice(["-1", "1"]),
-    default="-1",
-    show_default=True,
-    help="As in the log description: -1 if the sensor measures the wrench of the load on it.",
+    ["-1", "1"],
+    "-1",
+    "As in the log description: -1 if the sensor measures the wrench of the load on it.",
 )
 @option.rate_hz("Rate of the sensor's readings; required by c99, fmu and ros2_filter.")
 @option.cutoff_hz
 @option.sensor_range
 @option.output_folder("export")
 def export(
-    identification: Path,
-    to: str,
-    sensor_pose: tuple[float, ...] | None,
-    sign: str,
-    **loop: Any,
+    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **loop: Any
 ) -> None:
     """Write a load for a robot, model or controller.
 
@@ -551,12 +546,8 @@ def sample_log(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE)
-@click.option(
-    "--direction",
-    type=click.Choice(["x", "y", "z"]),
-    default="z",
-    show_default=True,
-    help="Direction of the task, an axis of the world frame.",
+@option.choice(
+    "--direction", ["x", "y", "z"], "z", "Direction of the task, an axis of the world frame."
 )
 @option.output_folder("analyze")
 @option.quiet
@@ -579,7 +570,6 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 @click.option(
     "--scenario",
     default="contact_transition",
-    show_default=True,
     help="Scenario of the station: a shipped name or a YAML file.",
 )
 @option.jobs
@@ -609,12 +599,11 @@ def compare_passivity(
     "--walls", type=option.POSITIVES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]"
 )
 @click.option("--network", help="Network preset.  [default: that of the scenario]")
-@click.option(
+@option.choice(
     "--task",
-    type=click.Choice(["press", "touch", "insert"]),
-    default="press",
-    show_default=True,
-    help="Task; it sets the required stability margin of gamma.",
+    ["press", "touch", "insert"],
+    "press",
+    "Task; it sets the required stability margin of gamma.",
 )
 @option.jobs
 @option.output_folder("tune")
@@ -680,7 +669,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE, default="identification")
-@click.option("--model", type=option.PATH_TYPE, help="Other arm: URDF, SDF, MJCF or .dmd.yaml.")
+@option.path("--model", help="Other arm: URDF, SDF, MJCF or .dmd.yaml.")
 @option.sensor_frame()
 @option.package_paths
 @click.option(
@@ -696,19 +685,17 @@ def scaling_study(out: Path, **options: Any) -> None:
     help="With --model: heaviest load of the sensor [kg]."
     "  [default: 130 % of the model's mass beyond the sensor]",
 )
-@click.option(
+@option.choice(
     "--criterion",
-    type=click.Choice(["kappa_w10", "kappa10", "kappa16", "A16", "D16"]),
-    default="kappa_w10",
-    show_default=True,
-    help="Condition number (kappa_w10: whitened; kappa10: SI units; kappa16: with offsets)"
+    ["kappa_w10", "kappa10", "kappa16", "A16", "D16"],
+    "kappa_w10",
+    "Condition number (kappa_w10: whitened; kappa10: SI units; kappa16: with offsets)"
     " or predicted errors (A16: rms; D16: geometric mean).",
 )
 @click.option(
     "--period",
     type=option.FiniteNumber(0.5, 600),
     default=6.0,
-    show_default=True,
     metavar="SECONDS",
     help="Duration of one period of the motion.",
 )
@@ -740,8 +727,7 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     collisions. Check the 3D replay, excitation.html, before a robot runs the motion.
     """
     if options["until"] is not None:
-        remedy = "remove it or --until"
-        option.refuse_given_options("criterion", "period", "seconds", remedy=remedy)
+        option.refuse_given_options("criterion", "period", "seconds", remedy="remove it or --until")
     from drake_teleop.cli.excitation import excite_command
 
     excite_command(scenario, out, **options)
@@ -749,23 +735,16 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("folder", type=option.PATH_TYPE)
-@click.option(
-    "--arm",
-    required=True,
-    type=option.PATH_TYPE,
-    help="Arm model: URDF, SDF, MJCF or .dmd.yaml.",
-)
+@option.path("--arm", required=True, help="Arm model: URDF, SDF, MJCF or .dmd.yaml.")
 @option.sensor_frame(required=True)
 @option.package_paths
-@click.option(
+@option.path(
     "--tool",
-    type=option.PATH_TYPE,
     help="Model of the tool.  [default: the arm's model beyond the sensor, or a default tool]",
 )
 @click.option(
     "--device",
     default="phantom_premium_15",
-    show_default=True,
     metavar="NAME",
     help="Preset of the master's haptic device.",
 )

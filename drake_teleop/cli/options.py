@@ -6,7 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,11 @@ class ShippedOrPath(Utf8Path):
 PATH_TYPE = Utf8Path(path_type=Path)
 SCENARIO_TYPE = ShippedOrPath(scenarios_dir(), str)
 STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
+path = partial(click.option, type=PATH_TYPE)
+
+
+def choice(name: str, words: list[str], default: str, text: str) -> Callable[[Any], Any]:
+    return click.option(name, type=click.Choice(words), default=default, help=text)
 
 
 def _fail_if_outside_range(
@@ -139,7 +144,6 @@ def output_folder(command: str) -> Callable[[Any], Any]:
         "--out",
         type=PATH_TYPE,
         default=Path("out") / command,
-        show_default=True,
         metavar="DIR",
         help="Output folder.",
         callback=_remove_new_empty_folders_at_end,
@@ -166,7 +170,7 @@ def _remove_empty_folders(new: list[Path]) -> None:
 
 _SEED_TYPE = IntegerInRange(0, 2**32 - 1)
 seed = click.option("--seed", type=_SEED_TYPE, help="Seed of noise.  [default: the scenario's]")
-seed_0 = click.option("--seed", type=_SEED_TYPE, default=0, show_default=True, help="Random seed.")
+seed_0 = click.option("--seed", type=_SEED_TYPE, default=0, help="Random seed.")
 jobs = click.option(
     "--jobs",
     type=IntegerInRange(1, 4096),
@@ -184,7 +188,6 @@ cutoff_hz = click.option(
     "cutoff_hz",
     type=POSITIVE_TYPE,
     default=30.0,
-    show_default=True,
     metavar="HZ",
     help="Cutoff of the low-pass on all signals; zero-phase for logs, causal for live streams.",
 )
@@ -200,28 +203,22 @@ delay = click.option(
     "--delay",
     type=DelayOrAuto(),
     default="auto",
-    show_default=True,
     help="Delay of the motion behind the wrench [s], or auto to estimate it.",
 )
-gamma = click.option(
-    "--gamma", type=SCALE_TYPE, default=1.0, show_default=True, help="Scale of the contact wrench."
-)
-package_paths = click.option(
+gamma = click.option("--gamma", type=SCALE_TYPE, default=1.0, help="Scale of the contact wrench.")
+package_paths = path(
     "--package-path",
     "package_paths",
-    type=PATH_TYPE,
     multiple=True,
     metavar="DIR",
     help="Folder to search for package:// files of the model; may be repeated.",
 )
-gripper_file = click.option(
+gripper_file = path(
     "--gripper",
-    type=PATH_TYPE,
     help="identification.json of the gripper without the object, in the same sensor frame.",
 )
-free_motion_log = click.option(
+free_motion_log = path(
     "--free",
-    type=PATH_TYPE,
     metavar="LOG",
     help="Log of free motion with this load, for the threshold of contact."
     "  [default: quiet parts of LOG]",
@@ -264,14 +261,13 @@ def load_file(*, required: bool = False, default: str = "") -> Callable[[Any], A
 
 
 def sigma(text: str) -> Callable[[Any], Any]:
-    return click.option("--sigma", type=SCALE_TYPE, default=0.0, show_default=True, help=text)
+    return click.option("--sigma", type=SCALE_TYPE, default=0.0, help=text)
 
 
 def separate_sigmas(command: Any) -> Any:
     text = "Scale of the load's {} alone.  [default: value of --sigma]"
     for part in ("inertia", "weight"):
-        option = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))
-        command = option(command)
+        command = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))(command)
     return command
 
 
@@ -318,9 +314,8 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
         sensor_pose("Pose of the sensor in the frame of the streamed poses [m, deg]."),
         package_paths,
         sensor_frame(),
-        click.option(
+        path(
             "--model",
-            type=PATH_TYPE,
             help="Model of the arm (URDF, SDF, MJCF), if SOURCE gives joint angles, no poses.",
         ),
         click.option(

@@ -404,6 +404,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     blocks = tuple(item for item in items if item not in TYPE_NAMES)
     metadata = entry.metadata
     choices = *metadata.get("choices", ()), *(metadata.get("registry") or ())
+    first_line = ((blocks[0].__doc__ if blocks else "") or "").partition("\n")[0]
     return FieldInfo(
         name=entry.name,
         kind="block" if blocks else TYPE_NAMES[items[0]].removeprefix("a "),
@@ -416,7 +417,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         high=metadata.get("high"),
         choices=choices if "choices" in metadata else (),
         blocks=blocks,
-        meaning=metadata.get("doc") or (_first_docstring_line(blocks[0]) if blocks else ""),
+        meaning=metadata.get("doc") or first_line.rstrip("."),
         is_mapping=is_mapping,
     )
 
@@ -435,7 +436,3 @@ def _format_value(value: Any) -> str:
 
 def _format_limit(limit: float | None) -> str:
     return f"{limit:.7g}" if isinstance(limit, float) else str(limit)
-
-
-def _first_docstring_line(block: type) -> str:
-    return (block.__doc__ or "").partition("\n")[0].rstrip(".")

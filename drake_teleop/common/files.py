@@ -164,8 +164,7 @@ def remove_log(path: Path) -> None:
     parts = sorted(path.glob(LOG_PARTS_PATTERN))
     if others := sorted(set(path.iterdir()) - set(parts)):
         what = f"contains {others[0].name}, which is not part of a log"
-        remedy = "give another folder for the log"
-        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
+        raise DrakeTeleopError(what, where=str(path), remedy="give another folder for the log")
     for part in reversed(parts):  # from the end: an interruption leaves no gap
         part.unlink()
 

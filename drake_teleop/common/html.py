@@ -48,8 +48,7 @@ def write_report_page_and_pictures(
     for name, figure in pictures.items():
         write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
     urls = {name: png_data_url(out / f"{name}.png") for name in pictures}
-    page = render_page(package, "report.html.j2", pictures=urls, **values)
-    write_text(out / "report.html", page)
+    write_text(out / "report.html", render_page(package, "report.html.j2", pictures=urls, **values))
 
 
 _SCRIPT_PATTERN = re.compile(r"<script[^>]*>(.*?)</script>", re.S)

@@ -50,8 +50,7 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
             raise ValueError("dates or time spans")
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        what = f"holds no numbers ({error})"
-        raise DrakeTeleopError(what, where=name, remedy=remedy) from error
+        raise DrakeTeleopError(f"holds no numbers ({error})", where=name, remedy=remedy) from error
 
 
 def as_compiled_arguments(values: _Record) -> _Record:

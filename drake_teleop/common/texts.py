@@ -110,8 +110,7 @@ def to_yaml_text(
     text = "\n".join(lines) + "\n"
     if parse_yaml(text, "YAML", tagged=True) != data:
         what = f"{reprlib.repr(data)} cannot be written"
-        remedy = "use numbers, texts, lists and mappings"
-        raise DrakeTeleopError(what, where="YAML", remedy=remedy)
+        raise DrakeTeleopError(what, where="YAML", remedy="use numbers, texts, lists and mappings")
     return text
 
 
@@ -152,8 +151,7 @@ def read_text(path: str | Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        what = f"is not UTF-8 text (byte {error.start})"
-        raise DrakeTeleopError(what, where=str(path)) from None
+        raise DrakeTeleopError(f"is not UTF-8 text (byte {error.start})", where=str(path)) from None
     except OSError as error:
         raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 

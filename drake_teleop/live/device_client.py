@@ -20,15 +20,8 @@ from typing import Protocol
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
-from drake_teleop.live.device_packets import (
-    MAX_PACKET_BYTES,
-    DevicePose,
-    DeviceState,
-    ForceCommand,
-    pack_state,
-    unpack_force,
-)
 from drake_teleop.live.haply import HaplyDevice
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import host_and_port
@@ -44,7 +37,7 @@ class HapticDevice(Protocol):
     @property
     def limits(self) -> DeviceLimits: ...
 
-    def read(self) -> DevicePose | None:
+    def read(self) -> device_packets.DevicePose | None:
         """Return the next pose; None if none is received for 0.5 s."""
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
@@ -67,7 +60,7 @@ class DeviceClient:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(host_and_port(address))
         self._socket.setblocking(False)
-        self._command: ForceCommand | None = None
+        self._command: device_packets.ForceCommand | None = None
         self._last_tick: float | None = None
 
     def exchange_packets(
@@ -94,27 +87,29 @@ class DeviceClient:
     def _receive_force_commands(self) -> None:
         while True:
             try:
-                packet = self._socket.recv(MAX_PACKET_BYTES + 1)
+                packet = self._socket.recv(device_packets.MAX_PACKET_BYTES + 1)
             except BlockingIOError:
                 return
             except ConnectionError:  # the station is not started yet
                 continue
-            command = unpack_force(packet)
+            command = device_packets.unpack_force(packet)
             if command is None or command.number > self._number:
                 continue
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send_pose(self, pose: DevicePose, now: float, age: float) -> None:
+    def _send_pose(self, pose: device_packets.DevicePose, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
             self.force_ages_s.append(behind)
         x, y, z = map(float, pose.position)
         w, i, j, k = map(float, pose.quaternion_wxyz)
-        state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind)
+        state = device_packets.DeviceState(
+            self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind
+        )
         try:
-            self._socket.send(pack_state(state))
+            self._socket.send(device_packets.pack_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer
             return
 
@@ -133,7 +128,7 @@ class RealTimeVirtualDevice:
         self._wrench: Sequence[float] = (0.0,) * 6
         self._due = self._simulated_until = time.perf_counter()
 
-    def read(self) -> DevicePose:
+    def read(self) -> device_packets.DevicePose:
         self._due += _CLIENT_PERIOD_S
         now = time.perf_counter()
         if self._due > now:
@@ -143,7 +138,7 @@ class RealTimeVirtualDevice:
             self._due = self._simulated_until = now
         self.virtual.simulate_motion(self._wrench[:3], max(now - self._simulated_until, 1e-6))
         self._simulated_until = now
-        return DevicePose(self.virtual.position)
+        return device_packets.DevicePose(self.virtual.position)
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         self._wrench = wrench

@@ -140,11 +140,8 @@ class ExternalMaster(LeafSystem):
         """Do nothing: a real hand has its own impedance."""
 
     def _current_pose_and_twist(self, context: Context) -> Array:
-        _pose_and_twist_on_path_into(
-            context.get_numeric_parameter(self._path).value(),
-            context.get_time(),
-            self._pose_and_twist,
-        )
+        path = context.get_numeric_parameter(self._path).value()
+        _pose_and_twist_on_path_into(path, context.get_time(), self._pose_and_twist)
         return self._pose_and_twist
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
@@ -172,14 +169,10 @@ class ExternalMaster(LeafSystem):
         output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT_INDEX])
 
     def _update_display(self, context: Context, discrete_state: DiscreteValues) -> None:
-        _update_displayed_wrench(
-            self._command.Eval(context),
-            context.get_numeric_parameter(self._path).value()[_HELD_INDEX] > 0.5,
-            self._period,
-            self._limits,
-            context.get_discrete_state_vector().value(),
-            discrete_state.get_mutable_value(0),
-        )
+        held = context.get_numeric_parameter(self._path).value()[_HELD_INDEX] > 0.5
+        last, now = context.get_discrete_state_vector().value(), discrete_state.get_mutable_value(0)
+        wrench = self._command.Eval(context)
+        _update_displayed_wrench(wrench, held, self._period, self._limits, last, now)
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:

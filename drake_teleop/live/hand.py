@@ -195,16 +195,10 @@ class LiveHand(Operator):
         return self._scratch
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _live_hand_wrench_into(
-            context.get_numeric_parameter(self._path).value(),
-            context.get_time(),
-            self._impedance,
-            self._mass,
-            self._pose.Eval(context),
-            self._twist.Eval(context),
-            self._scratch,
-            output.get_mutable_value(),
-        )
+        path, time = context.get_numeric_parameter(self._path).value(), context.get_time()
+        hand = self._impedance, self._mass
+        motion = self._pose.Eval(context), self._twist.Eval(context), self._scratch
+        _live_hand_wrench_into(path, time, *hand, *motion, output.get_mutable_value())
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._current_motion(context)[:7])

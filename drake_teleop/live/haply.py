@@ -13,12 +13,7 @@ from urllib.parse import urlsplit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import DeviceLimits
-from drake_teleop.live.device_packets import (
-    CLUTCH_OPEN,
-    DevicePose,
-    DeviceState,
-    valid_state,
-)
+from drake_teleop.live.device_packets import CLUTCH_OPEN, DevicePose, DeviceState, valid_state
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")

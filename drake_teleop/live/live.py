@@ -15,17 +15,10 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
+from drake_teleop.live import inputs as live_inputs
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import POSE_PERIOD_MS
-from drake_teleop.live.inputs import (
-    INPUT_RANGES,
-    MAX_DURATION_MS,
-    SLICE_MS,
-    STATION_INPUTS,
-    choice_names,
-    input_range,
-)
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.scenarios import SCENE_NAMES
@@ -81,7 +74,7 @@ class Live:
         begin: Mapping[str, int] | None = None,
     ) -> None:
         self._log, self._initial = log, begin or {}
-        self._link, self._slice_ms = link, SLICE_MS if link is None else POSE_PERIOD_MS
+        self._link, self._slice_ms = link, live_inputs.SLICE_MS if link is None else POSE_PERIOD_MS
         self.refused, self.requested_scene, self.scene = 0, "", SCENE_NAMES[0]
         self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
         self._driver: int | None = None
@@ -138,8 +131,8 @@ class Live:
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
-            "ranges": {name: input_range(name) for name in INPUT_RANGES},
-            "names": choice_names(),
+            "ranges": {name: live_inputs.input_range(name) for name in live_inputs.INPUT_RANGES},
+            "names": live_inputs.choice_names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
             "touch": MIN_DISPLAYED_TOUCH_FORCE_N,
             "known": self._load is not None,
@@ -171,7 +164,7 @@ class Live:
         if client != self._driver:
             return
         if "set" in message:
-            if not STATION_INPUTS.isdisjoint(message["set"]):
+            if not live_inputs.STATION_INPUTS.isdisjoint(message["set"]):
                 self._refusal = ""
             self._requested = self._requested.with_changes(message["set"])
             self._rates = RateInputs()
@@ -261,7 +254,7 @@ class Live:
                 self.stopped = to_one_line(str(error))
             else:  # there is no such station: keep the present one
                 self._refusal = to_one_line(str(error))
-                removed = {name: getattr(present, name) for name in STATION_INPUTS}
+                removed = {name: getattr(present, name) for name in live_inputs.STATION_INPUTS}
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
@@ -270,7 +263,7 @@ class Live:
             self._pressed = pressed
         if self._link is not None and not self.stopped:
             self._link.send_wrench(self._session.device_wrench())
-        if self._session.ms >= MAX_DURATION_MS:
+        if self._session.ms >= live_inputs.MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
 
     def frame(self) -> dict[str, Any]:
@@ -301,7 +294,7 @@ class Live:
             "scene": self.requested_scene or self.scene,
             "record": self._folder,
             "stopped": self.stopped,
-            "inputs": {name: getattr(inputs, name) for name in INPUT_RANGES},
+            "inputs": {name: getattr(inputs, name) for name in live_inputs.INPUT_RANGES},
         }
 
     def _state_name(self) -> str:

@@ -202,8 +202,7 @@ class LiveDrive:
                 logger=_LOGGER,
             )
         except OSError as error:
-            what = f"cannot be opened ({error.strerror})"
-            remedy = "use another --port"
+            what, remedy = f"cannot be opened ({error.strerror})", "use another --port"
             raise DrakeTeleopError(what, where=f"port {self._port}", remedy=remedy) from error
         self._port = server.sockets[0].getsockname()[1]
         self.url = f"http://{_HOST}:{self._port}/?token={self._token}"

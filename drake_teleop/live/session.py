@@ -37,15 +37,10 @@ from drake_teleop.live.scenarios import (
     chosen_scenario,
 )
 from drake_teleop.live.station_swap import copy_station_state
+from drake_teleop.station import simulation
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import LOG_BLOCK_NAME, SIGNALS, signal_of
-from drake_teleop.station.simulation import (
-    MakeSimulator,
-    advance_without_garbage_collection,
-    log_slices_of_signals,
-    read_recorded_signals,
-)
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 #: Rows in a part of a log on disk, two seconds. Copying a longer part would delay a slice; each
@@ -123,12 +118,12 @@ class _Station:
             master=make_master(scenario, cross_fade=number > 0),
         )
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
-        self.simulator = MakeSimulator(self.station, seeded)
+        self.simulator = simulation.MakeSimulator(self.station, seeded)
         if scenario.simulation.integrator == "runge_kutta3":  # has error control
             take_short_steps_in_contact(self.simulator, _MIN_INTEGRATION_STEP_S)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG_BLOCK_NAME).FindMutableLog(self.context)
-        self.columns = log_slices_of_signals(self.station)
+        self.columns = simulation.log_slices_of_signals(self.station)
 
     def block_and_context(self, name: str) -> tuple[Any, Context]:
         inner_side = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
@@ -269,7 +264,7 @@ class Session:
     def _advance_to(self, ms: int) -> None:
         self.ms = ms
         # The same product as Drake's event times, see `simulate`.
-        advance_without_garbage_collection(self._station.simulator, 1e-3 * ms)
+        simulation.advance_without_garbage_collection(self._station.simulator, 1e-3 * ms)
 
     def new_rows(self) -> dict[str, Array]:
         """Return the log's rows since the last call: signal -> (n, k), and "t" (n,) [s]."""
@@ -315,7 +310,7 @@ class Session:
             self._on_disk.wait_until_written()
 
     def _recorded_signals(self) -> SimulationResult:
-        return add_missing_signals(read_recorded_signals(self._station.simulator, 0.0))
+        return add_missing_signals(simulation.read_recorded_signals(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
         parts = [*self._earlier_rows, self._recorded_signals()]

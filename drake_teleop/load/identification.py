@@ -25,6 +25,8 @@ PARAMETER_NAMES = (
     *("m", "m c_x", "m c_y", "m c_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz"),
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
+PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
+"""Unit of each parameter."""
 
 MAX_IDENTIFIED_STD_SHARE = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
@@ -118,14 +120,14 @@ class Identification:
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
         force, torque = (np.linalg.norm(part) for part in np.split(self.residual_rms, 2))
+        com_deviations = com_standard_deviations(self.phi, self.covariance)
         unknown = [f"{name} {verdict}" for name, verdict in named if verdict != "identified"]
         known = ", ".join([f"{16 - len(unknown)} of 16 parameters identified", *unknown])
         return "\n".join(
             (
                 f"{self.method}, {self.samples} samples: {known}",
                 f"  mass              {_format_numbers([mass], deviations[6:7])} kg",
-                "  centre of mass   "
-                f" {_format_numbers(com, com_standard_deviations(self.phi, self.covariance))} m",
+                f"  centre of mass    {_format_numbers(com, com_deviations)} m",
                 f"  inertia xx yy zz  {_format_numbers(inertia[[0, 3, 5]])} kg m^2, about that"
                 " centre",
                 f"  inertia xy xz yz  {_format_numbers(inertia[[1, 2, 4]])} kg m^2",

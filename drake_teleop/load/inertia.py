@@ -30,8 +30,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
         what = "the inertia tensor is not symmetric"
         remedy = "give equal products of inertia above and below the diagonal"
         raise DrakeTeleopError(what, where="I_BBcm_S", remedy=remedy)
-    about_origin = I + _inertia_of_point_mass(p, m)
-    return np.concatenate([[m], m * p, about_origin[np.triu_indices(3)]])
+    return np.concatenate([[m], m * p, (I + _inertia_of_point_mass(p, m))[np.triu_indices(3)]])
 
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:

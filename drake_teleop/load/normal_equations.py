@@ -292,8 +292,7 @@ class SecondMoments:
     ) -> tuple[Array, Array]:
         w = self._weights
         absorbed = self._absorbed_degrees_of_freedom(between, inverse)
-        spread = inverse @ grams @ inverse
-        shares = np.einsum("cij,kji->ck", between, spread) * w**2
+        shares = np.einsum("cij,kji->ck", between, inverse @ grams @ inverse) * w**2
         degrees = np.maximum(count - absorbed, 0.0)
         equations = np.diag(count - 2.0 * absorbed) + shares
         if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
@@ -375,8 +374,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
     WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
     gram = TZ.transpose(1, 0, 2).reshape(16, -1) @ WT.transpose(1, 0, 2).reshape(16, -1).T
-    right = np.einsum("cjd,cd->j", TZ[:, :, 1:7], W)
-    return 0.5 * (gram + gram.T), right
+    return 0.5 * (gram + gram.T), np.einsum("cjd,cd->j", TZ[:, :, 1:7], W)
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:

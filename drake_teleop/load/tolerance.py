@@ -12,13 +12,13 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITY_NAMES = ("mass", "com", "inertia")
-"""Names of the quantities whose accuracy a tolerance can require."""
+"""Quantities whose accuracy a tolerance can require."""
 NAMES_OF_ENTRIES = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 }
-"""Names of the numbers that each quantity consists of."""
+"""Numbers that each quantity consists of."""
 QUANTITY_UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
 """Unit of each quantity in printed values."""
 
@@ -87,8 +87,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     E, upper = np.eye(3), np.triu_indices(3)
     rows[4:, 0] = ((c @ c) * E - np.outer(c, c))[upper]
     for k in range(3):
-        both = np.outer(E[k], c) + np.outer(c, E[k])
-        rows[4:, 1 + k] = -(2.0 * c[k] * E - both)[upper]
+        rows[4:, 1 + k] = -(2.0 * c[k] * E - (np.outer(E[k], c) + np.outer(c, E[k])))[upper]
     rows[4:, 4:] = np.eye(6)
     # Lower bound, because a poorly determined inertia can have any estimate.
     scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))

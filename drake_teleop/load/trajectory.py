@@ -40,8 +40,11 @@ class FourierTrajectory:
         `sine` and `cosine` (n, N - 1) [rad] are free coefficients; harmonic k is divided by k.
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
-        rest_rho, rest_delta = _make_rest_coefficient_bases(sine.shape[-1] + 1)
-        return cls(np.asarray(q0, float), sine @ rest_rho, cosine @ rest_delta, frequency)
+        k = np.arange(1.0, sine.shape[-1] + 2)[:, np.newaxis]
+        # Bases of the coefficients whose sums, plain or weighted by k, are zero.
+        bases = [np.linalg.qr(weights, mode="complete")[0][:, 1:] for weights in (k**0, k)]
+        rho, delta = sine @ (bases[0] / k).T, cosine @ (bases[1] / k).T
+        return cls(np.asarray(q0, float), rho, delta, frequency)
 
     @property
     def period(self) -> float:
@@ -107,9 +110,3 @@ class FourierTrajectory:
             what = f"contains numbers above {_MAX_FILE_NUMBER:g}"
             raise DrakeTeleopError(what, where=where, remedy="give rad and Hz")
         return cls(q0, rho, delta, frequency)
-
-
-def _make_rest_coefficient_bases(harmonics: int) -> tuple[Array, Array]:
-    k = np.arange(1.0, harmonics + 1)
-    bases = [np.linalg.qr(row[:, np.newaxis], mode="complete")[0][:, 1:] for row in (k**0, k)]
-    return (bases[0] / k[:, np.newaxis]).T, (bases[1] / k[:, np.newaxis]).T

@@ -16,13 +16,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT
 from drake_teleop.common.numeric import Array
+from drake_teleop.load import tolerance as tolerances
 from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import regressor
-from drake_teleop.load.tolerance import (
-    Tolerance,
-    derivatives_over_tolerances,
-    deviations_over_tolerances,
-)
 from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_pass_log
@@ -78,7 +74,7 @@ class RecordEvaluation:
 
 def evaluate_record(
     path: Path,
-    tolerance: Tolerance,
+    tolerance: tolerances.Tolerance,
     previous: RecordEvaluation | None,
     *,
     cutoff_hz: float | None,
@@ -111,19 +107,19 @@ def evaluate_record(
     elif changes:
         advice = _RESTART_ADVICE.format(t=min(changes))
     else:
-        errors = derivatives_over_tolerances(tolerance, phi)
+        errors = tolerances.derivatives_over_tolerances(tolerance, phi)
         advice = advise_motion(log.motion, log.dt, cutoff_hz, errors, noise)
     t = 0.0 if log is None else float(log.t[-1])
     return RecordEvaluation(t, found, why, half, sure, known, doubts, advice)
 
 
 def half_widths_and_dof_over_tolerances(
-    found: IdentifiedLog, tolerance: Tolerance
+    found: IdentifiedLog, tolerance: tolerances.Tolerance
 ) -> tuple[Array, Array, Array]:
     """Return relative half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom (k,)."""
     load = found.identification
-    errors = derivatives_over_tolerances(tolerance, load.phi)
-    deviations = deviations_over_tolerances(errors, load.covariance)
+    errors = tolerances.derivatives_over_tolerances(tolerance, load.phi)
+    deviations = tolerances.deviations_over_tolerances(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
     levels = 0.95, TOLERANCE_CONFIDENCE
@@ -163,7 +159,7 @@ def advise_motion(
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
     for words, of_motion in _candidate_information_matrices(last, noise, rate):
-        left = deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
+        left = tolerances.deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
             best, least = words, cost
@@ -203,7 +199,7 @@ def calibrate(
     source: Source,
     recorder: Recorder,
     path: Path,
-    tolerance: Tolerance,
+    tolerance: tolerances.Tolerance,
     *,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",

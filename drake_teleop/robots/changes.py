@@ -19,20 +19,15 @@ from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import FittedModel
+from drake_teleop.robots import streams
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
-from drake_teleop.robots.streams import (
-    NONZERO_WRENCH_FLAGS,
-    NUM_READING_VALUES,
-    Reading,
-    ReadingFlag,
-)
 
 TESTED_RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
 MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
-_TEST_TRIGGER_FLAGS = int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD)
-_UNTESTED_READING_FLAGS = ~int(NONZERO_WRENCH_FLAGS)
+_TEST_TRIGGER_FLAGS = int(streams.ReadingFlag.IN_CONTACT | streams.ReadingFlag.OTHER_LOAD)
+_UNTESTED_READING_FLAGS = ~int(streams.NONZERO_WRENCH_FLAGS)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_TEST_SPACING_S, _MAX_PAUSE_IN_FLAGGED_TIME_S, _MIN_REPORTED_CHANGE_SPACING_S = 10.0, 1.0, 1.0
 _MIN_TESTED_RECORD_S, _KIND_LIKELIHOOD_RATIO = 4.0, 40.0
@@ -48,14 +43,14 @@ class ChangeMonitor:
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
-        self._rows = np.zeros((round(TESTED_RECORD_SPAN_S / dt), 1 + NUM_READING_VALUES))
+        self._rows = np.zeros((round(TESTED_RECORD_SPAN_S / dt), 1 + streams.NUM_READING_VALUES))
         self._count, self._last = 0, -math.inf
         self._flagged_since, self._last_flagged, self._next_attempt = math.inf, -math.inf, math.inf
         self._executor = ThreadPoolExecutor(1, "changes of a stream")
         self._pending: Future[list[TimedChangeText]] | None = None
         self._reported: list[float] = []
 
-    def add_reading(self, reading: Reading, flags: int) -> None:
+    def add_reading(self, reading: streams.Reading, flags: int) -> None:
         if flags & _UNTESTED_READING_FLAGS:
             return
         if not 0.0 < reading.t - self._last < CLOCK_JUMP_S:
@@ -163,7 +158,7 @@ def _text_of_zero_or_load_change(cause: Cause) -> str:
 def main() -> None:
     if hasattr(os, "nice"):
         os.nice(_CHANGE_TEST_NICENESS)
-    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_READING_VALUES)
+    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + streams.NUM_READING_VALUES)
     json.dump(find_zero_and_load_changes(rows, float(sys.argv[1])), sys.stdout)
 
 

@@ -14,11 +14,8 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import unknown_gravity_error
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs import processing
 from drake_teleop.logs.causal import filter_lag, low_pass_and_settled_state
-from drake_teleop.logs.processing import (
-    phi_with_inertia_replaced,
-    weight_scale_without_effect_error,
-)
 from drake_teleop.robots import compensation_step as kernel
 from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
@@ -111,7 +108,7 @@ class Compensator:
         watch: ContactAndLoadMonitor | None = None,
         detector: StreamContactDetector | None = None,
     ) -> None:
-        self._phi, self._zero_phi = phi_with_inertia_replaced(load)[0], np.zeros(10)
+        self._phi, self._zero_phi = processing.phi_with_inertia_replaced(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
         self._scales = np.empty(4)
         self.set_scales(sigma, gamma, sigma_weight, sigma_inertia)
@@ -165,7 +162,7 @@ class Compensator:
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:
-            raise weight_scale_without_effect_error("load")
+            raise processing.weight_scale_without_effect_error("load")
         kernel.set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
 
     def step(self, reading: Reading, now: float) -> CompensatedWrench:

@@ -13,14 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import removed_weight_needs_orientation_error
-from drake_teleop.robots.assembly import (
-    IDENTITY_POSE,
-    ArmKinematics,
-    PoseSourceFromJoints,
-    ReadingAssembler,
-    WrenchAndMotionStreams,
-    pose_from_rpy,
-)
+from drake_teleop.robots import assembly
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
@@ -41,7 +34,7 @@ def open_source(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    arm: ArmKinematics | None = None,
+    arm: assembly.ArmKinematics | None = None,
 ) -> Source:
     """Return the source of wrench and motion at an address.
 
@@ -60,7 +53,7 @@ def open_source(
         return ReplayLogSource(path, load, cutoff_hz=cutoff_hz, delay=delay, real_time=real_time)
     source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
     weight_removed = load is not None and load.weight_removed
-    if not isinstance(source, WrenchAndMotionStreams):
+    if not isinstance(source, assembly.WrenchAndMotionStreams):
         if weight_removed:
             source.close()
             raise removed_weight_needs_orientation_error(address)
@@ -68,7 +61,7 @@ def open_source(
     track = load if isinstance(delay, str) else None
     if isinstance(delay, str):
         delay = 0.0 if load is None else load.delay_s
-    return ReadingAssembler(
+    return assembly.ReadingAssembler(
         source,
         cutoff_hz=cutoff_hz,
         delay_s=delay,
@@ -85,7 +78,7 @@ def open_source_and_recorder(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    arm: ArmKinematics | None = None,
+    arm: assembly.ArmKinematics | None = None,
 ) -> tuple[Source, Recorder]:
     """Return the source that `calibrate` reads, and its recorder."""
     kind = _address_scheme(address)
@@ -95,7 +88,7 @@ def open_source_and_recorder(
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
     source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
-    two_clocks = isinstance(source, WrenchAndMotionStreams) and source.two_clocks
+    two_clocks = isinstance(source, assembly.WrenchAndMotionStreams) and source.two_clocks
     X_FS = _pose_from_option(sensor_pose)
     return source, Recorder(source.streams, largest, X_FS, two_clocks=two_clocks)
 
@@ -141,7 +134,7 @@ def _open_streams(
     rate_hz: float | None,
     motion: str | None,
     sensor_pose: tuple[float, ...] | None,
-    arm: ArmKinematics | None,
+    arm: assembly.ArmKinematics | None,
 ) -> Source:
     joints = () if arm is None else arm.joint_names
     opened = [_open_registered_source(address, rate_hz, joints)]
@@ -160,8 +153,8 @@ def _open_streams(
                 what = "delivers no joint positions for --model"
                 remedy = "give a source such as zenoh://HOST/TOPIC?joints=/joint_states"
                 raise DrakeTeleopError(what, where=motion or address, remedy=remedy)
-            opened[-1] = PoseSourceFromJoints(opened[-1], arm)
-        return WrenchAndMotionStreams(*opened, where=motion or address)
+            opened[-1] = assembly.PoseSourceFromJoints(opened[-1], arm)
+        return assembly.WrenchAndMotionStreams(*opened, where=motion or address)
     except BaseException:
         for each in opened:
             each.close()
@@ -178,7 +171,7 @@ def _open_registered_source(address: str, rate_hz: float | None, joints: tuple[s
 
 
 def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
-    return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
+    return assembly.IDENTITY_POSE if sensor_pose is None else assembly.pose_from_rpy(sensor_pose)
 
 
 def _make(module: str, class_name: str, *arguments: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -132,14 +133,9 @@ def _ur_script(load: ExportedLoad) -> str:
 
 
 def _franka_json(load: ExportedLoad) -> str:
-    return _json_text(
-        {
-            "mass": load.mass,
-            "centerOfMass": load.com.tolist(),
-            "inertia": load.inertia.T.ravel().tolist(),
-            "transformation": np.eye(4).T.ravel().tolist(),
-        }
-    )
+    inertia, identity = load.inertia.T.ravel().tolist(), np.eye(4).ravel().tolist()
+    values = {"mass": load.mass, "centerOfMass": load.com.tolist(), "inertia": inertia}
+    return _json_text(values | {"transformation": identity})
 
 
 def _xarm_call(load: ExportedLoad) -> str:
@@ -158,14 +154,9 @@ def _kth_yaml(load: ExportedLoad) -> str:
 
 
 def _ft_tools_yaml(load: ExportedLoad) -> str:
-    return to_yaml_text(
-        {
-            "mass": float(load.mass),
-            "sensor_frame_to_com": _float_list(load.com),
-            "force_offset": _float_list(load.offsets[:3]),
-            "torque_offset": _float_list(load.offsets[3:]),
-        }
-    )
+    force, torque = (_float_list(part) for part in np.split(load.offsets, 2))
+    values = {"mass": float(load.mass), "sensor_frame_to_com": _float_list(load.com)}
+    return to_yaml_text(values | {"force_offset": force, "torque_offset": torque})
 
 
 def _admittance_yaml(load: ExportedLoad) -> str:
@@ -242,6 +233,7 @@ def _json_text(document: dict[str, Any]) -> str:
 
 
 _SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
+_format_of_sensor = partial(Format, of_sensor=True, inertia=False, comment="#")
 
 FORMATS = Registry(
     "export format",
@@ -251,21 +243,14 @@ FORMATS = Registry(
             _franka_json, note="transformation is the identity: use that of your end effector"
         ),
         "xarm": Format(_xarm_call, inertia=False, comment="#"),
-        "kth": Format(
+        "kth": _format_of_sensor(
             _kth_yaml,
-            of_sensor=True,
-            inertia=False,
             offsets=True,
-            comment="#",
             note=f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
             " compensated force is twice the weight, change the sign of the mass",
         ),
-        "ft_tools": Format(
-            _ft_tools_yaml, of_sensor=True, inertia=False, offsets=True, comment="#"
-        ),
-        "ros2-admittance": Format(
-            _admittance_yaml, of_sensor=True, inertia=False, comment="#", note=_SENSOR_FRAME_NOTE
-        ),
+        "ft_tools": _format_of_sensor(_ft_tools_yaml, offsets=True),
+        "ros2-admittance": _format_of_sensor(_admittance_yaml, note=_SENSOR_FRAME_NOTE),
         "bota": Format(
             _bota_json,
             of_sensor=True,

@@ -16,13 +16,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from drake_teleop.common.files import (
-    log_part_path,
-    make_folder,
-    remove_log,
-    wrap_write_errors,
-    write_table,
-)
+from drake_teleop.common import files
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
@@ -110,7 +104,7 @@ class TableSink:
     """
 
     def __init__(self, path: Path) -> None:
-        make_folder(path.parent)
+        files.make_folder(path.parent)
         self._path, self._period = path, TABLE_WRITE_PERIOD_S[path.suffix]
         self._rows: list[CompensatedWrench] = []
         self._written, self._end = 0, 0  # rows; bytes of the CSV file
@@ -130,14 +124,16 @@ class TableSink:
 
         rows, table = len(self._rows), pl.DataFrame(self._buffered_columns())
         if not self._written:
-            remove_log(self._path)
+            files.remove_log(self._path)
         if self._path.suffix == ".parquet":
-            make_folder(self._path)
-            write_table(log_part_path(self._path, self._written), table, temporary_base=self._path)
+            files.make_folder(self._path)
+            files.write_table(
+                files.log_part_path(self._path, self._written), table, temporary_base=self._path
+            )
         else:
             text = table.write_csv(include_header=not self._written).encode()
             mode = "r+b" if self._written else "wb"
-            with wrap_write_errors(self._path), self._path.open(mode, buffering=0) as file:
+            with files.wrap_write_errors(self._path), self._path.open(mode, buffering=0) as file:
                 file.seek(self._end)
                 if file.write(text) < len(text):  # a truncated number would be a wrong number
                     file.truncate(self._end)

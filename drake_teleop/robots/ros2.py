@@ -12,25 +12,9 @@ from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.interruption import delayed_signals
+from drake_teleop.robots import ros2_messages, streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.ros2_messages import (
-    MESSAGE_TYPE_OF_TOPIC,
-    SOURCE_PARAMETERS,
-    WRENCH_STAMPED,
-    MessageConverter,
-    checked_topic_name,
-    damaged_reading_of_topic,
-    domain_of_address,
-    topics_frames_and_streams,
-)
-from drake_teleop.robots.streams import (
-    NONZERO_WRENCH_FLAGS,
-    CompensatedWrench,
-    Reading,
-    ReadingFlag,
-    Source,
-)
 
 _NODE_NAME = "drake_teleop"
 _MAX_DIAGNOSTICS_PERIOD_S = 1.0
@@ -90,7 +74,7 @@ def message_class(kind: str, where: str) -> Any:
         raise DrakeTeleopError(what, where=where, remedy=remedy) from None
 
 
-class Ros2Source(Source):
+class Ros2Source(streams.Source):
     """Source at ros2://TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&domain=N&sign=1].
 
     TOPIC is a WrenchStamped. `/tf` and `/tf_static` contain all frames between PARENT and CHILD.
@@ -98,12 +82,15 @@ class Ros2Source(Source):
 
     @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
-        self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
-        topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
-        classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
-        self._converter = MessageConverter(sign, frames, joints)
-        self._found: list[Reading] = []
+        parsed = parse_ros2_address(address, ros2_messages.SOURCE_PARAMETERS)
+        self.dt, sign, domain = dt, parsed.wrench_sign(), ros2_messages.domain_of_address(parsed)
+        topics, frames, self.streams = ros2_messages.topics_frames_and_streams(parsed, joints)
+        classes = {
+            name: message_class(ros2_messages.MESSAGE_TYPE_OF_TOPIC[name], address)
+            for name in topics
+        }
+        self._converter = ros2_messages.MessageConverter(sign, frames, joints)
+        self._found: list[streams.Reading] = []
         self._counts: Counter[str] = Counter()
         self._node, self._next_spin = shared_node(domain), 0.0
         self._subscriptions = [
@@ -112,7 +99,7 @@ class Ros2Source(Source):
         ]
 
     @delayed_signals()
-    def read(self, timeout_s: float) -> list[Reading] | None:
+    def read(self, timeout_s: float) -> list[streams.Reading] | None:
         self._take_messages()
         if not self._found:
             self._node.spin(timeout_s)
@@ -148,7 +135,7 @@ class Ros2Source(Source):
             try:
                 data = deserialize_message(message, kind)
             except Exception:  # of rmw, without a common type
-                self._found.append(damaged_reading_of_topic(name))
+                self._found.append(ros2_messages.damaged_reading_of_topic(name))
                 return
             self._found += self._converter.readings_of_message(name, data, number)
 
@@ -156,8 +143,7 @@ class Ros2Source(Source):
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
-        best_effort = ReliabilityPolicy.BEST_EFFORT
-        newest = QoSProfile(depth=_MAX_QUEUED_MESSAGES, reliability=best_effort)
+        newest = QoSProfile(depth=_MAX_QUEUED_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT)
         options = {"callback": receive, "qos_profile": newest, "raw": True}
         return node.create_subscription(kind, f"/{topic}", **options), receive
 
@@ -170,10 +156,13 @@ class Ros2Sink:
         parsed = parse_ros2_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
 
-        topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
+        topic, domain = (
+            ros2_messages.checked_topic_name(parsed, parsed.path),
+            ros2_messages.domain_of_address(parsed),
+        )
         self._which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
         names = "DiagnosticArray", "DiagnosticStatus", "KeyValue"
-        types = (WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
+        types = (ros2_messages.WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in types}
         self._kinds = SimpleNamespace(**classes)
         self._message = self._kinds.WrenchStamped()
@@ -187,7 +176,7 @@ class Ros2Sink:
         self._diagnostics = node.create_publisher(kinds.DiagnosticArray, "/diagnostics", 100)
 
     @delayed_signals()
-    def write(self, out: CompensatedWrench) -> None:
+    def write(self, out: streams.CompensatedWrench) -> None:
         message, ns = self._message, time.time_ns()
         _set_stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
@@ -203,11 +192,11 @@ class Ros2Sink:
     def close(self) -> None:
         self._node.close()
 
-    def _diagnostics_message(self, out: CompensatedWrench, ns: int) -> Any:
+    def _diagnostics_message(self, out: streams.CompensatedWrench, ns: int) -> Any:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
-        if out.flags & ~NONZERO_WRENCH_FLAGS:
-            level = kind.STALE if out.flags == ReadingFlag.STALE else kind.ERROR
+        if out.flags & ~streams.NONZERO_WRENCH_FLAGS:
+            level = kind.STALE if out.flags == streams.ReadingFlag.STALE else kind.ERROR
         pairs = {"number": out.number, "t": repr(float(out.t)), "flags": out.flags, **self._counts}
         values = [self._kinds.KeyValue(key=key, value=str(value)) for key, value in pairs.items()]
         status = kind(

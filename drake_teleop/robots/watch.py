@@ -10,23 +10,11 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import (
-    MIN_NOISE_FLOOR_SAMPLES,
-    NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
-    ContactDetector,
-    fit_noise_floor,
-    update_contact_flag,
-)
+from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales
 from drake_teleop.load.identification import Identification
+from drake_teleop.load.online import watched
 from drake_teleop.load.online.change import change_detector_parameters
-from drake_teleop.load.online.watched import (
-    STATE_DISTURBED,
-    STATE_OTHER_LOAD,
-    initial_monitor_memory,
-    load_state_index,
-    monitor_load,
-)
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass, low_pass_and_settled_state
 from drake_teleop.logs.processing import phi_with_inertia_replaced
@@ -74,15 +62,17 @@ class ContactAndLoadMonitor:
     def restart(self, offsets: Array) -> None:
         """Restart with other sensor offsets (6,)."""
         self._out = np.concatenate([offsets, self._phi])
-        self._memory = initial_monitor_memory(self._out, self._covariance)
+        self._memory = watched.initial_monitor_memory(self._out, self._covariance)
 
     def reading_flags(self, values: Array) -> int:
         """Return the `ReadingFlag` bits of a valid reading (15,): contact, another load, or 0."""
-        monitor_load(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
-        state = load_state_index(self._memory)
-        if state == STATE_OTHER_LOAD:
+        watched.monitor_load(
+            self._out, self._memory, values, self._fallback, self._dt, *self._parameters
+        )
+        state = watched.load_state_index(self._memory)
+        if state == watched.STATE_OTHER_LOAD:
             return int(ReadingFlag.OTHER_LOAD)
-        return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0
+        return int(ReadingFlag.IN_CONTACT) if state == watched.STATE_DISTURBED else 0
 
 
 MEAN_WRENCH_TIME_CONSTANT_S = 3.0
@@ -115,7 +105,7 @@ class StreamContactDetector:
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         transient = round(0.5 / (_GRAVITY_CUTOFF_HZ * dt))  # of the low-passes
-        if len(values) < (required := transient + MIN_NOISE_FLOOR_SAMPLES):
+        if len(values) < (required := transient + detection.MIN_NOISE_FLOOR_SAMPLES):
             what = f"has {len(values)} valid readings, too few for a noise floor"
             remedy = f"give a log of free motion with at least {required}"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)
@@ -130,10 +120,12 @@ class StreamContactDetector:
         fade = float(np.exp(-1.0 / hold))
         covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
-        floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
-        threshold = max(NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(_CONTACT_STATISTIC))
+        floor = detection.fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
+        threshold = max(
+            detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(_CONTACT_STATISTIC)
+        )
         following = dt / MEAN_WRENCH_TIME_CONSTANT_S
-        self._settings = ContactDetector(
+        self._settings = detection.ContactDetector(
             floor, threshold, statistic=_CONTACT_STATISTIC, hold=hold, following=following
         ).settings
         self.restart()
@@ -141,7 +133,7 @@ class StreamContactDetector:
         self.restart()
 
     def restart(self) -> None:
-        self._memory = ContactDetector.initial_memory()
+        self._memory = detection.ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
     def contact_flag(self, values: Array, contact: Array) -> int:
@@ -160,4 +152,4 @@ def _filter_and_detect_contact(memory, values, contact, fast, slow, filters, set
     for i in range(3):
         filtered[9 + i] = filtered[i] - filtered[9 + i]
     s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
-    return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)
+    return detection.update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)

@@ -9,13 +9,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.experiment.design import (
-    ApparentMass,
-    Condition,
-    ContactDetection,
-    PegInSlot,
-    Task,
-)
+from drake_teleop.live.experiment import design
 from drake_teleop.live.experiment.procedure import IntervalResult
 from drake_teleop.live.inputs import AS_IN_SCENARIO, INPUT_RANGES, Inputs
 from drake_teleop.live.scenarios import adapt_estimate, chosen_scenario, live_scenario
@@ -43,8 +37,8 @@ class Apparatus:
     `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1.
     """
 
-    task: Task
-    condition: Condition
+    task: design.Task
+    condition: design.Condition
     scenario: Scenario
     load: IdentifiedLoad | None
     load_mass_at_hand: float
@@ -57,9 +51,9 @@ class Apparatus:
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
         share = sigma if condition.eta is None else 100.0 * condition.eta
-        if isinstance(self.task, ContactDetection):
+        if isinstance(self.task, design.ContactDetection):
             gamma = max(1.0, gamma * level / contact_force) if level else 0.0
-        elif isinstance(self.task, ApparentMass) and level:
+        elif isinstance(self.task, design.ApparentMass) and level:
             share += max(1.0, 100.0 * level / self.load_mass_at_hand)
         if condition.eta is None:
             sigma = share
@@ -74,10 +68,10 @@ class Apparatus:
         `inputs` are its `stimulus_scales`.
         """
         force = rows.largest_mean_contact_force()
-        if isinstance(self.task, PegInSlot):
+        if isinstance(self.task, design.PegInSlot):
             time_s = rows.done_at or rows.time
             return IntervalResult(force_N=force, done=rows.done_at > 0.0, time_s=time_s)
-        if isinstance(self.task, ContactDetection):
+        if isinstance(self.task, design.ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
             return IntervalResult(level if target else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
         before = self.condition.sigma if self.condition.eta is None else self.condition.eta
@@ -86,7 +80,7 @@ class Apparatus:
 
 
 def make_apparatus(
-    task: Task, condition: Condition, scenario: Scenario, load: IdentifiedLoad | None
+    task: design.Task, condition: design.Condition, scenario: Scenario, load: IdentifiedLoad | None
 ) -> Apparatus:
     setup = live_scenario(scenario)
     changes: dict[str, object] = {}

@@ -4,13 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from drake_teleop.common.config import (
-    check_all_field_values,
-    choice,
-    plain,
-    quantity,
-    settings,
-)
+from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS

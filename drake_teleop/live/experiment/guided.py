@@ -199,8 +199,7 @@ class GuidedExperiment:
         live.frame()
         level = self._procedure.current_level
         result = self._apparatus.interval_result(level, self._stimulus, self._rows)
-        result = dataclasses.replace(result, lost_s=live.pace.lost_time_s)
-        self._procedure.finish_interval(result)
+        self._procedure.finish_interval(dataclasses.replace(result, lost_s=live.pace.lost_time_s))
         self._since = self._frame_due = now
         self._prepare_interval_if_changed(now)
 
@@ -210,8 +209,7 @@ class GuidedExperiment:
         task = self._procedure.task
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
-        plain = Inputs()
-        inputs = {name: getattr(plain, name) for name in INPUT_RANGES}
+        inputs = {name: getattr(Inputs(), name) for name in INPUT_RANGES}
         inputs |= {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {

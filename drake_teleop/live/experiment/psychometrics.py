@@ -26,8 +26,7 @@ _NUM_STIMULUS_LEVELS = 25
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
     """Return the probability of a correct answer at stimulus levels >= 0 (two intervals)."""
-    d = (level / threshold) ** slope
-    return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
+    return 0.5 * lapse + (1.0 - lapse) * ndtr((level / threshold) ** slope / math.sqrt(2.0))
 
 
 class EstimateWithLimits(NamedTuple):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import polars as pl
 from scipy.special import stdtrit
 
 from drake_teleop.common.files import write_picture, write_table
@@ -16,7 +17,6 @@ from drake_teleop.live.experiment.psychometrics import EstimateWithLimits, PsiMe
 from drake_teleop.live.experiment.store import TrialRow, TrialStore, table_schema
 
 if TYPE_CHECKING:
-    import polars as pl
     from matplotlib.axes import Axes
 
 _DRAWN_QUANTITIES = (
@@ -101,8 +101,6 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
 
 
 def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:
-    import polars as pl
-
     found = compute_results(experiment, store)
     table = pl.DataFrame(found, schema=table_schema(ResultRow), orient="row").with_columns(
         pl.col("value", "low", "high").fill_nan(None)

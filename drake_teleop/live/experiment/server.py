@@ -41,8 +41,7 @@ class ExperimentDrive(LiveDrive):
 
     def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
         for task in map(str, range(len(self._scenarios))):
-            seen = self._stations[int(task), 0].scenario
-            self._views[task] = PageScene(task, seen, forces=False)
+            self._views[task] = PageScene(task, self._stations[int(task), 0].scenario, forces=False)
         first = self._stations[0, 0]
         compile_slice_functions(first.scenario, first.load, device)
 

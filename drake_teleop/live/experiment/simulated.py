@@ -114,8 +114,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     while session.ms < 1e3 * task.interval:
         t = max(1e-3 * session.ms - _HAND_MOTION_START_S, 0.0)
         if moves_sideways:
-            ramp = min(t, 1.0)
-            displacement = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
+            displacement = {"x": observer.sway * min(t, 1.0) * math.sin(2.0 * math.pi * t)}
         else:
             share = 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))
             displacement = {"z": -observer.reach * share}

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
+from drake_teleop.load.batch import uncertainty
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
     EstimatorFit,
@@ -19,12 +20,6 @@ from drake_teleop.load.batch.total_least_squares import (
     SampleRecord,
     SolvedNormalEquations,
     total_least_squares,
-)
-from drake_teleop.load.batch.uncertainty import (
-    covariance_for_gain_errors,
-    covariance_for_random_walks,
-    covariance_for_white_noise,
-    covariance_of_solution,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.normal_equations import (
@@ -92,8 +87,7 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
         return fit
-    theta = consistent_least_squares(gram, right, theta)
-    return replace(fit, form=fit.form._replace(theta=theta))
+    return replace(fit, form=fit.form._replace(theta=consistent_least_squares(gram, right, theta)))
 
 
 def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -207,12 +201,12 @@ def identify_batch(
     theta, Z = fit.form.theta, fit.moments.mean_products
     walk = np.square(np.broadcast_to(options.noise.walk, 12))
     steps = residual_covariance(np.diag(np.pad(walk, (1, 6))), theta)
-    covariance = covariance_for_white_noise(plain.covariance, equations, fit)
-    covariance = covariance + covariance_for_random_walks(record, kept, fit, steps)
-    covariance = covariance_of_solution(covariance, fit.form, offsets)
+    covariance = uncertainty.covariance_for_white_noise(plain.covariance, equations, fit)
+    covariance = covariance + uncertainty.covariance_for_random_walks(record, kept, fit, steps)
+    covariance = uncertainty.covariance_of_solution(covariance, fit.form, offsets)
     if gain_std > 0.0:
         known = np.isfinite(np.diag(covariance))
-        gain_covariance = gain_std**2 * covariance_for_gain_errors(fit, offsets)
+        gain_covariance = gain_std**2 * uncertainty.covariance_for_gain_errors(fit, offsets)
         covariance += np.outer(known, known) * gain_covariance
     identification = replace(
         plain,

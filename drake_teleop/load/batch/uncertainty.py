@@ -10,17 +10,11 @@ from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.load import identification
 from drake_teleop.load.batch.total_least_squares import (
     EstimatorFit,
     SampleRecord,
     SolvedNormalEquations,
-)
-from drake_teleop.load.identification import (
-    MAX_IDENTIFIED_STD_SHARE,
-    PARAMETER_NAMES,
-    Identification,
-    mark_undetermined,
-    natural_scales,
 )
 from drake_teleop.load.normal_equations import (
     SAMPLES_PER_CHUNK,
@@ -36,7 +30,6 @@ _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
 CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
-_PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
 # coefficient that is rounding.
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_COMBINATION_COEFFICIENT = 1e-12, 1e-6
@@ -44,7 +37,7 @@ _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_COMBINATION_COEFFICIENT = 1e-12, 1e-6
 _MIN_TERM_SHARE_WITH_NUMBER, _MIN_TERM_SHARE_AS_ELLIPSIS = 0.1, 0.01
 
 
-def confidence_intervals(load: Identification) -> tuple[Array, Array]:
+def confidence_intervals(load: identification.Identification) -> tuple[Array, Array]:
     """Return lower and upper ends (16,) of the 95 % confidence intervals of [offsets; phi]."""
     degrees = np.minimum(load.degrees_of_freedom, _MAX_DEGREES_OF_FREEDOM)
     half = stdtrit(degrees, 0.5 + 0.5 * 0.95) * load.standard_deviations
@@ -75,7 +68,7 @@ class ParameterCombination:
     text: str
 
     def __str__(self) -> str:
-        unit = _PARAMETER_UNITS[self.leading_index]
+        unit = identification.PARAMETER_UNITS[self.leading_index]
         return f"{self.text} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
@@ -102,7 +95,10 @@ class BaseParameters:
         several = (c for c in self.combinations if np.count_nonzero(c.coefficients) > 1)
         lines += [f"only together: {c}" for c in several]
         for c in self.weak_directions:
-            if np.count_nonzero(c.coefficients) == 1 or c.relative_std > MAX_IDENTIFIED_STD_SHARE:
+            if (
+                np.count_nonzero(c.coefficients) == 1
+                or c.relative_std > identification.MAX_IDENTIFIED_STD_SHARE
+            ):
                 percent = 100.0 * c.relative_std
                 share = f"{percent:.0f} % of" if percent < 100.0 else "more than"
                 lines.append(f"weak: {c} ({share} the natural scale of the load)")
@@ -117,7 +113,7 @@ class BaseParameters:
 def base_parameters(equations: SecondMoments) -> BaseParameters:
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
-    covariance, natural = equations.covariance(), natural_scales(load.phi)
+    covariance, natural = equations.covariance(), identification.natural_scales(load.phi)
     unexcited = equations.unexcited_columns
 
     def scaled_combination(coefficients: Array, leading: int) -> ParameterCombination:
@@ -152,19 +148,19 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
         c = np.zeros(16)
         c[weak] = direction / natural[weak]
         directions.append(scaled_combination(c, int(weak[np.argmax(np.abs(direction))])))
-    names = tuple(PARAMETER_NAMES[i] for i in np.flatnonzero(unexcited))
+    names = tuple(identification.PARAMETER_NAMES[i] for i in np.flatnonzero(unexcited))
     slow = tuple(CHANNEL_NAMES[i] for i in np.flatnonzero(equations.has_slow_noise()))
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
 def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
-    text = PARAMETER_NAMES[leading]
+    text = identification.PARAMETER_NAMES[leading]
     for i in np.flatnonzero(weights >= _MIN_TERM_SHARE_WITH_NUMBER):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
-            text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETER_NAMES[i]}"
+            text += f" {'-' if c < 0.0 else '+'} {size}{identification.PARAMETER_NAMES[i]}"
     small = (weights < _MIN_TERM_SHARE_WITH_NUMBER) & (weights >= _MIN_TERM_SHARE_AS_ELLIPSIS)
     return text + " + ..." if small.any() else text
 
@@ -188,7 +184,7 @@ def covariance_for_white_noise(
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
     covariance = inverse @ (fit.moments.num_samples * normal_equations(Z, of_sums)[0]) @ inverse
-    return mark_undetermined(covariance, np.isinf(np.diag(least_squares_covariance)))
+    return identification.mark_undetermined(covariance, np.isinf(np.diag(least_squares_covariance)))
 
 
 def _inverse_gram(fit: EstimatorFit) -> Array:
@@ -257,4 +253,4 @@ def covariance_of_solution(
         covariance -= covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
     covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
-    return mark_undetermined(covariance, unknown | form.is_undetermined)
+    return identification.mark_undetermined(covariance, unknown | form.is_undetermined)

@@ -286,8 +286,7 @@ def fit_noise_floor(
     noise, per_acceleration = np.sqrt(fitted[:, 0]), np.sqrt(fitted[:, 1:])
     floor = NoiseFloor(noise, P, per_acceleration, np.eye(6), np.zeros(6), fade=fade)
     scaled = rows[0] / floor.noise_std_along(*rows[1:])
-    deviations = np.sqrt(np.mean(scaled**2, axis=0))
-    scales = np.maximum(deviations, 1e-6)
+    scales = np.maximum(np.sqrt(np.mean(scaled**2, axis=0)), 1e-6)
     power = scaled.T @ scaled / len(scaled) / np.outer(scales, scales)
     # Keeps the correlation positive definite if a channel has no independent noise.
     correlation = 0.999 * power + 0.001 * np.eye(6)

@@ -153,8 +153,7 @@ def _update_filter(memory, filter_start, block, noise):
         copy_into(memory, filter_start, before, 0, 272)
     else:
         root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
-        estimate = memory[filter_start : filter_start + 272]
-        update_estimate_by_block_mean(estimate, V, wrench, root)
+        update_estimate_by_block_mean(memory[filter_start : filter_start + 272], V, wrench, root)
     return chi
 
 

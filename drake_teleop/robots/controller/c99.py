@@ -38,20 +38,10 @@ def c_kernel_text() -> str:
     c.translate_function(step.reading_problem, values=values, largest=values, limits=(6,))
     factors = dict.fromkeys(("sigma_weight", "sigma_inertia", "gamma"), "double")
     c.translate_function(step.set_scale_factors_into, **factors, scales=(4,))
-    c.translate_function(
-        step.contact_and_scaled_wrench_into,
-        values=values,
-        gravity=(3,),
-        offsets=(6,),
-        phi=(10,),
-        no_load=(10,),
-        scales=(4,),
-        low_pass=("low_pass_count",),
-        memory=(2, *out),
-        rest=(1, *row),
-        at="int",
-        out=out,
-    )
+    arrays: dict[str, Any] = {"values": values, "gravity": (3,), "offsets": (6,), "phi": (10,)}
+    arrays |= {"no_load": (10,), "scales": (4,), "low_pass": ("low_pass_count",)}
+    arrays |= {"memory": (2, *out), "rest": (1, *row), "at": "int", "out": out}
+    c.translate_function(step.contact_and_scaled_wrench_into, **arrays)
     c.translate_function(step.clip_wrenches, wrenches=out, limits=(6,))
     moments: dict[str, Any] = {"count": "double", "mean": row, "squares": row}
     c.translate_function(step.add_to_statistics, row=row, **moments)

@@ -11,14 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, replace_file_on_success
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import notes_on_undetermined_load
-from drake_teleop.robots.controller.c99 import (
-    ControllerTarget,
-    Files,
-    c99_files,
-    kernel_files,
-    read_template,
-    render_template,
-)
+from drake_teleop.robots.controller import c99
 from drake_teleop.robots.controller.fmu import fmu_files
 from drake_teleop.robots.export import refuse_removed_weight, unused_sensor_pose_error
 
@@ -26,7 +19,7 @@ _FILTER_NAME = "wrench_compensator_filter"
 _FILTER_TEMPLATE_FOLDER = "ros2_filter"
 
 
-def ros2_filter_files(target: ControllerTarget) -> Files:
+def ros2_filter_files(target: c99.ControllerTarget) -> c99.Files:
     """Return the files of a ROS 2 package with a filter of wrenches."""
     shipped = {
         f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
@@ -34,20 +27,20 @@ def ros2_filter_files(target: ControllerTarget) -> Files:
         "CMakeLists.txt": "CMakeLists.txt",
         f"src/{_FILTER_NAME}.cpp": f"{_FILTER_NAME}.cpp",
     }
-    kernel = dict(kernel_files(target))
+    kernel = dict(c99.kernel_files(target))
     sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
     folder = _FILTER_TEMPLATE_FOLDER
     return {
-        **{name: read_template(f"{folder}/{file}") for name, file in shipped.items()},
+        **{name: c99.read_template(f"{folder}/{file}") for name, file in shipped.items()},
         **{f"src/{name}": text for name, text in kernel.items()},
-        "README.md": render_template(f"{folder}/README.md", **values),
+        "README.md": c99.render_template(f"{folder}/README.md", **values),
     }
 
 
-CONTROLLER_FORMATS: dict[str, Callable[[ControllerTarget], Files]] = {
-    "c99": c99_files,
+CONTROLLER_FORMATS: dict[str, Callable[[c99.ControllerTarget], c99.Files]] = {
+    "c99": c99.c99_files,
     "fmu": fmu_files,
     "ros2_filter": ros2_filter_files,
 }
@@ -79,7 +72,7 @@ def export_controller(
     if largest is None:
         notes.append("no range of the sensor was given: saturation is not detected")
     whole = None if largest is None else np.repeat(np.array(largest, float), 3)
-    target = ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
+    target = c99.ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
     for name, content in CONTROLLER_FORMATS[to](target).items():
         path = out / name
         make_folder(path.parent)

@@ -13,13 +13,7 @@ from uuid import NAMESPACE_URL, uuid5
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.version import __version__
-from drake_teleop.robots.controller.c99 import (
-    CFLAGS,
-    ControllerTarget,
-    Files,
-    kernel_files,
-    read_template,
-)
+from drake_teleop.robots.controller import c99
 from drake_teleop.robots.export import indented_xml
 
 _MODEL_NAME, _XML_HEAD = "wrench_compensator", '<?xml version="1.0" encoding="UTF-8"?>\n'
@@ -37,16 +31,16 @@ _UNIT_EXPONENTS = {
 _PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
-def fmu_files(target: ControllerTarget) -> Files:
+def fmu_files(target: c99.ControllerTarget) -> c99.Files:
     """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
     is_linux64 = platform.system() == "Linux" and platform.machine() == "x86_64"
     compiler = shutil.which("cc") if is_linux64 else None
     if compiler is None:
         target.notes.append("the FMUs contain sources only: there is no C compiler for linux64")
-    kernel = dict(kernel_files(target))
+    kernel = dict(c99.kernel_files(target))
     token = str(uuid5(NAMESPACE_URL, "".join(map(str, kernel.values()))))
     kernel["token.h"] = f'#define TOKEN "{token}"\n'
-    kernel["fmu.h"] = read_template("fmu.h")
+    kernel["fmu.h"] = c99.read_template("fmu.h")
     return {
         f"{_MODEL_NAME}_fmi{version[0]}.fmu": _fmu_archive(target, kernel, version, token, compiler)
         for version in ("2.0", "3.0")
@@ -54,9 +48,9 @@ def fmu_files(target: ControllerTarget) -> Files:
 
 
 def _fmu_archive(
-    target: ControllerTarget, kernel: Files, version: str, token: str, cc: str | None
+    target: c99.ControllerTarget, kernel: c99.Files, version: str, token: str, cc: str | None
 ) -> bytes:
-    sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
+    sources = {**kernel, f"fmi{version[0]}.c": c99.read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
     compiled = [name for name in sources if name.endswith(".c")]
     files["modelDescription.xml"] = _model_description(target, version, token, compiled)
@@ -77,19 +71,18 @@ def _fmu_archive(
     return content.getvalue()
 
 
-def _compile_library(compiler: str, sources: Files, compiled: list[str]) -> bytes:
+def _compile_library(compiler: str, sources: c99.Files, compiled: list[str]) -> bytes:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in sources.items():
             (folder / file).write_text(str(text), encoding="utf-8")
-        options = [*CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
-        command = [compiler, *options, *compiled, "-o", "library.so"]
-        subprocess.run(command, cwd=folder, check=True)
+        options = [*c99.CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
+        subprocess.run([compiler, *options, *compiled, "-o", "library.so"], cwd=folder, check=True)
         return (folder / "library.so").read_bytes()
 
 
 def _model_description(
-    target: ControllerTarget, version: str, token: str, compiled: list[str]
+    target: c99.ControllerTarget, version: str, token: str, compiled: list[str]
 ) -> str:
     new = version == "3.0"
     root = Element(
@@ -140,7 +133,7 @@ def _model_description(
     return _XML_HEAD + indented_xml(root)
 
 
-def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, float | None]]:
+def _model_variables(target: c99.ControllerTarget) -> list[tuple[str, str, str, float | None]]:
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_COMPONENT_NAMES]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]

@@ -81,8 +81,7 @@ class Translator:
         if key not in self._functions:
             uses = sum(known[0] is function for known in self._functions)
             name = function.py_func.__name__ + (f"_{uses + 1}" if uses else "")
-            made = _FunctionTranslation(self, function.py_func, name, parameters)
-            self._functions[key] = made
+            self._functions[key] = _FunctionTranslation(self, function.py_func, name, parameters)
         return self._functions[key]
 
 
