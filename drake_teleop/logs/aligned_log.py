@@ -310,9 +310,11 @@ def _physically_consistent_theta(found: PoseEstimate) -> Array:
 def _note_on_disturbances_clock_and_misfit(found: PoseEstimate, gain_std: float) -> str:
     notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
     if not found.fit.is_explained_by_gains:
-        gains = f"gains beyond {gain_std:g}, " if gain_std else "gains (state wrench.gain_std), "
+        verb, beyond = ("increase", " beyond the stated") if gain_std else ("state", "")
         notes.append(
-            f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
-            f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"
+            "the wrench is not that of a rigid load alone, which increases all standard deviations"
+            f" {found.fit.std_inflation_by_misfit:.2g} times (possible causes: gain errors{beyond},"
+            f" bending, or a pose frame that is not S); {verb} wrench.gain_std, or correct the"
+            " frame of the pose"
         )
     return "; ".join(notes)

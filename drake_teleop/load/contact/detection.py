@@ -125,7 +125,7 @@ def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUS
 
 
 @njit(cache=True)
-def _normalized_sum_of_last_innovations(memory, hold, widths):
+def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
     m = 0
     while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
         m += 1
@@ -136,7 +136,7 @@ def _normalized_sum_of_last_innovations(memory, hold, widths):
     for i in range(6):
         difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
         total += difference * difference
-    return math.sqrt(total / (1 << m)) / widths[m]
+    return math.sqrt(total / (1 << m)) / sum_widths[m]
 
 
 @njit(cache=True)
@@ -151,7 +151,7 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
     else:
         quiet = memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
         memory[QUIET_SAMPLES_INDEX] = quiet
-        if quiet > hold and _normalized_sum_of_last_innovations(memory, hold, widths) < leave:
+        if quiet > hold and _norm_of_innovation_sum_within_hold(memory, hold, widths) < leave:
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[FLAG_INDEX] = 0.0
             memory[CUSUM_START:] = 0.0

@@ -99,8 +99,8 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
         return Finding(
             "swapped axes",
-            f"{text}: its x, y, z should be its {', '.join(axis_names_of_rows(P))}; correct"
-            " imu.angular_velocity.columns, and signs by imu.angular_velocity.scale",
+            f"{text}: the correct x, y, z are the present {', '.join(axis_names_of_rows(P))};"
+            " reorder imu.angular_velocity.columns, and set signs by imu.angular_velocity.scale",
         ), description
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
     finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
@@ -121,8 +121,8 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     return Finding(
         "swapped axes",
         "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axis_names_of_rows(best))}; correct"
-        " imu.angular_acceleration.columns, or remove it",
+        f" the gyroscope's {', '.join(axis_names_of_rows(best))}; reorder"
+        " imu.angular_acceleration.columns, or remove imu.angular_acceleration",
     )
 
 

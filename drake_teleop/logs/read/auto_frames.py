@@ -108,8 +108,8 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
         lever = max(arms, key=lambda arm: int(arm.is_determined_by_axis.sum()), default=None)
     if lever is None:
         raise DrakeTeleopError(
-            "the data do not determine the position of the accelerometer: no position of"
-            " the pose agrees with it, and the wrench contains more than the load",
+            "pose and wrench do not determine the position of the accelerometer: the pose has no"
+            " positions or disagrees with the IMU, and the load alone does not explain the wrench",
             where=where,
             remedy="give imu.position in metres, or pose.position",
         )

@@ -62,13 +62,13 @@ def NonContactWrench_(T: Any) -> Any:
             self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORT_NAMES]
             self._load = self.DeclareVectorInputPort("load", 10)
             inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-            calculate = weak_callback(self._calc)
+            calculate = weak_callback(self._calc_non_contact_wrench)
             self.DeclareVectorOutputPort("non_contact_wrench_S", 6, calculate, inputs)
 
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
             Impl._construct(self, other._phi, converter=converter)
 
-        def _calc(self, context: Any, output: Any) -> None:
+        def _calc_non_contact_wrench(self, context: Any, output: Any) -> None:
             if self._load.HasValue(context):
                 phi = self._load.Eval(context)
             else:

@@ -43,8 +43,11 @@ class JointFriction(LeafSystem):
         self._constants = coulomb, index
         self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
         self.DeclareVectorOutputPort(
-            "generalized_force", velocities, weak_callback(self._calc), {self._state.ticket()}
+            "generalized_force",
+            velocities,
+            weak_callback(self._calc_friction_force),
+            {self._state.ticket()},
         )
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
         _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())

@@ -181,9 +181,9 @@ class PositionServo(LeafSystem):
         self.DeclareStateOutputPort("joint_torque", holding)
         memory = np.concatenate([[0.0, 0.0], q_start, q_start, np.zeros(n), *(queued * [q_start])])
         self.DeclareDiscreteState(memory)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_servo_state)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_servo_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         inputs = self._command.Eval(context), self._state.Eval(context)
         torque, memory = (discrete_state.get_mutable_value(group) for group in range(2))
         position_servo_torque_into(self._arm, *inputs, *self._constants, memory, torque)
