@@ -556,7 +556,7 @@ def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
         f"{', '.join(names)} of the load are not identified: {effect}"
         for names, effect in (
             (moments, "their errors are in the contact wrench; identify the load again"),
-            (phi_with_inertia_replaced(load)[1], "those of a point mass are used"),
+            (phi_with_inertia_replaced(load)[1], "the values of a point mass are used"),
         )
         if names
     )

@@ -44,7 +44,7 @@ class PositionInterface:
         40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
     )
     drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "of the drives; sets joint stiffness"
+        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"
     )
 
     def check(self, where: str, rate: float) -> None:
