@@ -192,10 +192,10 @@ def input_range(name: str) -> tuple[int, int]:
     return (0, len(METHODS) - 1) if name == "method" else INPUT_RANGES[name]
 
 
-_VERSION = {"drake_teleop": __version__}
+_WRITER_PACKAGE_AND_VERSION = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _VERSION) -> str:
+def csv_header(made_by: Mapping[str, str] = _WRITER_PACKAGE_AND_VERSION) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -206,7 +206,9 @@ def csv_row(ms: int, inputs: Inputs) -> str:
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
-def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
+def read_inputs(
+    path: Path, made_by: Mapping[str, str] = _WRITER_PACKAGE_AND_VERSION
+) -> list[tuple[int, Inputs]]:
     """Return the recorded times [ms] and inputs of each change; the last is the end.
 
     Raise DrakeTeleopError if the file is invalid, or if its versions differ from `made_by`.

@@ -43,7 +43,7 @@ _MIN_BLOCK_OVER_CORRELATION, _MIN_DOF_OF_VARIANCE = 4.0, 8.0
 # fit's degrees of freedom that the blocks contain.
 _MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
-_SAME_POSE_WITHIN_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
+_SAME_POSE_DISTANCE_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
 _MAX_ROUNDING_RESIDUAL = 1e-6
 # Indices of wrench, specific force and products w_i w_j in z.
@@ -270,7 +270,7 @@ class SecondMoments:
         blocks = self._blocks[: self._state[0] + 1]
         count = blocks[:, 0]
         s = blocks[:, _SPECIFIC_FORCE_COLUMNS] / count[:, None]
-        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_WITHIN_M_S2).argmax(axis=1)
+        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_DISTANCE_M_S2).argmax(axis=1)
         groups = (np.unique(first)[:, None] == first).astype(float)
         sums = groups @ (blocks[:, _WRENCH_COLUMNS] - _regressors_of_blocks(blocks) @ theta)
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))

@@ -279,10 +279,12 @@ def _batch_result_of_estimate(
     )
     notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
     if not found.fit.is_explained_by_gains:
-        gains = f"gains beyond {gain_std:g}, " if gain_std else "gains (state wrench.gain_std), "
+        verb, beyond = ("increase", " beyond the stated") if gain_std else ("state", "")
         notes.append(
-            f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
-            f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"
+            "the wrench is not that of a rigid load alone, which increases all standard deviations"
+            f" {found.fit.std_inflation_by_misfit:.2g} times (possible causes: gain errors{beyond},"
+            f" bending, or a pose frame that is not S); {verb} wrench.gain_std, or correct the"
+            " frame of the pose"
         )
     return BatchResult(load, noise, rejected, "; ".join(notes), equations)
 

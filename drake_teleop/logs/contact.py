@@ -233,7 +233,8 @@ def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, 
         return ()
     return (
         f"the offsets of the record differ by {force:.2g} N from those of the free motion: either"
-        " the sensor drifted, or most of the record is contact, which changes the offsets",
+        " the sensor drifted, or most of the record is contact, which changes the offsets; tare the"
+        " sensor before recording, or record less contact",
     )
 
 

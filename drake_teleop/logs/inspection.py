@@ -305,7 +305,8 @@ def _inspect_clock_and_flag_usable_rows(
         where = float(t[int(np.argmax(steps))] - t[0])
         text = (
             f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s: rows are missing or"
-            " the clock jumped; the motion there is not used"
+            " the clock jumped; the motion there is not used: record again"
+            " if it matters"
         )
         findings.append(Finding("gap", text))
     if back:

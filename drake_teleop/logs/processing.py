@@ -54,7 +54,7 @@ from drake_teleop.logs.read.alignment import (
     remove_delay,
 )
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.reading import MIN_BANDWIDTH_HZ, read_log
+from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
@@ -227,8 +227,8 @@ def identify_log(
 
 def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
     expect_type((str, Path), path, "log", "give the file's name")
-    if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_BANDWIDTH_HZ:
-        remedy = f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for no filter"
+    if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_CUTOFF_HZ:
+        remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no filter"
         raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where="cutoff_hz", remedy=remedy)
 
 
@@ -528,7 +528,7 @@ def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
         f"{', '.join(names)} of the load are not identified: {effect}"
         for names, effect in (
             (moments, "their errors are in the contact wrench; identify the load again"),
-            (phi_with_inertia_replaced(load)[1], "those of a point mass are used"),
+            (phi_with_inertia_replaced(load)[1], "the values of a point mass are used"),
         )
         if names
     )

@@ -112,7 +112,10 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
         if is_written and verdict != "identified"
     ]
     if not format.inertia:
-        warnings.append(f"{to} has no field for the inertia: inertial wrenches remain")
+        warnings.append(
+            f"{to} has no field for the inertia, so torques of fast rotations are not compensated;"
+            " rotate slowly"
+        )
     if not found.physically_consistent:
         remedy = "`identify --method consistent` corrects it"
         warnings.append(f"the load is not physically consistent; {remedy}")

@@ -36,7 +36,8 @@ from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
-Warnings = Iterator[tuple[str, Spans]]
+Warnings = Iterator[tuple[str, Spans, str]]
+"""Condition, time spans and advice of each warning."""
 
 _MIN_WARNING_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
@@ -63,6 +64,7 @@ _MIN_FORCE_OSCILLATION_CYCLES = 4
 _MIN_POWER_SHARE_OF_OSCILLATION = 0.5
 # Largest number of time spans that a warning lists; further ones are counted.
 _MAX_LISTED_SPANS = 3
+_REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
@@ -80,7 +82,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_rendered_force_oscillation(result),
     )
     overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
-    texts = [f"{condition} {_spans_text(spans)}" for condition, spans in found if spans]
+    texts = [f"{text} {_spans_text(x)}{note and '; '}{note}" for text, x, note in found if x]
     return [*overlaps, *texts]
 
 
@@ -116,16 +118,18 @@ def _check_faults(result: SimulationResult) -> Warnings:
     for fault, meaning in FAULT_WARNINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))
-            yield f"a fault: {meaning},", find_spans(t, happened)
+            yield f"a fault: {meaning},", find_spans(t, happened), ""
 
 
 def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     t, flag = result.t, result["saturated"][:, 0]
-    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
+    spans = find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
+    yield "the wrist sensor saturates", spans, "move more slowly, or use larger sensor ranges"
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
-            yield f"inverse kinematics: {status.name}", find_spans(t, happened)
+            advice = "use smaller or slower motions, or another start posture"
+            yield f"inverse kinematics: {status.name}", find_spans(t, happened), advice
     control = scenario.joint_control
     checked = [("torque", result["joint_torque"], arm.effort_limit)]
     if "joint_command" in result:
@@ -137,7 +141,8 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
     for what, values, limit in checked:
         clipped = np.abs(values) >= _SHARE_AT_LIMIT * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
-            yield f"joint {joint + 1} is at its largest {what}", find_spans(t, clipped[:, joint])
+            spans, advice = find_spans(t, clipped[:, joint]), "use smaller or slower motions"
+            yield f"joint {joint + 1} is at its largest {what}", spans, advice
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
@@ -148,14 +153,16 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         elif device.peak_torque.all():
             full |= _is_torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
-        yield "the device displays its largest force or torque", spans
+        yield "the device displays its largest force or torque", spans, _REDUCE_FORCE_ADVICE
         ended = device.is_any_axis_at_end_stop(result["master_state"][:, : device.num_joints])
-        yield "the device is at the end of its workspace", find_spans(t, ended)
+        advice = "use smaller motions, or increase kinematic_scaling.translation_scale"
+        yield "the device is at the end of its workspace", find_spans(t, ended), advice
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
         bent = scenario.first_sheet_spring.max_linear_deflection
         yield (
             f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
             find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),
+            "reduce the contact force",
         )
 
 
@@ -165,7 +172,8 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
         spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_WARNING_SPAN_S)
-        yield f"the {end}'s end is in its safe state, no packets arrive from the {other},", spans
+        text = f"the {end}'s end is in its safe state, no packets arrive from the {other},"
+        yield text, spans, "check loss, delay and timeout of the channel"
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
@@ -178,11 +186,13 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
             " more than its delay explains,",
             spans,
+            "move more slowly, or use another passivity method",
         )
     yield from _check_reserve_speed_limit(result, scenario)
     oscillating = flag_pose_oscillation(t, sent, received, MAX_REVERSAL_DELAY_S + window)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
-    yield f"the channel ({by}) makes the slave's command oscillate", spans
+    advice = "use another passivity method or network"
+    yield f"the channel ({by}) makes the slave's command oscillate", spans, advice
 
 
 def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> Warnings:
@@ -214,10 +224,10 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
             f" {speed_unit}, and the command moves at up to {speed[held].max():.2g}:"
             f" for {100 * held.mean():.0f} % of the time"
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
-            " pose (move more slowly, or increase the energy:"
-            f" passivity.{scenario.passivity.method}.reserve"
-            f" {_format_list(enough)} and initial {_format_list(enough + config.hand_reserve)}),",
+            " pose,",
             find_spans(t, held),
+            f"move more slowly, or increase passivity.{scenario.passivity.method}.reserve"
+            f" {_format_list(enough)} and initial {_format_list(enough + config.hand_reserve)}",
         )
 
 
@@ -249,17 +259,19 @@ def _check_joints(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         spans = find_spans(t, far > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
-        yield f"joint {k + 1} is up to {way} behind its command", spans
+        advice = "move more slowly, or increase the bandwidth of joint_control"
+        yield f"joint {k + 1} is up to {way} behind its command", spans, advice
     oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_OSCILLATION_RAD)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
-    yield "the slave oscillates while its command does not,", spans
+    advice = "change the bandwidth of joint_control, or damp the touched object"
+    yield "the slave oscillates while its command does not,", spans, advice
 
 
 def _check_hand_oscillation(result: SimulationResult) -> Warnings:
     if "intent" in result and "pose_master" in result:
         oscillating = flag_pose_oscillation(result.t, result["intent"], result["pose_master"])
         spans = find_spans(result.t, oscillating, _MIN_WARNING_SPAN_S)
-        yield "the hand oscillates while its intent does not,", spans
+        yield "the hand oscillates while its intent does not,", spans, _REDUCE_FORCE_ADVICE
 
 
 def _check_contact_chatter(result: SimulationResult) -> Warnings:
@@ -272,10 +284,10 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
             f"contact chatter of the tool: {sum(each.num_touches for each in found)} touches at"
-            f" {worst.rate_hz:.2g} Hz with up to {worst.peak_force:.3g} N (damp the touched object:"
-            " dissipation of its surface or damping of its joint; or reduce"
-            " force_scaling.force_scale or kinematic_scaling.translation_scale),",
+            f" {worst.rate_hz:.2g} Hz with up to {worst.peak_force:.3g} N",
             [(chatter.start, chatter.stop) for chatter in found],
+            "increase dissipation of the touched surface or damping of its joint, or reduce"
+            " force_scaling.force_scale or kinematic_scaling.translation_scale",
         )
 
 
@@ -305,9 +317,9 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     ledger = ", or increase passivity.ledger.initial with ledger" if over_network else ""
     yield (
         f"the rendered force oscillates at {frequency:.2g} Hz with up to"
-        f" {_maximum_within_spans(t, rms, spans):.2g} N rms while the hand rests (reduce"
-        f" force_scaling.gamma or force_scale{ledger}),",
+        f" {_maximum_within_spans(t, rms, spans):.2g} N rms while the hand rests",
         spans,
+        f"{_REDUCE_FORCE_ADVICE}{ledger}",
     )
 
 

@@ -128,16 +128,16 @@ class Scenario:
     @property
     def surroundings(self) -> Environment | None:
         """All objects that the tool can touch as one `Environment`, or None."""
-        things = self._touchables
+        things = self._environments
         return SeveralObjects(things) if len(things) > 1 else next(iter(things), None)
 
     @property
     def first_sheet_spring(self) -> SheetSpring | None:
         """Sheet spring from `sheet_spring` or `environment`, or None."""
-        return next((thing for thing in self._touchables if isinstance(thing, SheetSpring)), None)
+        return next((thing for thing in self._environments if isinstance(thing, SheetSpring)), None)
 
     @property
-    def _touchables(self) -> list[Environment]:
+    def _environments(self) -> list[Environment]:
         own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
         return [*own, *self.environment]
 
@@ -167,7 +167,7 @@ class Scenario:
         for index, thing in enumerate(self.environment):
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
-            if sum(isinstance(thing, kind) for thing in self._touchables) > 1:
+            if sum(isinstance(thing, kind) for thing in self._environments) > 1:
                 what = f"the scenario has more than one {name} (one is permitted)"
                 raise DrakeTeleopError(what, where=f"{where}:environment", remedy="keep one")
         _check_task(self, where)

@@ -45,10 +45,10 @@ _JOINT_SIGNAL_NAMES = ("joint_position", "joint_torque", "joint_command")
 SIGNALS = {
     name: _signal(name, components, units, description)
     for name, (components, units), description in (
-        ("measured_wrench_S", _WRENCH_COMPONENTS, "of the sensor, sign of Eq. (1), at sample_time"),
+        ("measured_wrench_S", _WRENCH_COMPONENTS, "sensor's wrench, Eq. (1), at sample_time"),
         ("specific_force_S", ("s_x s_y s_z", "m/s^2"), "a - g at So, at sample_time"),
-        ("angular_velocity_S", ("omega_x omega_y omega_z", "rad/s"), "of S, at sample_time"),
-        ("angular_acceleration_S", ("alpha_x alpha_y alpha_z", "rad/s^2"), "of S, at sample_time"),
+        ("angular_velocity_S", ("omega_x omega_y omega_z", "rad/s"), "omega at sample_time"),
+        ("angular_acceleration_S", ("alpha_x alpha_y alpha_z", "rad/s^2"), "alpha at sample_time"),
         ("saturated", ("saturated", "1"),
          "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after a"
          " lost reading"),
@@ -64,21 +64,21 @@ SIGNALS = {
         ("true_contact_wrench_W", _WRENCH_COMPONENTS, "environment on the tool, about Wo, in W"),
         ("sheet_state", ("z v_z", "m,m/s"), "deflection of the sheet spring's end, upwards"),
         ("intent", _POSE_COMPONENTS, "intended pose of the stylus, X_BE"),
-        ("hand_wrench_E", _WRENCH_COMPONENTS, "hand on the stylus at Eo, in B"),
+        ("hand_wrench_E", _WRENCH_COMPONENTS, "wrench of the hand on the stylus at Eo, in B"),
         ("master_state", _joint_state_components(6), "joint angles and velocities of the device"),
-        ("pose_master", _POSE_COMPONENTS, "of the stylus, X_BE"),
-        ("twist_master", _TWIST_COMPONENTS, "of the stylus in the device's base"),
+        ("pose_master", _POSE_COMPONENTS, "pose X_BE of the stylus"),
+        ("twist_master", _TWIST_COMPONENTS, "twist of the stylus in the device's base"),
         ("pose_command", _POSE_COMPONENTS, "setpoint of the slave, X_WS"),
-        ("joint_command", _joint_components(6, "rad"), "from the inverse kinematics"),
-        ("ik_status", ("status", "1"), "of the inverse kinematics (IkStatus), 0 = OK"),
+        ("joint_command", _joint_components(6, "rad"), "setpoints of the joints"),
+        ("ik_status", ("status", "1"), "IkStatus of the inverse kinematics, 0 = OK"),
         ("scaled_wrench_S", _WRENCH_COMPONENTS, "F' of Fig. 2, before the scale to the master"),
         ("contact_wrench_S", _WRENCH_COMPONENTS, "Eq. (13), calculated contact wrench"),
-        ("fault", ("fault", "1"), "of sample or load estimate, 0 = none"),
+        ("fault", ("fault", "1"), "fault of sample or load estimate, 0 = none"),
         ("force_to_master", _WRENCH_COMPONENTS,
          "wrench that the device displays, within its limits"),
-        ("fault_at_hand", ("fault", "1"), "of the wrench command at the device, 0 = none"),
+        ("fault_at_hand", ("fault", "1"), "fault of the wrench command at the device, 0 = none"),
         ("task_state", ("phase outcome noticed threshold trust", "1,1,1,N,1"),
-         "of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
+         "state of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
          " smallest detected force at the hand; share of approach_speed (docs/operator.md)"),
         ("pose_received", _POSE_COMPONENTS, "setpoint X_WS of the slave after the channel"),
         ("ports", _CHANNEL_PORT_COMPONENTS,

@@ -34,7 +34,7 @@ class SteppedBlock(DoubleOnly, LeafSystem):
         step = self.DeclareCacheEntry("step", producer, sources)
         self._step = step.cache_index()  # the entry itself would keep the block alive
         self._after_step = {step.ticket()}
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_step_results)
 
     def _declare_output(self, name: str, result: int, part: slice) -> None:
         """Declare an output port with `part` of the step's result of index `result`."""
@@ -59,6 +59,6 @@ class SteppedBlock(DoubleOnly, LeafSystem):
         results: list[Array] = self.get_cache_entry(self._step).Eval(context)
         return results
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_step_results(self, context: Context, discrete_state: DiscreteValues) -> None:
         for state, index in zip(self._step_results(context), self._states, strict=False):
             discrete_state.set_value(index, state)

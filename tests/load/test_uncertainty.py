@@ -164,7 +164,10 @@ def test_slow_noise_is_reported():
     walk = np.cumsum(white, axis=0) / np.sqrt(len(white))
     drifting = slow(np.where(np.arange(6) == 4, white + 30.0 * walk, white))
     assert drifting.channels_with_slow_noise == ("tau_y",)
-    assert drifting.text_lines()[-1] == "drift or slow noise in tau_y: all +- are lower bounds"
+    last = (
+        "drift or slow noise in tau_y: all +- are lower bounds; let the sensor warm up, and record"
+    )
+    assert drifting.text_lines()[-1] == f"{last} again"
     for seed in range(20):
         noise = study.coloured_noise(np.random.default_rng(seed), len(white), "AR(1) 0.9, 1 kHz")
         assert slow(noise).channels_with_slow_noise == ()
@@ -344,9 +347,9 @@ def test_text_of_one_pose_names_the_combinations():
     assert lines[1].endswith("m c_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz")
     together = {line.split(" = ")[0] for line in lines[2:]}
     assert together == {
-        "only together: m + 0.102 f_oz",
-        "only together: m c_x - 0.102 tau_oy",
-        "only together: m c_y + 0.102 tau_ox",
+        "determined only in combination: m + 0.102 f_oz",
+        "determined only in combination: m c_x - 0.102 tau_oy",
+        "determined only in combination: m c_y + 0.102 tau_ox",
     }
 
 

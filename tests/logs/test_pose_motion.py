@@ -32,7 +32,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import use_spline_motion_and_flag_edges
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
-    _taper_without_gaps,
+    _taper_zero_in_gaps,
     estimate_from_poses,
 )
 from drake_teleop.logs.pose_motion.linear_model import (
@@ -135,7 +135,7 @@ def test_400_ms_beside_gaps_of_the_poses_and_lost_samples_have_no_weight(delay, 
     poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept])
     gap = np.searchsorted(poses.t, 7.0)
     first, last = poses.t[gap - 1] - delay, poses.t[gap] - delay
-    taper = _taper_without_gaps(WrenchGrid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
+    taper = _taper_zero_in_gaps(WrenchGrid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
     near = (t > first - 0.399) & (t < last + 0.399)
     assert (taper[near] == 0.0).all() if excluded else taper[near].min() > 0.99
     assert (taper[np.abs(t - 12.0) < 0.05] == 0.0).all()

@@ -775,7 +775,7 @@ def test_remaining_time_follows_from_the_latest_runs():
     """Runs take 2 s, four in parallel; the first two also identify a load."""
     shown = []
     counter = StudyProgress(100)
-    counter.start(lambda fraction, words="": shown.append((fraction, words)), 4)
+    counter.start_reporting(lambda fraction, words="": shown.append((fraction, words)), 4)
     counter.add_earlier_runs(20)
     assert shown == [(0.2, "20/100, the first runs begin")]
     counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST_KEY: 7.0}] * 2)
@@ -791,7 +791,7 @@ def test_remaining_time_follows_from_the_latest_runs():
 def test_repeated_identifications_count_in_the_remaining_time():
     shown = []
     counter = StudyProgress(100)
-    counter.start(lambda fraction, words="": shown.append(words), 1)
+    counter.start_reporting(lambda fraction, words="": shown.append(words), 1)
     for _ in range(40):
         counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST_KEY: 7.0}])
     assert shown[0] == "1/100, about 0:03:18 left"

@@ -98,7 +98,7 @@ def plan_station(
     shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     load = shapes.arm.phi_load[:4] - (_STAND_IN_TOOL_LOAD if tool is None else 0.0)
     axis, own_tool = _sensor_axis_along_tool(shapes, load), False
-    if tool is None and _tool_extends_beyond_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
+    if tool is None and _has_tool_beyond_sensor_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
         slave.tool, own_tool = None, True
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = find_base_plane_height(shapes)
@@ -176,11 +176,11 @@ def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
     return sensor_axis_along_last_joint(shapes.arm) or "z"
 
 
-def _tool_extends_beyond_link(shapes: PostureShapes, axis: str) -> bool:
+def _has_tool_beyond_sensor_link(shapes: PostureShapes, sensor_axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
     link_bodies = shapes.bodies_welded_to_sensor() - shapes.tool_bodies
-    link_end = extent_beyond_sensor(shapes, link_bodies, axis)
-    return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
+    link_end = extent_beyond_sensor(shapes, link_bodies, sensor_axis)
+    return extent_beyond_sensor(shapes, own_bodies, sensor_axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
 def find_base_plane_height(shapes: PostureShapes) -> float:

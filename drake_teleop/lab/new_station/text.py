@@ -28,14 +28,14 @@ def scenario_text(
     else:
         slave["home"] = plan.place.home
     comments = {
-        "slave.position": "of the sensor at the start, tool down [m]",
+        "slave.position": "sensor at the start, tool down [m]",
         "slave.home": "joints at the start, tool down [rad, m]",
         "slave.tip": "contact point, p_STip [m]",
-        "slave.torque_limits": "those of the model cannot hold the arm",
+        "slave.torque_limits": "the limits of the model cannot hold the arm",
         "kinematic_scaling": f"the arm can move {plan.place.reachable_text}",
         "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
-        "operator.intent": "of the hand: up and down, then down onto the wall",
-        "rates": "of the device",
+        "operator.intent": "hand motion: up and down, then down onto the wall",
+        "rates": "rates of the device",
     }
     if tool is not None:
         slave["tool"] = {"model": tool}

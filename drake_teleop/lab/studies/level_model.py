@@ -145,7 +145,7 @@ class LevelModel:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
             over_points = design * self._relative_std(terms)
-            halves.append(np.hypot(over_points, self._half_width_over_seeds(table, terms)))
+            halves.append(np.hypot(over_points, self._pooled_half_width_over_seeds(table, terms)))
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
@@ -188,14 +188,15 @@ class LevelModel:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
         return _student_quantile(num_intervals, self._degrees_of_freedom) * float(np.sqrt(variance))
 
-    def _half_width_over_seeds(self, table: Array, terms: Array) -> float:
+    def _pooled_half_width_over_seeds(self, table: Array, effect_rows: Array) -> float:
         seeds = table.shape[1]
         if seeds == 1:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
-        moved = np.sum((terms @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
-        noise = self._residual_variance(apart, seeds - 1) * np.sum(self._relative_std(terms) ** 2)
-        deviation = np.sqrt(max(moved - noise, 0.0) / len(terms) / seeds)
+        moved = np.sum((effect_rows @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
+        relative_variance = np.sum(self._relative_std(effect_rows) ** 2)
+        noise = self._residual_variance(apart, seeds - 1) * relative_variance
+        deviation = np.sqrt(max(moved - noise, 0.0) / len(effect_rows) / seeds)
         return _student_quantile(len(self.factors), seeds - 1) * float(deviation)
 
 
@@ -226,7 +227,7 @@ def _build_level_model(
     factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
-    failed = _find_failed_level_cells(factors, known, by_chance)
+    failed = _excluded_level_cells_of_factor_pairs(factors, known, by_chance)
     codes = [_effect_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
     columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
@@ -247,23 +248,23 @@ def _build_level_model(
     return LevelModel(factors, codes, places, failed, X, v.T / size @ u.T)
 
 
-def _find_failed_level_cells(
-    factors: list[Levels], known: BooleanArray, by_chance: bool
+def _excluded_level_cells_of_factor_pairs(
+    factors: list[Levels], has_value: BooleanArray, missing_by_chance: bool
 ) -> dict[tuple[int, int], BooleanArray]:
-    found = {}
+    excluded = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
         a, b = factors[i], factors[j]
         tried, good = np.zeros((2, len(a.names), len(b.names)))
         np.add.at(tried, (a.index, b.index), 1.0)
-        np.add.at(good, (a.index[known], b.index[known]), 1.0)
+        np.add.at(good, (a.index[has_value], b.index[has_value]), 1.0)
         failed = good == 0
-        if by_chance:
+        if missing_by_chance:
             share = good / np.maximum(tried, 1.0)
             best = np.minimum(share.max(axis=1, keepdims=True), share.max(axis=0))
             failed = (tried > 0) & (failed | (share < best / 2))
         if failed.any():
-            found[i, j] = failed
-    return found
+            excluded[i, j] = failed
+    return excluded
 
 
 def _pair_products(a: Array, b: Array) -> Array:

@@ -84,7 +84,7 @@ def run_study(
                 show_progress(progress) as stage,
                 open_executor(store, jobs, cluster, executor) as (num_workers, run_chunks),
             ):
-                counter.start(stage("Study"), num_workers)
+                counter.start_reporting(stage("Study"), num_workers)
                 new = points
                 while new:
                     finished = store.first_runs_of_finished_chunks()
@@ -130,7 +130,7 @@ class StudyProgress:
         self.total, self.done, self._num_timed = total, 0, 0
         self._recent: deque[float] = deque(maxlen=_NUM_RUNS_FOR_TIME_ESTIMATE)
 
-    def start(self, progress: UpdateProgress, processes: int) -> None:
+    def start_reporting(self, progress: UpdateProgress, processes: int) -> None:
         self._progress, self._processes = progress, processes
 
     def add_earlier_runs(self, runs: int) -> None:

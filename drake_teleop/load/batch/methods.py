@@ -45,7 +45,8 @@ _STD_PER_NORMAL_MAD = 1.4826
 _MIN_SAMPLES_TO_REJECT, _MAX_HUBER_SAMPLES, _MAX_FIT_STD_GROWTH = 12, 50_000, 2.0
 _NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
-    " are indistinguishable from motion errors (delay, scale, mounting): no sample was rejected"
+    " are indistinguishable from motion errors: no sample was rejected; check delay, scale and"
+    " mounting"
 )
 
 

@@ -91,9 +91,9 @@ class BaseParameters:
         lines = [f"{len(self.combinations)} of 16 combinations of offsets and load are determined"]
         if self.parameters_without_influence:
             names = ", ".join(self.parameters_without_influence)
-            lines.append(f"without influence on this record: {names}")
+            lines.append(f"parameters without influence on this record: {names}")
         several = (c for c in self.combinations if np.count_nonzero(c.coefficients) > 1)
-        lines += [f"only together: {c}" for c in several]
+        lines += [f"determined only in combination: {c}" for c in several]
         for c in self.weak_directions:
             if (
                 np.count_nonzero(c.coefficients) == 1
@@ -101,12 +101,18 @@ class BaseParameters:
             ):
                 percent = 100.0 * c.relative_std
                 share = f"{percent:.0f} % of" if percent < 100.0 else "more than"
-                lines.append(f"weak: {c} ({share} the natural scale of the load)")
+                lines.append(
+                    f"weak: {c} (+- is {share} the typical size for this load); rotate the load"
+                    " further and faster, about more axes"
+                )
             else:
-                lines.append(f"identified although its parts are not: {c}")
+                lines.append(f"combination identified, its parameters are not: {c}")
         if self.channels_with_slow_noise:
             names = ", ".join(self.channels_with_slow_noise)
-            lines.append(f"drift or slow noise in {names}: all +- are lower bounds")
+            lines.append(
+                f"drift or slow noise in {names}: all +- are lower bounds; let the sensor warm up,"
+                " and record again"
+            )
         return lines
 
 

@@ -33,7 +33,7 @@ from drake_teleop.load.contact.noise_floor import (
 # below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6);
 # sum of all e (6); ring of its last MAX_SUMMED_SAMPLES values.
 SAMPLE_COUNT_INDEX, HELD_SQUARES_START = 0, 1
-FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 3, 4, 5
+CONTACT_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 3, 4, 5
 NORMALIZED_WRENCH_START, MEAN_START, CUSUM_START = 8, 14, 20
 INNOVATION_SUM_START, RING_BUFFER_START = 26, 32
 MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
@@ -58,7 +58,7 @@ def update_statistics(
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
-    noise, held = (variances, P, growth, fade), memory[HELD_SQUARES_START:FLAG_INDEX]
+    noise, held = (variances, P, growth, fade), memory[HELD_SQUARES_START:CONTACT_INDEX]
     noise_variances_into(held, s, omega, alpha, acceleration, *noise, V, scaled)
     for c in range(6):
         scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(scaled[c])
@@ -125,7 +125,7 @@ def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUS
 
 
 @njit(cache=True)
-def _normalized_sum_of_last_innovations(memory, hold, widths):
+def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
     m = 0
     while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
         m += 1
@@ -136,7 +136,7 @@ def _normalized_sum_of_last_innovations(memory, hold, widths):
     for i in range(6):
         difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
         total += difference * difference
-    return math.sqrt(total / (1 << m)) / widths[m]
+    return math.sqrt(total / (1 << m)) / sum_widths[m]
 
 
 @njit(cache=True)
@@ -145,18 +145,18 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
 
     Contact begins at `enter`, ends at `leave`; `widths` are `NoiseFloor.sum_widths`.
     """
-    if memory[FLAG_INDEX] == 0.0:
+    if memory[CONTACT_INDEX] == 0.0:
         if memory[STATISTICS_START + statistic] >= enter:
-            memory[FLAG_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
+            memory[CONTACT_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
     else:
         quiet = memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
         memory[QUIET_SAMPLES_INDEX] = quiet
-        if quiet > hold and _normalized_sum_of_last_innovations(memory, hold, widths) < leave:
+        if quiet > hold and _norm_of_innovation_sum_within_hold(memory, hold, widths) < leave:
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
-            memory[FLAG_INDEX] = 0.0
+            memory[CONTACT_INDEX] = 0.0
             memory[CUSUM_START:] = 0.0
             memory[SAMPLE_COUNT_INDEX] = 1.0
-    return memory[FLAG_INDEX] != 0.0
+    return memory[CONTACT_INDEX] != 0.0
 
 
 @njit(cache=True)

@@ -222,7 +222,7 @@ def _offset_or_load_step_cause(state: FittedModel, i: int) -> Cause:
         text = (
             f"{when} the sensor has another zero: {_format_vector(values[:3], 'N')},"
             f" {_format_vector(values[3:], 'N m')} are added (a tare in the record); the stated"
-            " offsets are those before it"
+            " offsets are those before it; do not tare within a record"
         )
         return Cause("zero change", text, start_s=step.time, values={"change": values.tolist()})
     mass, com = float(values[0]), mass_com_inertia(values)[1] if values[0] else np.zeros(3)

@@ -95,8 +95,8 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     text = "the axes of the gyroscope are not those of the accelerometer"
     names = imu.angular_velocity.columns
     if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
-        text += f": its x, y, z should be its {', '.join(axis_names_of_rows(P))}"
-        remedy = "correct imu.angular_velocity.columns, and signs by imu.angular_velocity.scale"
+        text += f": the correct x, y, z are the present {', '.join(axis_names_of_rows(P))}"
+        remedy = "reorder imu.angular_velocity.columns, and set signs by imu.angular_velocity.scale"
         return Finding("swapped axes", f"{text}; {remedy}"), description
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
     finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
@@ -116,7 +116,7 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
         return None
     text = "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
     text += f" the gyroscope's {', '.join(axis_names_of_rows(best))}"
-    remedy = "correct imu.angular_acceleration.columns, or remove it"
+    remedy = "reorder imu.angular_acceleration.columns, or remove imu.angular_acceleration"
     return Finding("swapped axes", f"{text}; {remedy}")
 
 

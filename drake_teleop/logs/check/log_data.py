@@ -131,7 +131,7 @@ _CHECKED_FIELDS_OF_STREAM = {
     "wrench": ("force", "torque"),
     "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
 }
-_MIN_LIVE_NOISE_OVER_SPREAD = 1e-6
+_MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 
 
 def dead_or_repeated_channel_findings(
@@ -173,7 +173,7 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
 def _dead_channel_findings(where: str, numbers: dict[str, Array]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
     noise = white_noise_deviations(np.stack(list(numbers.values()), axis=1))
-    alive = noise > _MIN_LIVE_NOISE_OVER_SPREAD * (np.array(list(spread.values())) + 1e-300)
+    alive = noise > _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE * (np.array(list(spread.values())) + 1e-300)
     dead = [name for name, width in spread.items() if width == 0.0]
     if not dead or not (alive & (noise > 0.0)).any():
         return []

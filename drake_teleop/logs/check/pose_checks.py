@@ -154,15 +154,15 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     if frame.is_shifted:
         shift = ", ".join(f"{1e3 * x:.1f}" for x in frame.p_SoPo_S)
         deviation = 1e3 * float(frame.position_stds_m.max())
-        texts.append(
-            f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
-        )
+        texts.append(f"the pose's origin is at [{shift}] mm (+- {deviation:.2g}) in S")
         lines.append(f"pose.position_in_sensor: {round_for_yaml(place)}")
     if frame.is_rotated:
         angle, deviation = rotation_angle_deg(frame.R_SP), float(frame.rotation_stds_deg.max())
-        texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
+        texts.append(
+            f"the pose's axes are rotated by {angle:.1f} deg (+- {deviation:.2g}) relative to S"
+        )
         lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
-    text = f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}"
+    text = f"the pose is not that of S: {' and '.join(texts)}; set {' and '.join(lines)}"
     return Finding("pose frame", text)
 
 

@@ -154,7 +154,7 @@ def estimate_from_poses(
         inputs = t, wrench, poses, gravity_W, delay, lost, imu
         found, _, window = _find_splines_and_delay(*inputs, fewest=_MIN_SHARED_INSTANTS)
         splines, late, grid = found.splines, found.delay_s, window.grid
-        window = replace(window, taper=_taper_without_gaps(grid, splines.poses, lost, late))
+        window = replace(window, taper=_taper_zero_in_gaps(grid, splines.poses, lost, late))
         spectra = window.spectra_at_delay(splines, late)
         rejected, note = find_disturbances(spectra, splines.spacing)
         window = replace(window, taper=exclude_from_taper(window.taper, rejected, grid.dt))
@@ -233,7 +233,7 @@ def _find_splines_and_delay(
     wrench = finite_array("wrench", wrench, len(t), 6)
     grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
-    taper = _taper_without_gaps(grid, poses, lost, guess)
+    taper = _taper_zero_in_gaps(grid, poses, lost, guess)
     usable = int((taper > 0.5).sum())
     if usable < fewest:
         raise DrakeTeleopError(
@@ -283,7 +283,7 @@ def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
     return slice(first, first + length)
 
 
-def _taper_without_gaps(
+def _taper_zero_in_gaps(
     grid: WrenchGrid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float
 ) -> Array:
     stamps = poses.t - delay

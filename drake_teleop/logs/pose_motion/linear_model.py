@@ -327,18 +327,18 @@ def choose_knot_spacing_and_delay(
     coarsest = choices[0].splines_with_spacing(TRIED_KNOT_SPACINGS_S[0])
     start = window.spectra_at_delay(coarsest, delay)
 
-    def cost_and_spacing(cache: SplineCache, h: float) -> tuple[float, float]:
-        splines = cache.splines_with_spacing(h)
-        return start.with_motion(splines, window.gravity_W, delay).fit_coefficients().cost, h
+    def fit_cost(cache: SplineCache, knot_spacing_s: float) -> float:
+        splines = cache.splines_with_spacing(knot_spacing_s)
+        return start.with_motion(splines, window.gravity_W, delay).fit_coefficients().cost
 
     found = []
     for cache in choices:
         spacings = _knot_spacings_for_pose_rate(cache)
-        costs = [cost_and_spacing(cache, h) for h in spacings]
+        costs = [(fit_cost(cache, h), h) for h in spacings]
         k = spacings.index(min(costs)[1])
         beside = spacings[max(0, k - 1) : k] + spacings[k + 1 : k + 2]
         between = [float(np.sqrt(spacings[k] * h)) for h in beside]
-        found.append(min(costs + [cost_and_spacing(cache, h) for h in between]))
+        found.append(min(costs + [(fit_cost(cache, h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
     finer = _SPACING_OVER_BEST if window.grid.known_load is None else _SPACING_OVER_BEST_KNOWN_LOAD

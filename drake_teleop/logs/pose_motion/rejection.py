@@ -12,7 +12,8 @@ from drake_teleop.logs.pose_motion.splines import SIGNALS_ZERO_AT_REST
 
 NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so disturbances"
-    " cannot be distinguished from errors of the motion: no sample was rejected"
+    " cannot be distinguished from errors of the motion: no sample was rejected; check delay,"
+    " scale and mounting"
 )
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
 _STD_PER_NORMAL_MAD, _MAX_FIT_STD_GROWTH = 1.4826, 2.5

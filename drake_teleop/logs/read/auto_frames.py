@@ -107,10 +107,12 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
         arms = [arm for arm in (lever, lever_arm_from_wrench(at_Io)) if arm is not None]
         lever = max(arms, key=lambda arm: int(arm.is_determined_by_axis.sum()), default=None)
     if lever is None:
-        what = "the data do not determine the position of the accelerometer"
-        why = "no position of the pose agrees with it, and the wrench contains more than the load"
+        what = (
+            "pose and wrench do not determine the position of the accelerometer: the pose has no"
+            " positions or disagrees with the IMU, and the load alone does not explain the wrench"
+        )
         remedy = "give imu.position in metres, or pose.position"
-        raise DrakeTeleopError(f"{what}: {why}", where=where, remedy=remedy)
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     if not lever.is_determined_by_axis.all():
         what = f"the motion does not determine {_unknown_axes(lever.is_determined_by_axis)} of the"
         what += f" accelerometer's position ({_format_arm_mm(lever)} mm, from the {lever.source})"

@@ -34,7 +34,7 @@ from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES, OrientationColumn
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
-MIN_STATIC_POSES, MIN_BANDWIDTH_HZ = 3, 1e-3
+MIN_STATIC_POSES, MIN_CUTOFF_HZ = 3, 1e-3
 _CONVERTED_CHUNK_ROWS, _MIN_IMU_GAP_OVER_STEP = 2**16, 4.0
 _EstimateAuto = Callable[..., auto_frames.Estimate]
 
@@ -54,9 +54,9 @@ def read_log(
             `Log.posed`.
     """
     expect_type((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= MIN_BANDWIDTH_HZ:
+    if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= MIN_CUTOFF_HZ:
         what = f"{bandwidth_hz:g} Hz is too low"
-        remedy = f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one"
+        remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for the largest possible one"
         raise DrakeTeleopError(what, where="bandwidth_hz", remedy=remedy)
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):

@@ -70,7 +70,7 @@ def export_controller(
     refuse_removed_weight(found, to)
     notes = list(notes_on_undetermined_load(found))
     if largest is None:
-        notes.append("no range of the sensor was given: saturation is not detected")
+        notes.append("no range of the sensor was given: saturation is not detected; give --range")
     whole = None if largest is None else np.repeat(np.array(largest, float), 3)
     target = c99.ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
     for name, content in CONTROLLER_FORMATS[to](target).items():

@@ -25,7 +25,7 @@ _GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
-def _implementation(function: Any, T: Any) -> Callable[..., None]:
+def _compiled_or_python(function: Any, T: Any) -> Callable[..., None]:
     return function if T is float else function.py_func
 
 
@@ -62,20 +62,20 @@ def NonContactWrench_(T: Any) -> Any:
             self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORT_NAMES]
             self._load = self.DeclareVectorInputPort("load", 10)
             inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-            calculate = weak_callback(self._calc)
+            calculate = weak_callback(self._calc_non_contact_wrench)
             self.DeclareVectorOutputPort("non_contact_wrench_S", 6, calculate, inputs)
 
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
             Impl._construct(self, other._phi, converter=converter)
 
-        def _calc(self, context: Any, output: Any) -> None:
+        def _calc_non_contact_wrench(self, context: Any, output: Any) -> None:
             if self._load.HasValue(context):
                 phi = self._load.Eval(context)
             else:
                 phi = context.get_numeric_parameter(self._parameter).CopyToVector()
             wrench = _zero_vector_of_type(T, 6)
             motion = [port.Eval(context) for port in self._motion]
-            _implementation(non_contact_wrench_into, T)(*motion, phi, wrench)
+            _compiled_or_python(non_contact_wrench_into, T)(*motion, phi, wrench)
             output.SetFromVector(wrench)
 
     return Impl
@@ -141,7 +141,7 @@ def WrenchScaling_(T: Any) -> Any:
         def _scaled(self, context: Any, scales: tuple[float, float, float]) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
             wrench = _zero_vector_of_type(T, 6)
-            _implementation(scaled_wrench_into, T)(
+            _compiled_or_python(scaled_wrench_into, T)(
                 measured, estimate[:6], s, omega, alpha, *self._parts(estimate), *scales, wrench
             )
             return wrench
@@ -169,7 +169,7 @@ def WrenchScaling_(T: Any) -> Any:
                     raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
                 parts = self._parts(self._inputs[-1].Eval(context))
-                _implementation(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
+                _compiled_or_python(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
 
         def _calc_to_master(self, context: Any, output: Any) -> None:
@@ -179,7 +179,7 @@ def WrenchScaling_(T: Any) -> Any:
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)
-            _implementation(wrench_to_master_into, T)(scaled, R_WS, self._R_WB, k, k, wrench)
+            _compiled_or_python(wrench_to_master_into, T)(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)
 
     return Impl

@@ -70,8 +70,8 @@ _ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_MONITOR_SIZES)
 _layout = slots.SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
-_LAST_FINITE_MASTER_POSE_AND_FLAG = _layout.vector(8)
-_LAST_FINITE_SLAVE_POSE_AND_FLAG = _layout.vector(8)  # pose of the slave, likewise
+_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG = _layout.vector(8)
+_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG = _layout.vector(8)  # pose of the slave, likewise
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
@@ -103,7 +103,8 @@ def method_parameters_and_frame(
 def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array:
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
-    ends[_LAST_FINITE_MASTER_POSE_AND_FLAG][:7] = ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = start
+    ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG][:7] = start
+    ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG][:7] = start
     ends[_TIME_WITH_VALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
@@ -161,7 +162,7 @@ def step_master_end(
     `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
     hand is added to `work` (2,) [J].
     """
-    before, held = ends[_LAST_FINITE_MASTER_POSE_AND_FLAG], ends[_RENDERED_HAND_WRENCH]
+    before, held = ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG], ends[_RENDERED_HAND_WRENCH]
     watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
     valid = _update_pose_and_write_increment(pose_command, before, dx)
@@ -195,7 +196,7 @@ def step_slave_end(
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
-    before, held = ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG], ends[_LAST_VALID_SLAVE_WRENCH]
+    before, held = ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG], ends[_LAST_VALID_SLAVE_WRENCH]
     watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
@@ -352,7 +353,7 @@ class TeleopChannel(SteppedBlock):
         `fill_time_s` the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = slave
+        ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG][:7] = slave
         ends[SLAVE_METHOD_MEMORY][slots.CHANNEL_FILL_TIME_LEFT] = fill_time_s
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)

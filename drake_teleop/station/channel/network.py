@@ -99,7 +99,7 @@ stations 600 ms. lunar: 384 400 km are 1.28 s; round trip with ground stations 2
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
 _RANDOM_KEY, _STEP_PERIOD, _MEAN_DELAY_STEPS, _DELAY_JITTER = range(4)
 _DELAY_DISTRIBUTION, _MAX_DELAY_STEPS, _BAD_STATE_SHARE, _BAD_STATE_PERSISTENCE = range(4, 8)
-_BAD_STATE_LOSS, _DUPLICATE_SHARE, _PACKETS_PER_STEP = range(8, 11)
+_BAD_STATE_LOSS_SHARE, _DUPLICATE_SHARE, _PACKETS_PER_STEP = range(8, 11)
 _PLAYOUT_STEPS, _IS_REDUNDANT, _NUM_TRANSIT_SLOTS, _SILENCE_POLICY = range(11, 15)
 _MIN_DELAY_STEPS, _DELAY_TRACE_START = 15, 16
 # State of a receiver: these, then its last packet. In transit: slots, then sent packets.
@@ -138,7 +138,7 @@ def network_parameters(
     p[_DELAY_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
     p[_BAD_STATE_SHARE] = bad
     p[_BAD_STATE_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
-    p[_BAD_STATE_LOSS], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
+    p[_BAD_STATE_LOSS_SHARE], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
     p[_PACKETS_PER_STEP] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
     p[_PLAYOUT_STEPS], p[_IS_REDUNDANT] = playout, config.redundant
     p[_NUM_TRANSIT_SLOTS] = max(longest, playout) + 1
@@ -227,7 +227,7 @@ def _draw_loss_and_delays(p, k, bad):
     rate = p[_PACKETS_PER_STEP]
     if rate < 1.0 and math.floor(k * rate + 1e-9) == math.floor((k - 1) * rate + 1e-9):
         return bad, -1, -1
-    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BAD_STATE_LOSS]:
+    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BAD_STATE_LOSS_SHARE]:
         return bad, -1, -1
     first = _draw_delay_steps(p, k, 2)
     second = -1

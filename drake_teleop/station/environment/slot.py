@@ -40,11 +40,19 @@ class Slot(Environment):
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of its mouth")
     yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: along x_W")
     clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot less the peg's")
-    depth: float = quantity(0.040, "m", 0.02, 0.05, "from the mouth to the floor")
-    chamfer: float = quantity(3e-3, "m", 5e-4, 0.015, "depth and width of the 45 degree chamfers")
-    stiffness: float = quantity(1e4, "N/m", 1e2, 1e6, "of contact, part and fixture together (E)")
-    dissipation: float = quantity(1.0, "s/m", 0.0, 100.0, "Hunt-Crossley, as of the leaf (E)")
-    friction: float = quantity(0.2, "1", 0.0, 2.0, "of a ball on a face, at rest and in motion (E)")
+    depth: float = quantity(0.040, "m", 0.02, 0.05, "distance from mouth to floor")
+    chamfer: float = quantity(
+        3e-3, "m", 5e-4, 0.015, "depth of the chamfers of 45 degrees, and their width on each side"
+    )
+    stiffness: float = quantity(
+        1e4, "N/m", 1e2, 1e6, "stiffness of a ball on a face, including part and fixture (E)"
+    )
+    dissipation: float = quantity(
+        1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation of the contact, as of the leaf (E)"
+    )
+    friction: float = quantity(
+        0.2, "1", 0.0, 2.0, "friction coefficient of a ball on a face, at rest and in motion (E)"
+    )
 
     @property
     def width(self) -> float:

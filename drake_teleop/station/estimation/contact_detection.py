@@ -13,7 +13,7 @@ from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.load import regressor
 from drake_teleop.load.compensation import scaled_wrench_into
-from drake_teleop.load.contact.detection import FLAG_INDEX, ContactDetector, update_contact_flag
+from drake_teleop.load.contact.detection import CONTACT_INDEX, ContactDetector, update_contact_flag
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_OVER_MAX, NoiseFloor
 from drake_teleop.station.slave.arm import ArmModel, acceleration_from_specific_force_into
 
@@ -47,7 +47,7 @@ def update_contact_flag_with_sample(memory, sample, estimate, acceleration, sett
     `acceleration` (3,) is that of So, in S [m/s^2]; `settings` is `ContactDetector.settings`.
     """
     if not (are_finite_and_in_range(sample) and are_finite_and_in_range(estimate)):
-        return memory[FLAG_INDEX] != 0.0
+        return memory[CONTACT_INDEX] != 0.0
     contact = np.empty(6)
     s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
     alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]

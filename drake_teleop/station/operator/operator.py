@@ -68,7 +68,7 @@ class Sine:
     """
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the first ramp")
-    duration: float = quantity(1.0, "s", 1e-3, 1e6, "from start to end, both ramps included")
+    duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration, both ramps included")
     ramp: float = quantity(0.1, "s", 1e-3, 1e6, "length of each ramp, at most half the duration")
     frequency: float = quantity(1.0, "Hz", 0.0, 100.0, "frequency")
     phase: float = quantity(0.0, "rad", -7.0, 7.0, "phase at t_start")

@@ -76,7 +76,7 @@ _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 class MotionEstimationConfig:
     """Settings of the motion estimation of the sensor frame S."""
 
-    source: str = choice("accelerometer", _MOTION_SOURCES, "of angular velocity and accelerations")
+    source: str = choice("accelerometer", _MOTION_SOURCES, "source of omega and accelerations")
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )

@@ -186,7 +186,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._store_configuration)
+            self.DeclareInitializationDiscreteUpdateEvent(self._store_rotation_rate_and_joints)
         first = 0
         for name, size in {**signal_sizes_of_sample(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
@@ -206,25 +206,27 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
         self.DeclareVectorOutputPort(name, size, calc_part_of_sample, {self.xd_ticket()})
 
-    def _configuration(self, context: Context) -> Array:
+    def _rotation_rate_and_joints(self, context: Context) -> Array:
         _, body, _ = self._weld
         R_WB = self._poses.Eval(context)[body].rotation().matrix()
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _store_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.get_mutable_value(0)[self._held] = self._configuration(context)
+    def _store_rotation_rate_and_joints(
+        self, context: Context, discrete_state: DiscreteValues
+    ) -> None:
+        discrete_state.get_mutable_value(0)[self._held] = self._rotation_rate_and_joints(context)
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
         configuration = discrete_state.value(0)[self._held].copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._store_configuration(context, discrete_state)
+            self._store_rotation_rate_and_joints(context, discrete_state)
         if step % self._steps_per_sample != 0:
             return
         if not self._pairs_steps:
-            configuration = self._configuration(context)
+            configuration = self._rotation_rate_and_joints(context)
         reaction, body, geometry = self._weld
         acceleration = self._accelerations.Eval(context)[body].get_coeffs()
         force = self._reactions.Eval(context)[reaction].get_coeffs()

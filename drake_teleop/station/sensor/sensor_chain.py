@@ -73,7 +73,7 @@ class WristSensorConfig:
         compare=False,
         metadata={
             "choices": ("custom", *PRESET_NAMES),
-            "doc": "in a file: whose figures the fields have that the file leaves out; custom: the "
+            "doc": "sensor whose figures replace missing fields in a file; custom: the "
             'defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`',
             "in_python": "set wrist_sensor = drake_teleop.station.sensor.presets.PRESETS[name]",
         },
@@ -123,9 +123,9 @@ class WristSensorConfig:
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
-    force_latency: float = quantity(0.0, "s", 0.0, 0.1, "of force and torque, whole samples")
-    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "of accelerations, whole samples")
-    encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "of joint angles, whole samples")
+    force_latency: float = quantity(0.0, "s", 0.0, 0.1, "force and torque latency, whole samples")
+    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "acceleration lag, whole samples")
+    encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "encoder latency, whole samples")
 
     def noise_std(self) -> Array:
         """Return the standard deviations (12,) of white noise in raw samples, in SI units."""

@@ -373,7 +373,7 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Take the due samples, and store them in the context."""
-        seen = self._arm_state_and_surroundings(context)
+        seen = self._states_of_arm_and_environment(context)
         near = self._tool_proximity(*seen)
         self._take_samples(context, seen, near, False, _USE_COMPILED_CONTACT, self._result)
         context.SetDiscreteState(self._result[self._memory_slice])
@@ -383,9 +383,9 @@ class WristSensor(LeafSystem):
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _EQUAL_TIME_TOLERANCE_PERIODS), 0.0
-        append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
+        append_step_to_queue(tail, time, *self._states_of_arm_and_environment(context))
 
-    def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
+    def _states_of_arm_and_environment(self, context: Context) -> tuple[Array, Array]:
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
         around = self._around if self._sheet is None else self._sheet.Eval(context)
@@ -408,7 +408,7 @@ class WristSensor(LeafSystem):
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._arm_state_and_surroundings(context)
+        seen = self._states_of_arm_and_environment(context)
         near = self._tool_proximity(*seen)
         if near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
@@ -453,7 +453,10 @@ class WristSensor(LeafSystem):
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         time = context.get_time()
         if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(time):
-            seen, monitored = self._arm_state_and_surroundings(context), self._monitored_pairs.size
+            seen, monitored = (
+                self._states_of_arm_and_environment(context),
+                self._monitored_pairs.size,
+            )
             if not monitored or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
                 if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
@@ -469,7 +472,7 @@ class WristSensor(LeafSystem):
 
     def _check_acceleration_for_unknown_forces(self, context: Context) -> EventStatus:
         n, physics = self._n, self._physics
-        state, around = self._arm_state_and_surroundings(context)
+        state, around = self._states_of_arm_and_environment(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
         assemble_plant_state(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged

@@ -417,7 +417,7 @@ class ForwardKinematics(LeafSystem):
         self._n = arm.num_joints
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         inputs = {self._state.ticket()}
-        self.DeclareVectorOutputPort("pose_slave", 7, weak_callback(self._calc), inputs)
+        self.DeclareVectorOutputPort("pose_slave", 7, weak_callback(self._calc_slave_pose), inputs)
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_slave_pose(self, context: Context, output: BasicVector) -> None:
         pose_into(self._arm, self._state.Eval(context)[: self._n], output.get_mutable_value())

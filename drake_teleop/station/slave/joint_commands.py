@@ -68,7 +68,7 @@ class LeaderJointFollower(LeafSystem):
         self.DeclareDiscreteState(np.array(q_start, dtype=np.float64))
         self.DeclareVectorOutputPort("joint_command", n, weak_callback(self._calc_command))
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_next_command)
 
     def _next_command(self, context: Context) -> tuple[Array, IkStatus]:
         last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
@@ -84,7 +84,7 @@ class LeaderJointFollower(LeafSystem):
     def _calc_status(self, context: Context, output: BasicVector) -> None:
         output[0] = self._next_command(context)[1]
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_next_command(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._next_command(context)[0])
 
 
@@ -96,9 +96,11 @@ class ExcitationCommand(LeafSystem):
     def __init__(self, trajectory: FourierTrajectory, start: float) -> None:
         super().__init__()
         self._trajectory, self._start = trajectory, start
-        self.DeclareVectorOutputPort("joint_command", len(trajectory.q0), weak_callback(self._calc))
+        self.DeclareVectorOutputPort(
+            "joint_command", len(trajectory.q0), weak_callback(self._calc_joint_command)
+        )
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_joint_command(self, context: Context, output: BasicVector) -> None:
         time = np.clip(context.get_time() - self._start, 0.0, self._trajectory.period)
         output.SetFromVector(self._trajectory.evaluate(time)[0])
 
@@ -119,9 +121,13 @@ class JointRangeMonitor(LeafSystem):
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            period, 0.0, self._store_status_and_check_joint_ranges
+        )
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_status_and_check_joint_ranges(
+        self, context: Context, discrete_state: DiscreteValues
+    ) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

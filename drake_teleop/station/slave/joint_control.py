@@ -154,9 +154,9 @@ class JointControl(LeafSystem):
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joint_torque)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_joint_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
         inputs = self._command.Eval(context), self._state.Eval(context)
         torque = discrete_state.get_mutable_value(0)
         computed_torque_into(self._arm, *inputs, *self._constants, torque)
@@ -176,9 +176,9 @@ class HeldTorque(LeafSystem):
         self._request = self.DeclareVectorInputPort("requested_torque", arm.num_joints)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._hold_requested_torque)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _hold_requested_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
         torque = self._request.Eval(context)
         if are_finite_and_in_range(torque):
             discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))

@@ -42,8 +42,8 @@ class JointFriction(LeafSystem):
         super().__init__()
         self._constants = coulomb, index
         self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
-        calc, inputs = weak_callback(self._calc), {self._state.ticket()}
+        calc, inputs = weak_callback(self._calc_friction_force), {self._state.ticket()}
         self.DeclareVectorOutputPort("generalized_force", velocities, calc, inputs)
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
         _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())

@@ -47,10 +47,12 @@ MAX_SOLVER_STEPS_PER_COMMAND = 10
 _MIN_STEP_DAMPING_M2 = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-3, 100, 100
-_ZERO_GRADIENT_RATIO_M = 1e-3  # ratio |J^T e| / |e| below which the gradient counts as zero [m]
-_UNREACHED_ERROR_M = 5e-6  # error below which out of reach and singular are indistinguishable [m]
-# The same tolerance for `find_posture`, which stops the search earlier [m].
-_SEARCH_UNREACHED_M = 1e-3
+# Ratio |J^T e| / |e| below which the gradient counts as zero [m].
+_ZERO_GRADIENT_RATIO_M = 1e-3
+# Error below which out of reach and singular are indistinguishable [m].
+_MAX_POSE_ERROR_AT_SINGULARITY_M = 5e-6
+# The same for `find_posture`, which stops the search earlier [m].
+_MAX_SEARCH_ERROR_AT_SINGULARITY_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
@@ -256,7 +258,7 @@ def follow_pose(
             if squared < (1.0 - 1e-7) * before - expected_gain:
                 return _wrist_or_shoulder_status(L, J)
             copy_into(q, 0, kept, 0, n)
-            far = before > _UNREACHED_ERROR_M * _UNREACHED_ERROR_M and expected_gain < 1e-3 * before
+            far = before > _MAX_POSE_ERROR_AT_SINGULARITY_M**2 and expected_gain < 1e-3 * before
             return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
@@ -319,7 +321,10 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
-            if squared < _SEARCH_UNREACHED_M**2 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M:
+            if (
+                squared < _MAX_SEARCH_ERROR_AT_SINGULARITY_M**2
+                and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M
+            ):
                 status = _wrist_or_shoulder_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
@@ -387,7 +392,7 @@ class NumericInverseKinematics(LeafSystem):
         calc_command = weak_callback(self._calc_command)
         self._command = self.DeclareVectorOutputPort("joint_command", n, calc_command)
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_command_and_time)
 
     def _solve_command(self, context: Context, q: Array) -> int:
         last = context.get_discrete_state_vector().value()
@@ -401,7 +406,7 @@ class NumericInverseKinematics(LeafSystem):
     def _calc_status(self, context: Context, output: BasicVector) -> None:
         output[0] = self._solve_command(context, np.empty(self._joints))
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_command_and_time(self, context: Context, discrete_state: DiscreteValues) -> None:
         next_state = discrete_state.get_mutable_value(0)
         next_state[:-1] = self._command.Eval(context)  # cached for the joint control
         next_state[-1] = context.get_time()

@@ -42,7 +42,9 @@ class PositionInterface:
     max_acceleration: float = quantity(
         40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
     )
-    drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "of drives; sets joint stiffness")
+    drive_bandwidth_hz: float = quantity(
+        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"
+    )
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
@@ -172,9 +174,9 @@ class PositionServo(LeafSystem):
         self.DeclareStateOutputPort("joint_torque", holding)
         memory = np.concatenate([[0.0, 0.0], q_start, q_start, np.zeros(n), *(queued * [q_start])])
         self.DeclareDiscreteState(memory)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_servo_state)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_servo_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         inputs = self._command.Eval(context), self._state.Eval(context)
         torque, memory = (discrete_state.get_mutable_value(group) for group in range(2))
         position_servo_torque_into(self._arm, *inputs, *self._constants, memory, torque)

@@ -120,7 +120,7 @@ class SampledServo(LeafSystem):
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)
         self.DeclareVectorOutputPort("torque_rate", n, rate, {self.xd_ticket()})
-        self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update_torque_line)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         n, line = self._n, context.get_discrete_state_vector().value()
@@ -130,7 +130,7 @@ class SampledServo(LeafSystem):
         line = context.get_discrete_state_vector().value()
         output.SetFromVector(line[self._n : 2 * self._n])
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_torque_line(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
         sheet = self._at_rest if self._sheet is None else self._sheet.Eval(context)
         inputs = self._command.Eval(context), self._state.Eval(context), sheet

@@ -27,7 +27,7 @@ class Scene(Environment):
     file: str = plain(
         "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
-    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots, in W")
+    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "free roots' position in W")
     rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of free roots of the file"
     )

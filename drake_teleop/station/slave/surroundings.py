@@ -182,8 +182,8 @@ class MovingBodyPose(LeafSystem):
         self._joints, order = MakeJointTableAndRowBodies(plant, [body])
         self._bodies = np.empty((len(order), BODY_STATE_SIZE))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
-        self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
+        self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc_body_pose))
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_body_pose(self, context: Context, output: BasicVector) -> None:
         poses_and_twists_into(self._joints, self._state.Eval(context), self._bodies)
         output.SetFromVector(self._bodies[-1, :7])  # the body is last in its chain

@@ -26,7 +26,7 @@ class Ball:
     """Ball of the tool, with contact."""
 
     radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
-    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
+    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "centre of the shape, in S")
 
     @property
     def shape(self) -> Shape:
@@ -43,7 +43,7 @@ class Block:
     """Box of the tool, with contact."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
-    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
+    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "centre of the shape, in S")
     rpy: list[float] = quantity([0.0, 0.0, 0.0], "rad", -6.3, 6.3, "roll, pitch, yaw in S")
 
     @property
@@ -66,7 +66,7 @@ class Tool:
     """Tool, by default the paper's; a model file or a mass replaces it."""
 
     model: str = plain("", "file of a tool: its root link is put on S", is_path=True)
-    mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
+    mass: float = quantity(0.0, "kg", 0.0, 100.0, "mass of a tool without a file")
     com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
         [0.0] * 6, "kg m^2", -10.0, 10.0, "about com: xx, xy, xz, yy, yz, zz; zeros: steel ball"

@@ -35,7 +35,7 @@ from drake_teleop.station.slave.model.repair_report import (
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
 # Dynamics whose output has no range.
-_UNBOUNDED_ACTUATOR_DYNAMICS = ("integrator", "muscle", "user", "dcmotor")
+_DYNTYPES_WITH_UNBOUNDED_OUTPUT = ("integrator", "muscle", "user", "dcmotor")
 
 
 def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
@@ -230,7 +230,7 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
         return 0.0
     biased = given.get("biastype", "none") != "none" and any(given.numbers("biasprm", (0.0,) * 3))
-    is_unbounded = given.get("dyntype") in _UNBOUNDED_ACTUATOR_DYNAMICS
+    is_unbounded = given.get("dyntype") in _DYNTYPES_WITH_UNBOUNDED_OUTPUT
     if biased or given.get("gaintype", "fixed") != "fixed" or is_unbounded:
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])
