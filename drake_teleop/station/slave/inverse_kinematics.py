@@ -61,7 +61,9 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array) -> int:
+def _ik_status_and_all_solutions_into(
+    R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array
+) -> int:
     """Write all eight solutions to q (8, 6); return the `IkStatus`.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
@@ -148,7 +150,7 @@ def _nearest_branch_into(
     if not (np.isfinite(R.sum()) and are_finite_and_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _all_solutions_into(R, p, reference[0], reference[3], branches)
+    status = _ik_status_and_all_solutions_into(R, p, reference[0], reference[3], branches)
     best = -1
     best_distance = np.inf
     for row in range(8):
