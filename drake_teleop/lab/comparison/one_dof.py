@@ -293,6 +293,10 @@ def figures_of_traces(
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
+    return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
+
+
+def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     s = 1j * _RESISTANCE_FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -302,7 +306,7 @@ def covering_damping(model: OneDof, round_trip: float) -> float:
     contact = model.gamma * model.wall_stiffness / s
     inertia = model.sigma * model.tool_mass * s
     displayed = model.force_scale * (contact + inertia) * closed_loop * delay_factor
-    return max(0.0, -float(displayed.real.min()))
+    return np.asarray(displayed.real)
 
 
 def _range_about_parabola(x: Array) -> float:
