@@ -5,7 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    DiscreteValues,
+    LeafSystem,
+)
 
 from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
@@ -297,9 +303,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
-        self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
-        moving = {self._intended_pose.ticket(), self._intended_twist.ticket(), self.time_ticket()}
+        moving = self._declare_intended_motion_inputs() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("Operator: a task requires the arguments training, arm and tip")
@@ -325,6 +329,12 @@ class Operator(LeafSystem):
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+
+    def _declare_intended_motion_inputs(self) -> set[DependencyTicket]:
+        # `LiveHand` replaces these ports by a path to external targets.
+        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
+        return {pose.ticket(), twist.ticket()}
 
     def _update_perception_and_decision(self, context: Context, states: DiscreteValues) -> None:
         state = [states.get_mutable_value(group) for group in self._groups]
