@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +19,12 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array, nonnegative_array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.normal_equations import regressor_coefficients
-from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
+from drake_teleop.load.online.recursive import (
+    MAX_SETTLED_RELATIVE_STD,
+    PRIOR_STD,
+    RecursiveEstimator,
+    RecursiveLeastSquares,
+)
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
 # Relative increase of diagonal elements against rounding.
@@ -312,10 +316,15 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     allows_for_noisy_motion = True
 
     def __init__(
-        self, noise_std: ArrayLike, motion_std: ArrayLike, *options: Any, **named: Any
+        self,
+        noise_std: ArrayLike,
+        motion_std: ArrayLike,
+        forgetting: float = 1.0,
+        prior_std: ArrayLike = PRIOR_STD,
+        settled_std: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         self._motion_std = nonnegative_array("motion_std", motion_std, 9)
-        super().__init__(noise_std, *options, **named)
+        super().__init__(noise_std, forgetting, prior_std, settled_std)
 
     @classmethod
     def for_noise(
