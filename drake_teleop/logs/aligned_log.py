@@ -199,7 +199,10 @@ def replace_specific_force_by_acceleration(log: Log) -> Log:
 
 @dataclass(frozen=True)
 class LoadFitOfPosedLog:
-    """Load identified from a log with poses; `log` are the used samples, with spline motion."""
+    """Load identified from a log with poses; `log` are the used samples, with spline motion.
+
+    `delay_source` is "given", "estimated", or "undetermined" (0 was used).
+    """
 
     log: Log
     fit: BatchResult

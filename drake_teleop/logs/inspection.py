@@ -281,7 +281,8 @@ def _inspect_clock_and_flag_usable_rows(
     at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
     if time.column is None:
-        figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
+        t = time_stamps_and_num_episodes(time, table, at)[0]
+        figures |= {"rate_hz": time.rate, "duration_s": float(np.ptp(t)) if rows else 0.0}
         return [], np.ones(rows, bool)
     stamps, figures["episodes"] = time_stamps_and_num_episodes(time, table, at)
     highest = np.fmax.accumulate(stamps)

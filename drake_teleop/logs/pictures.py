@@ -110,7 +110,7 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
 
 
 def amplitude_spectral_densities(x: Array, dt: float) -> tuple[Array, Array]:
-    """Return frequencies (m,) [Hz] and densities (m, k) [1/sqrt(Hz)] of x (N, k), by Welch."""
+    """Return frequencies (m,) > 0 [Hz] and one-sided densities (m, k) [x/sqrt(Hz)] of x (N, k)."""
     from scipy.signal import welch
 
     length = min(len(x), max(16, len(x) // 8), _MAX_WELCH_WINDOW_SAMPLES)

@@ -53,7 +53,10 @@ TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 
 @dataclass(frozen=True)
 class FingertipPush:
-    """Push at the fingertips, a half sine over time; `push_W` is its peak on the gripper [N]."""
+    """Push at the fingertips, a half sine over `start_s` to `stop_s` on the sensor's clock.
+
+    `push_W` (3,) is its peak on the gripper, in the world [N].
+    """
 
     start_s: float
     stop_s: float

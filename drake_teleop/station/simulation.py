@@ -154,8 +154,12 @@ class LogOnDisk:
     def write_and_keep_rows(self) -> int:
         """Write the rows in memory; a later part replaces them; return their number."""
         part = self._form(read_recorded_signals(self._simulator, self._start))
-        part.write_part(self._folder, self._rows)
+        self._write_part(part)
         return len(part.t)
+
+    def _write_part(self, part: SimulationResult) -> None:
+        # `BackgroundLog` replaces this by a thread that writes.
+        part.write_part(self._folder, self._rows)
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:

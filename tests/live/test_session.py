@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from drake_teleop.live.inputs import (
     csv_row,
     read_inputs,
 )
+from drake_teleop.live.record import BackgroundLog
 from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
@@ -296,6 +300,17 @@ def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tm
     assert list(read_drive(tmp_path).changes)[1:] == changes[1:]
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     assert log.t[-1] >= 1e-3 * session.ms - 2.0
+
+
+def test_parts_of_a_drive_are_written_by_another_thread(tmp_path, monkeypatch):
+    writers = []
+    part = SimpleNamespace(t=[0.0], write_part=lambda *_: writers.append(threading.get_ident()))
+    monkeypatch.setattr("drake_teleop.station.simulation.read_recorded_signals", lambda *_: part)
+    log = BackgroundLog(tmp_path / "log.parquet", MagicMock(), 0.0, lambda part: part)
+    log.write_and_clear_rows()
+    log.write_and_keep_rows()
+    log.wait_until_written()
+    assert len(writers) == 2 and threading.get_ident() not in writers
 
 
 MADE_BY = {"drake_teleop": "1.2", "drake": "3.4"}

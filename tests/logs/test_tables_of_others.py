@@ -179,6 +179,22 @@ def test_rows_of_a_stream_are_those_in_which_its_columns_are_filled(
     assert len(mixed) > 1900
 
 
+@pytest.mark.parametrize("by_time", [False, True])
+def test_rows_of_another_stream_are_no_gaps_at_a_constant_rate(
+    tmp_path: Path, by_time: bool
+) -> None:
+    wrench = table().select("t", *FORCE, *TORQUE)
+    pose = (
+        table().select("t", *POSITION, *QUATERNION).gather_every(4).with_columns(pl.col("t") + 3e-4)
+    )
+    both = pl.concat([wrench, pose], how="diagonal")
+    both = (both.sort("t") if by_time else both).drop("t")
+    times = {"wrench__time": {"rate": 500.0}, "pose__time": {"rate": 125.0}}
+    log = read_log(described(tmp_path, both, **times))
+    assert log.t[0] == 0.0 and log.t[-1] == pytest.approx(3.99, abs=0.02)
+    assert np.diff(log.t) == pytest.approx(2e-3, abs=1e-9)
+
+
 def test_a_partly_filled_row_is_still_an_error(tmp_path: Path) -> None:
     frame = table().with_columns(f1=pl.when(pl.col("t") == 1.0).then(None).otherwise(pl.col("f1")))
     with pytest.raises(DrakeTeleopError, match="no finite number in 1 rows, the first is row 501"):

@@ -228,8 +228,10 @@ def _read_log_and_row_times(
         what = "the episode has no orientation"
         raise DrakeTeleopError(what, where=source, remedy="describe pose.orientation")
     assert described.wrench is not None
-    clock = read_clock(described.wrench.time, table, described.wrench.columns, source)
-    at = np.interp(np.arange(clock.num_rows), clock.kept_rows, clock.t - clock.t[0])
+    timed = table.rows_with_any_number(described.wrench.columns)
+    clock = read_clock(described.wrench.time, timed, described.wrench.columns, source)
+    rows = clock.kept_rows if timed.kept_rows is None else timed.kept_rows[clock.kept_rows]
+    at = np.interp(np.arange(table.rows), rows, clock.t - clock.t[0])
     return log, at
 
 

@@ -389,7 +389,7 @@ def estimate_clock_rate_error(
 
 
 def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay: float) -> Poses:
-    """Return the poses with stamps on the wrench's clock."""
+    """Return the poses with stamps on the wrench's clock, for a relative rate error of theirs."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 

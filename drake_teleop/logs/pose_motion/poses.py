@@ -11,7 +11,10 @@ from drake_teleop.common.numeric import Array
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of frame P at stamps t (K,) [s]: p_WoPo_W [m], unit [w, x, y, z] of R_WP (K, 4)."""
+    """Poses of frame P at increasing, maybe uneven stamps t (K,) [s].
+
+    They are p_WoPo_W (K, 3) [m] and unit quaternions [w, x, y, z] of R_WP (K, 4).
+    """
 
     t: Array
     position: Array

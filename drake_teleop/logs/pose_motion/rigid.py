@@ -94,7 +94,7 @@ _OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
-    """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without `removed_weight` (4,)."""
+    """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without a weight [m, m c] (4,)."""
     C = _coefficients_without_removed_weight(phi)
     if removed_weight is not None:
         weight = _coefficients_without_removed_weight(np.concatenate([removed_weight, np.zeros(6)]))

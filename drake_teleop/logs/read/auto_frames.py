@@ -184,7 +184,10 @@ def wrench_of_weight(weight: Array, gravity: Array) -> Array:
 
 
 def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
-    """Add the wrench of a removed weight [m, m c] (4,) to a log; `motion_log` has its motion."""
+    """Add the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] to a log.
+
+    The delay of `motion_log`, the same log with motion, is estimated and taken into account.
+    """
     assert motion_log.gravity is not None
     at = log.t + delay_of_free_fit(block_means_of_log(motion_log))
     gravity = resample(at.clip(*motion_log.t[[0, -1]]), motion_log.t, motion_log.gravity)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, require_library
+from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra, require_library
 from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -152,8 +152,12 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         remedy = "give a folder with metadata.yaml, or a .mcap, .db3 or .bag file"
         raise DrakeTeleopError("the path is not a bag", where=str(path), remedy=remedy)
     require_library("rosbags", "rosbags", "ros", str(path))
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        what, remedy = f"cannot import rosbags: {error}", remedy_to_install_extra("ros")
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy) from error
 
     try:
         for file in path.iterdir() if path.is_dir() else [path]:

@@ -91,11 +91,12 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
     """Return the times (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
     Episodes are joined in the whole table, so that all its streams keep one clock. `time.rate` is
-    that of the stream's usual rows; missing rows are gaps.
+    that of the stream's usual rows; missing rows are gaps, unless only another stream has numbers
+    in them.
     """
     if time.column is None:
         assert time.rate is not None
-        rows = np.arange(table.rows) if table.kept_rows is None else table.kept_rows
+        rows = _row_numbers_without_other_streams(table)
         spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
         return rows / spacing / time.rate, 1
     whole = table.whole_table or table
@@ -113,6 +114,19 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
         t = t + columns[:, 1] * SI_VALUE_OF_UNIT["ns"]
     t, episodes = join_episodes(t)
     return (t if table.kept_rows is None else t[table.kept_rows]), episodes
+
+
+def _row_numbers_without_other_streams(table: Table) -> NDArray[np.intp]:
+    whole, kept = table.whole_table, table.kept_rows
+    if whole is None or kept is None:
+        return np.arange(table.rows)
+    only_others = np.zeros(whole.rows, bool)
+    for column in whole.columns.values():
+        if len(column) == whole.rows and column.dtype.kind == "f":
+            known = np.isfinite(column.reshape(len(column), -1)).any(axis=1)
+            if not known[kept].any():
+                only_others |= known
+    return np.searchsorted(np.flatnonzero(~only_others), kept)
 
 
 def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:

@@ -30,7 +30,9 @@ class SheetSpring(environment.Environment):
     thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the section")
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
-    damping_ratio: float = quantity(0.03, "1", 0.0, 100.0, "of the first mode; above 1 it creeps")
+    damping_ratio: float = quantity(
+        0.03, "1", 0.0, 100.0, "of the first mode; above 1 the leaf creeps back"
+    )
     slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property

@@ -38,11 +38,15 @@ class Surface(Environment):
     4e5 N/m and friction 0.2.
     """
 
-    stiffness: float = quantity(1e4, "N/m", 1e2, 1e7, "in series with that of the other body (E)")
+    stiffness: float = quantity(
+        1e4, "N/m", 1e2, 1e7, "of the surface, in series with the other body (E)"
+    )
     dissipation: float = quantity(
         1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation d: damping k x d at depth x (E)"
     )
-    friction: float = quantity(0.2, "1", 0.0, 2.0, "its mean with that of the tool applies (E)")
+    friction: float = quantity(
+        0.2, "1", 0.0, 2.0, "of the surface; its mean with the tool's counts (E)"
+    )
 
     @property
     def slip_speed(self) -> float:

@@ -106,7 +106,8 @@ class ForceScalingConfig:
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    for base, scale in ((0, force_scale), (3, torque_scale)):
+    for base in (0, 3):
+        scale = torque_scale if base == 3 else force_scale
         in_W = apply_matrix(matrix_as_tuple(R_WS), vector_at(wrench_S, base))
         in_B = scale_vector(-scale, apply_matrix(transposed(matrix_as_tuple(R_WB)), in_W))
         out[base], out[base + 1], out[base + 2] = in_B

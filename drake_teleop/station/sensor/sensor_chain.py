@@ -124,7 +124,7 @@ class WristSensorConfig:
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
     force_latency: float = quantity(0.0, "s", 0.0, 0.1, "force and torque latency, whole samples")
-    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "acceleration lag, whole samples")
+    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "latency, rounded to whole samples")
     encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "encoder latency, whole samples")
 
     def noise_std(self) -> Array:

@@ -73,7 +73,8 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
     for name, count in sizes.items():
         values = _numbers_in_text(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
-            return f"the {name} of a {kind} is not between 0 and {MAX_MODEL_VALUE_SI:g} m"
+            limits = f"not between 0 and {MAX_MODEL_VALUE_SI:g} m"
+            return f"the {name} of a {kind} is incomplete or {limits}"
     scale = _numbers_in_text(inner.get("scale") or inner.findtext("scale"))
     valid = len(scale) in (0, 1, 3) and all(0.0 < abs(x) <= MAX_MODEL_VALUE_SI for x in scale)
     for place in (*shape.findall("origin"), *shape.findall("pose")):
