@@ -217,7 +217,8 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    show = partial(Console().print, highlight=False, markup=False)
+    console = Console()
+    show = partial(console.print, highlight=False, markup=False)
     values = Table("criterion", "value", "what it is")
     for name, meaning in summary["meaning"].items():
         marked = f"[bold]{name}[/]" if name == summary["criterion"] else name
@@ -229,7 +230,7 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     for name, value in summary["predicted_std"].items():
         deviations.add_row(name.replace("[", r"\["), f"{value:.2g}")
     for part in (values, uses, deviations):
-        show(part)
+        console.print(part)
     if "until" in summary:
         show(
             f"{summary['period_s']:.3g} s reach {summary['until']}"

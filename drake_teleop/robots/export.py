@@ -113,8 +113,8 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
     ]
     if not format.inertia:
         warnings.append(
-            f"{to} has no field for the inertia, so torques of fast rotations are not compensated;"
-            " rotate slowly"
+            f"{to} has no field for the inertia, so inertial wrenches of fast motion remain;"
+            " move slowly"
         )
     if not found.physically_consistent:
         remedy = "`identify --method consistent` corrects it"

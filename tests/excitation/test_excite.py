@@ -17,7 +17,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from shown import type_in
 
-from drake_teleop.cli.excitation import draw_trajectory
+from drake_teleop.cli.excitation import _print_summary, draw_trajectory
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
@@ -651,6 +651,20 @@ def test_file_without_robot_gives_one_error_line(tmp_path, capsys, name, text):
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and name in error
+
+
+def test_summary_is_printed_without_markup(capsys, tmp_path):
+    use = {"share": 0.5, "where": "joint_1", "t": 1.25}
+    summary = {
+        "meaning": {"E": "smallest eigenvalue"}, "criterion": "E", "E": 2.0,
+        "limit_use": {"speed": use}, "predicted_std": {"f_x [N]": 0.01},
+        "until": "mass 1 %", "period_s": 3.0, "reliable": 0.9, "assumed": ["[x] is at rest"],
+    }  # fmt: skip
+    _print_summary(summary, tmp_path)
+    printed = capsys.readouterr().out
+    assert "[bold]" not in printed and "\\" not in printed
+    for words in ("t [s]", "f_x [N]", "50.0%", "mass 1 %", "assumed: [x] is at rest"):
+        assert words in printed
 
 
 def test_model_options_require_a_model(capsys, tmp_path):

@@ -30,7 +30,11 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
     monkeypatch.chdir(tmp_path)
     for module in ("live.server", "live.experiment.apparatus"):
         monkeypatch.setattr(f"drake_teleop.{module}.identified_load", lambda *_: load)
-    for name in ("station.replay.write_replay", "lab.run.write_picture", "lab.run.draw_overview"):
+    for name in (
+        "station.replay.write_replay",
+        "common.files.write_picture",
+        "lab.run.draw_overview",
+    ):
         monkeypatch.setattr(f"drake_teleop.{name}", lambda *_: None)
 
     def open_page(

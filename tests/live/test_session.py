@@ -265,7 +265,7 @@ def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeyp
     folder, _ = driven
     for painted in (
         "station.replay.write_replay",
-        "lab.run.write_picture",
+        "common.files.write_picture",
         "lab.run.draw_overview",
     ):
         monkeypatch.setattr(f"drake_teleop.{painted}", lambda *_: None)

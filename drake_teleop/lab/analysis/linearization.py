@@ -319,7 +319,9 @@ class _PeriodSimulator:
         context = self._get_context("master_device")
         x_B = self._device.coordinates_for_force_display(q)
         display = initial_display_state(x_B, self._device.parameters)
-        for group, value in enumerate((np.append(q, 0.0 * q), pose_B, np.zeros(6), display)):
+        for group, value in enumerate(
+            (np.append(q, np.zeros_like(q)), pose_B, np.zeros(6), display)
+        ):
             context.SetDiscreteState(group, value)
         target = self._evaluate_output("kinematic_scaling", "pose_command")
         ramp = round(_TIME_TO_OPERATING_POINT_S / self.dt) if displacement.any() else 0

@@ -128,8 +128,10 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
-        what = f"is {ratios.flat[0]:g} times hand_hz (must be a whole multiple)"
+    fits = (np.abs(ratios - count) <= 1e-9 * count) & (1 <= count <= _MAX_RATE_RATIO)
+    if not fits.all():
+        wrong = float(ratios[~fits].flat[0])
+        what = f"is {wrong:.10g} times hand_hz (must be one whole multiple)"
         remedy = f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand"
         raise DrakeTeleopError(what, where=f"sampling.{name}", remedy=remedy)
     return count

@@ -56,6 +56,7 @@ class StationPlan:
     Args:
         tool_mass_kg: mass beyond the sensor [kg].
         swing_amplitude_m: amplitude of the slave in free motion [m].
+        base_plane_height: height of the base plane [m].
         lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
         tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
         tool_axis_advice: advice if the tool is not along z_S.

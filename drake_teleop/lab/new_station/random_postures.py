@@ -67,6 +67,7 @@ class StartRegion:
     Attributes:
         tool_length: distance of the tool's end from S [m].
         first_joint_W: (3,) origin of the first joint, p_W [m].
+        plane_height: height of the base plane [m].
         reach: radius that the arm reaches about its first joint [m].
         is_joint_above_plane: (n,) True for joints above the base plane, not of a mobile base.
         side_direction_rad: direction of the region about z_W, from x_W [rad].

@@ -107,6 +107,7 @@ class LevelModel:
         products: columns of X for each pair (i, j) of factors.
         failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
         X: (n, p) design matrix; first column: the mean.
+        pseudo_inverse: (p, n) pseudo-inverse of X.
     """
 
     factors: list[Levels]
