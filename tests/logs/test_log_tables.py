@@ -402,7 +402,7 @@ with multiprocessing.get_context("fork").Pool(1) as pool:
 @pytest.mark.slow
 def test_reading_in_a_forked_process_raises_error(tmp_path: Path) -> None:
     path = write(tmp_path / "x.csv", PLAIN)
-    for when, says in (("before", "True"), ("after", "forked after tables were read")):
+    for when, says in (("before", "True"), ("after", "forked after polars was used")):
         done = subprocess.run(
             [sys.executable, "-c", FORKS, str(path), when],
             capture_output=True,
