@@ -251,8 +251,17 @@ def test_an_arm_a_device_and_a_wall_are_ten_lines(tmp_path):
 @pytest.mark.parametrize(
     ("table", "part", "said"),
     [
-        (FIGURES, {"friction": 0.2}, "device: 'own' is {'friction': 0.2}; register DeviceFigures"),
-        (ENVIRONMENTS, dict, "environment: 'own' is <class 'dict'>; register a class derived from"),
+        (
+            FIGURES,
+            {"friction": 0.2},
+            "device: 'own' is {'friction': 0.2}, not a valid part;"
+            " register an object of class DeviceFigures",
+        ),
+        (
+            ENVIRONMENTS,
+            dict,
+            "environment: 'own' is <class 'dict'>, not a valid part; register a class derived from",
+        ),
         (ENVIRONMENTS, Wall(), "register a class derived from Environment"),
     ],
 )

@@ -59,9 +59,9 @@ class Registry(dict[str, _Part]):
         else:
             fits = isinstance(part, self._part_type)
         if not fits:
-            kind = "a class derived from " if self._parts_are_classes else ""
-            remedy = f"register {kind}{self._part_type.__name__} (docs/extend.md)"
-            what = f"'{name}' is {reprlib.repr(part)}"
+            kind = "a class derived from" if self._parts_are_classes else "an object of class"
+            remedy = f"register {kind} {self._part_type.__name__} (docs/extend.md)"
+            what = f"'{name}' is {reprlib.repr(part)}, not a valid part"
             raise DrakeTeleopError(what, where=self.kind, remedy=remedy)
 
     def remove(self, name: str) -> None:

@@ -315,8 +315,9 @@ def _inspect_clock_and_flag_usable_rows(
         row = table.line_in_file(finite[int(np.argmax(steps <= 0)) + 1])
         text = (
             f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
-            " rows with equal stamps are omitted or spread evenly; a log with decreasing"
-            " stamps is refused: cut it there, or give time.rate"
+            " rows with equal stamps are omitted if their values repeat, and are spread evenly"
+            " otherwise; a log with decreasing stamps is refused: cut it where they decrease, or"
+            " give time.rate"
         )
         findings.append(Finding("clock jump", text))
     return findings, usable

@@ -160,8 +160,8 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
-        what = "is 0, so that the slave cannot press on the sheet spring"
-        remedy = "choose a scale above 0, or leave the sheet spring (sheet_spring) out"
+        what = "is 0, so that the slave cannot press on the leaf of the sheet spring"
+        remedy = "choose a scale above 0, or remove the sheet spring (sheet_spring or !SheetSpring)"
         raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).start_tip

@@ -43,7 +43,9 @@ JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 SIGMAS = (0.0, 1.0)
 _SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
-_STATION_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+_RATES_OF_EVERY_RUN = Rates(
+    sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0
+)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_SIMULATION_STEP_S = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
@@ -138,7 +140,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
-        rates=_STATION_RATES,
+        rates=_RATES_OF_EVERY_RUN,
         contact_detection=None,
     )
 

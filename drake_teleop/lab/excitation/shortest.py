@@ -35,7 +35,7 @@ PROBABILITY_ALL_WITHIN_TOLERANCE = 0.95
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
-_MAX_LOG_PERIOD_STEP = 0.15
+_MAX_STEP_OF_PERIOD_LOGARITHM = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
 _TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005  # after a round that missed the tolerance
@@ -169,7 +169,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
     def bounds(self, x: Array) -> optimizer.Bounds:
         """Return bounds of the unknowns; only log T is bounded, near that of x."""
-        ends = x[-1] + np.array([-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP])
+        ends = x[-1] + np.array([-_MAX_STEP_OF_PERIOD_LOGARITHM, _MAX_STEP_OF_PERIOD_LOGARITHM])
         low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 

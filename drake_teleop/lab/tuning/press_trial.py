@@ -50,7 +50,7 @@ _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at r
 _MAX_PRESS_DEPTH_M = 0.02
 _USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
 _LEAF_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
-_FILTER_DELAY_CYCLES = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
+_FILTER_DELAY_TIMES_BANDWIDTH = 0.416  # of the 4th-order Butterworth filter
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
 GIVEN_SETTINGS_NAME = "as given"
@@ -213,7 +213,7 @@ class OneAxisGammaSearch:
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
         ideal = self.base_scenario.wrist_sensor.ideal
-        added = 0.0 if ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        added = 0.0 if ideal else _FILTER_DELAY_TIMES_BANDWIDTH / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
         passivity, intent = settings.passivity(self.stated_set), operator_intent(task)
         filtered = dataclasses.replace(backward, delay=backward.delay + added)

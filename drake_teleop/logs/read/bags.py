@@ -140,7 +140,9 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dic
 
 
 def missing_topic_error(path: Path) -> DrakeTeleopError:
-    remedy = "describe it, with `topic` in each stream; `drake-teleop inspect` drafts that"
+    remedy = (
+        "describe it in a YAML file with `topic` in each stream; `drake-teleop inspect` drafts one"
+    )
     return DrakeTeleopError("is a bag, and no topic is specified", where=str(path), remedy=remedy)
 
 

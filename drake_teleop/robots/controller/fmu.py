@@ -52,18 +52,18 @@ def _fmu_archive(
 ) -> bytes:
     sources = {**kernel, f"fmi{version[0]}.c": c99.read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
-    compiled = [name for name in sources if name.endswith(".c")]
-    files["modelDescription.xml"] = _model_description(target, version, token, compiled)
+    c_files = [name for name in sources if name.endswith(".c")]
+    files["modelDescription.xml"] = _model_description(target, version, token, c_files)
     if version == "3.0":
         build = Element("fmiBuildDescription", fmiVersion="3.0")
         configuration = SubElement(build, "BuildConfiguration", modelIdentifier=_MODEL_NAME)
         group = SubElement(configuration, "SourceFileSet", language="C99")
-        for name in compiled:
+        for name in c_files:
             SubElement(group, "SourceFile", name=name)
         files["sources/buildDescription.xml"] = _XML_HEAD + indented_xml(build)
     if cc is not None:
         binary = f"binaries/{_PLATFORM_OF_FMI_VERSION[version]}/{_MODEL_NAME}.so"
-        files[binary] = _compile_library(cc, sources, compiled)
+        files[binary] = _compile_library(cc, sources, c_files)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
@@ -71,18 +71,18 @@ def _fmu_archive(
     return content.getvalue()
 
 
-def _compile_library(compiler: str, sources: c99.Files, compiled: list[str]) -> bytes:
+def _compile_library(compiler: str, sources: c99.Files, c_files: list[str]) -> bytes:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in sources.items():
             (folder / file).write_text(str(text), encoding="utf-8")
         options = [*c99.CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
-        subprocess.run([compiler, *options, *compiled, "-o", "library.so"], cwd=folder, check=True)
+        subprocess.run([compiler, *options, *c_files, "-o", "library.so"], cwd=folder, check=True)
         return (folder / "library.so").read_bytes()
 
 
 def _model_description(
-    target: c99.ControllerTarget, version: str, token: str, compiled: list[str]
+    target: c99.ControllerTarget, version: str, token: str, c_files: list[str]
 ) -> str:
     new = version == "3.0"
     root = Element(
@@ -100,7 +100,7 @@ def _model_description(
         simulation.set("fixedInternalStepSize", repr(target.dt))
     else:
         files = SubElement(simulation, "SourceFiles")
-        for name in compiled:
+        for name in c_files:
             SubElement(files, "File", name=name)
     units = SubElement(root, "UnitDefinitions")
     for unit, base in _UNIT_EXPONENTS.items():

@@ -74,7 +74,7 @@ TaskParameters = namedtuple(
 def pack_operator_parameters(
     training: OperatorTraining, perception: Perception, movement: tasks.Movement
 ) -> OperatorParameters:
-    there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_EFFECT_DELAY_S
+    there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_END_TO_EFFECT_S
     delays = perception.vision_delay + there_and_back, perception.reaction_time + there_and_back
     # 53 bits of a key are exact in a float.
     key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM)
@@ -118,7 +118,7 @@ _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
 MEMORY_SIZE = PLAN_START_INDEX + PLAN_SIZE
 
 _EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
-_MOVE_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
+_MOVE_END_TO_EFFECT_S = 0.05  # s, without network and perception, estimate
 _APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
 # Perceived depth without contact beyond which the operator gives up, estimate.
 _GIVE_UP_PENETRATION_M = 0.03

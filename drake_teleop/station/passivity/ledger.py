@@ -78,7 +78,7 @@ _MAX_SAME_WALL_DISTANCE_M, _MIN_SAME_WALL_COSINE = 5e-3, 0.7
 _MAX_FORGET_WALL_DEPTH_M, _FORGET_WALL_FORCE_N, _MIN_FORGET_WALL_DEPTH_M = 3e-3, 1.0, 1e-3
 _MIN_WALL_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
 _HAND_INPUT_SENDING_LEVEL = 0.5  # of the master's reserve
-_UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
+_NEVER_USED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_RATE = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
 _WITHHELD_WRENCH_RECOVERY_S = 0.1
@@ -389,7 +389,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _MAX_HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
-    unused = _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]
+    unused = _NEVER_USED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]
     most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)
     if share * cost > most:
@@ -402,7 +402,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _permitted_braking_share(g, dx, T, p, memory):
-    if memory[slots.STORED_ENERGY][g] >= _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]:
+    if memory[slots.STORED_ENERGY][g] >= _NEVER_USED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[FILTERED_OWN_VELOCITY]
     along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)

@@ -281,7 +281,7 @@ def repair_mjcf(
         report.state_assumption(what, "the world")
     joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
     _check_names_and_generators(world, report)
-    _set_body_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
+    _set_mass_properties_of_bodies(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _report_lost_shapes(reader, report)
     report.raise_faults(path)
@@ -305,16 +305,18 @@ def _check_names_and_generators(world: Body, report: RepairReport) -> None:
             report.add_fault(f"several {kind} are named {join_names(twice)}")
 
 
-def _set_body_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
+def _set_mass_properties_of_bodies(
+    world: Body, reader: BodyReader, ids_of_moving_bodies: set[int], mjcf: Mjcf
+) -> None:
     report, total = mjcf.report, mjcf.compiler.number("settotalmass", -1.0)
     factor = total / _sum_of_masses_in_file(mjcf) if total > 0.0 else 1.0
 
     def set_masses_of_subtree(body: Body, is_moved: bool) -> None:
-        is_moved |= id(body) in moving
+        is_moved |= id(body) in ids_of_moving_bodies
         if not body.is_auxiliary:
             given = reader.mass_properties_of_body(body)
             body.inertial = _valid_properties(given, factor, body.name, report, is_moved=is_moved)
-            if id(body) in moving and body.inertial is ZERO_MASS_PROPERTIES:
+            if id(body) in ids_of_moving_bodies and body.inertial is ZERO_MASS_PROPERTIES:
                 report.state_assumption("no inertia of", body.name)
         for child in body.children:
             set_masses_of_subtree(child, is_moved)

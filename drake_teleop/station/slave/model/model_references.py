@@ -154,17 +154,19 @@ class ModelFiles:
         Call `check_referenced_files` first.
         """
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
-        for mesh in [mesh for path in texts for mesh in self._referenced_files(path, meshes=True)]:
+        for mesh in [
+            mesh for path in texts for mesh in self._referenced_files(path, with_meshes=True)
+        ]:
             if not self.file_access_fault(mesh, "meshes"):
                 yield from filter(os.path.isfile, self.sizes)
 
-    def _referenced_files(self, path: Path, *, meshes: bool = False) -> Iterator[Path]:
+    def _referenced_files(self, path: Path, *, with_meshes: bool = False) -> Iterator[Path]:
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
             tops.append(Path.cwd())  # Drake resolves nested includes from here
         folders = {top / base for top in tops for base in self._bases}
         try:
-            for address in _mesh_addresses(path) if meshes else self._addresses_in_file(path):
+            for address in _mesh_addresses(path) if with_meshes else self._addresses_in_file(path):
                 if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
