@@ -153,6 +153,9 @@ def narrowest_half_width_and_centre(x: Array) -> tuple[Array, Array]:
 
 
 def position_of_parabola_minimum(left: float, middle: float, right: float) -> float:
-    """Return where a parabola through values at -1, 0, 1 has its minimum, clipped; 0 if none."""
+    """Return where a parabola through values at -1, 0, 1 has its minimum; 0 if none.
+
+    The result is clipped to [-1, 1].
+    """
     bend = left - 2.0 * middle + right
     return float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0

@@ -21,7 +21,10 @@ _ThriftStruct = dict[int, Any]
 
 
 def check_parquet(path: Path) -> None:
-    """Raise ValueError, with column and number, if sizes in a Parquet file are wrong."""
+    """Raise ValueError if a Parquet file is empty or damaged.
+
+    A file is damaged if its numbers of rows, values or bytes are inconsistent.
+    """
     with path.open("rb") as file:
         if not file.read(1):
             raise ValueError("it is empty")

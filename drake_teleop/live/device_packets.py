@@ -90,7 +90,7 @@ def valid_state(number: int, t: float, flags: int, numbers: Sequence[float]) -> 
 
 
 def rejection_reason(packet: bytes) -> str:
-    """Return as text why `unpack_state` rejects a packet."""
+    """Return as text why a packet is invalid; only for a packet that `unpack_state` rejects."""
     if len(packet) != _STATE_FORMAT.size:
         length = len(packet) if len(packet) < MAX_PACKET_BYTES else f"more than {MAX_PACKET_BYTES}"
         return f"is {length} bytes long, not {MAX_PACKET_BYTES}"

@@ -110,7 +110,7 @@ class Live:
     def change_scene(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: SceneFunction, now: float
     ) -> None:
-        """Complete the record and start a new session with the requested scene."""
+        """Complete the record and start a new session with the requested scene at `now` [s]."""
         self._scenario, self._load, self._scene_part = scenario, load, show
         self.scene, self.requested_scene = self.requested_scene, ""
         self._restart_session(now)

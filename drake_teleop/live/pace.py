@@ -45,7 +45,7 @@ class Pace:
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated over elapsed time of the last 400 slices; 0 at first."""
+        """Simulated over clock time of the last slices, at most 400; 0 before the second one."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])

@@ -55,7 +55,10 @@ def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return a message on wrong units for a mass above 1000 kg, None for a smaller one."""
+    """Return a message on wrong units for a mass of at least 1000 kg.
+
+    None for a smaller one, or for a log without a description of its wrench.
+    """
     if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected_fields_and_texts_by_cause(causes, log, by_pose=True)[0]

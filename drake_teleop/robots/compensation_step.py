@@ -48,10 +48,11 @@ def low_pass_into(x, low_pass, memory):
 def contact_and_scaled_wrench_into(
     values, gravity, offsets, phi, no_load, scales, low_pass, memory, rest, at, out
 ):
-    """Write the contact wrench and scaled wrench of a valid reading to out (12,).
+    """Write contact wrench and scaled wrench (`scaled_wrench`) of a valid reading to out (12,).
 
     `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
     unfiltered contact wrench. `gravity` (3,) matters if scales of weight and inertia differ.
+    `no_load` (10,) contains zeros, `memory` (2, 12) the state of the filter `low_pass`.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]

@@ -54,7 +54,7 @@ class DesignTask:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Criterion and use of limits at one point of the search.
+    """Criterion, and uses of limits (value over limit), at one point of the search.
 
     Attributes:
         log_criterion: smooth logarithm of the criterion.

@@ -145,7 +145,7 @@ def _trial_wall_name(edge: float) -> str:
 def find_start_place(
     arm: ArmModel, shapes: PostureShapes | None = None, *, plane: float = 0.0, axis: str = "z"
 ) -> StartPlace:
-    """Find a start at which the tool points down.
+    """Find a start posture of the arm at which the tool points down.
 
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.

@@ -87,7 +87,11 @@ class BlockMeans:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
-        """Return y, and for each time [s] its 25 motion columns, set to 0 before that time."""
+        """Return y (M, 67) with 25 columns appended for each time [s].
+
+        They repeat y's columns of the load's wrench, which depend on the motion, and are 0 before
+        that time.
+        """
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)

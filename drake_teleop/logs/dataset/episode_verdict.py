@@ -343,7 +343,7 @@ class Motion(NamedTuple):
 
 
 class EpisodeSignals:
-    """Wrench and motion of an episode, whose log has an orientation and is not low-passed."""
+    """Wrench and motion of an episode; its log must have an orientation and no low-pass."""
 
     def __init__(self, log: Log) -> None:
         self.log = log

@@ -129,7 +129,10 @@ def _evaluate_polynomial_derivatives(coefficients: list[Array], tau: Array, orde
 
 
 def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[Array, Array]:
-    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS."""
+    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS.
+
+    `smooth_derivatives` filters R_WS, also if `bandwidth_hz` is None.
+    """
     _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
     R_SW = np.swapaxes(R_WS, 1, 2)
     return vectors_of_skew_parts(R_SW @ first), vectors_of_skew_parts(R_SW @ second)

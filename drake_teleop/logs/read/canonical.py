@@ -110,7 +110,7 @@ class Log:
 
     @cached_property
     def dt(self) -> float:
-        """Sample spacing [s], without steps across removed gaps."""
+        """Mean sample spacing [s], without steps across removed gaps."""
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 

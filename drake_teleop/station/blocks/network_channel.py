@@ -35,7 +35,8 @@ class NetworkChannel(SteppedBlock):
         direction: 0 or 1; each direction has its own random numbers.
 
     Raises:
-        DrakeTeleopError: if `config.silence` requires packets of a passivity method.
+        DrakeTeleopError: if `config.silence` requires packets of a passivity method, and `size`
+            is not the length of such a packet.
     """
 
     __slots__ = ()

@@ -98,7 +98,10 @@ def are_vectors_finite(vectors):
 
 @njit(cache=True)
 def pose_difference_into(a, b, e):
-    """Write the difference of two poses (7,), [p_a - p_b; log(R_a R_b^T)] in W, into `e` (6,)."""
+    """Write the difference of two poses [quaternion wxyz; p] (7,) in W to `e` (6,) [m, rad].
+
+    It is [p_a - p_b; log(R_a R_b^T)].
+    """
     inverse = conjugate_quaternion((b[0], b[1], b[2], b[3]))
     turn = quaternion_logarithm(quaternion_product((a[0], a[1], a[2], a[3]), inverse))
     for i in range(3):

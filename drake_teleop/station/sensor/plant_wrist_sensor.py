@@ -359,7 +359,11 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
 def _weld_properties(
     plant: MultibodyPlant, S: Frame, joint: WeldJoint
 ) -> tuple[int, int, tuple[Array | float, ...]]:
-    """Return the indices of reaction and body of S in the plant's ports, and the geometry."""
+    """Return the indices of the weld's reaction and of the body B of S, and the geometry.
+
+    The indices are those of the plant's output ports. The geometry contains p_BoSo_B, R_BS, R_SJc
+    (Jc: frame of the reaction), p_SoJc_S, gravity in W, and the sign of the reaction.
+    """
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         what = f"the tool beyond joint '{joint.name()}' has no mass"

@@ -64,10 +64,11 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 def _ik_status_and_all_solutions_into(
     R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array
 ) -> int:
-    """Write all eight solutions to q (8, 6); return the `IkStatus`.
+    """Write all eight solutions for pose R, p to q (8, 6); return the `IkStatus`.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
-    q5 <= 0. Out of reach they are those of the nearest reachable wrist centre.
+    q5 <= 0. Out of reach they are those of the nearest reachable wrist centre. At a singularity of
+    shoulder or wrist, `q1_kept` or `q4_kept` replaces the undetermined angle.
     """
     status = _OK
     x = p[0] - WRIST_TO_S_M * R[0, 2]

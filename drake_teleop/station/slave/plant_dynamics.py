@@ -44,7 +44,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
         pairs: (k, 28) pairs of shapes, `ShapePairs.compiled_pairs`.
         joints: (m, 21) joints of moving bodies, from `MakeJointTableAndRowBodies`.
         applied_W: (6,) wrench [f; tau] that is added, about So, in W [N, N m].
-        sheet: (2,) deflection of the leaf and its rate [m, m/s].
+        sheet: (2,) deflection of the sheet spring's leaf, and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
     """
     has_wrench = pairs.shape[0] > 0
