@@ -52,7 +52,8 @@ def contact_and_scaled_wrench_into(
 
     `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
     unfiltered contact wrench. `gravity` (3,) matters if scales of weight and inertia differ.
-    `no_load` (10,) contains zeros, `memory` (2, 12) the state of the filter `low_pass`.
+    `no_load` (10,) contains zeros, `memory` (2, 12) the state of the filter `low_pass`. For the
+    scaled wrench see `scaled_wrench`.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]

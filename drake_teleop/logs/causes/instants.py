@@ -89,8 +89,8 @@ class BlockMeans:
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
         """Return y (M, 67) with 25 columns appended for each time [s].
 
-        They repeat y's columns of the load's wrench, which depend on the motion, and are 0 before
-        that time.
+        They repeat those columns of y that model the load's wrench (a constant and the motion),
+        and are 0 before that time.
         """
         parts = [self.y]
         for time in times:
