@@ -16,9 +16,12 @@ from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import run_command
 from drake_teleop.lab.run_summary import (
+    FILTER_TAIL_S,
+    ScenarioRun,
     _detection_delays,
     _moving_body_displacements,
     is_in_contact,
+    summarise,
 )
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
@@ -222,6 +225,23 @@ def test_bounces_belong_to_one_contact():
     spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
     contact = is_in_contact(SimulationResult(t, {spec.name: force}, [spec]))
     np.testing.assert_array_equal(np.flatnonzero(contact), [*range(10, 22), 60])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("before_s", "counts"), [(0.5 * FILTER_TAIL_S, False), (1.5 * FILTER_TAIL_S, True)]
+)
+@pytest.mark.parametrize("end", [False, True], ids=["before the contact", "after the contact"])
+def test_residual_leaves_out_the_time_beside_a_contact(contact, before_s, counts, end):
+    """50 N at one sample beside the contact appear in the residual only outside of the tail."""
+    result = SimulationResult.read_parquet(contact[1] / "log.parquet")
+    first, last = result.t[np.flatnonzero(is_in_contact(result))[[0, -1]]]
+    at = last + before_s if end else first - before_s
+    signals = {name: result[name].copy() for name in result.signals}
+    signals["measured_wrench_S"][np.abs(result.t - at).argmin(), 0] += 50.0
+    changed = SimulationResult(result.t, signals, list(result.specs))
+    summary = summarise(ScenarioRun(LoadScenario("contact_transition"), changed, None, "", 1.0))
+    assert (summary["residual_force_max_N"] > 40.0) == counts
 
 
 @pytest.mark.long
