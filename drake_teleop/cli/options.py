@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from functools import partial, wraps
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
@@ -52,44 +54,61 @@ STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
 path = partial(click.option, type=PATH_TYPE)
 
 
-def choice(name: str, words: list[str], default: str, text: str) -> Callable[[Any], Any]:
-    return click.option(name, type=click.Choice(words), default=default, help=text)
+HELP_SETTINGS = dict(help_option_names=["-h", "--help"], max_content_width=100, show_default=True)
 
 
-def _fail_if_outside_range(
-    kind: click.FloatRange | click.IntRange, number: float, param: Any, ctx: Any
-) -> None:
-    low, high = kind.min, kind.max
-    if high is not None and not (low or 0) <= number <= high:
-        text = f"{short_text(number)} is outside {short_text(low or 0)} to {short_text(high)}"
-        kind.fail(text, param, ctx)
-    if low is not None and (number < low or (kind.min_open and number == low)):
-        relation = "not above" if kind.min_open else "below"
-        kind.fail(f"{short_text(number)} is {relation} {short_text(low)}", param, ctx)
+class DocumentedCommand(click.Command):
+    """Command whose docstring ends with `Options:` and the help of its own options."""
+
+    def __init__(self, *arguments: Any, help: str | None, **settings: Any) -> None:
+        text, _, listed = cleandoc(help or "").partition("\n\nOptions:")
+        super().__init__(*arguments, help=text, **settings)
+        options = {each.opts[0]: each for each in self.params if isinstance(each, click.Option)}
+        for name, meaning in re.findall(r"^ {4}(--[\w-]+): ((?:.|\n {8})+)", listed, re.M):
+            options[name].help = meaning.replace("\n" + " " * 8, " ")
 
 
-class FiniteNumber(click.FloatRange):
+class CommandGroup(click.Group):
+    """Group of a `DocumentedCommand` for each decorated function."""
+
+    command_class = DocumentedCommand
+
+
+class Number(click.FloatRange):
     """Parameter type of finite numbers in a range; click's type accepts nan and inf."""
 
-    name = "number"
+    name, _type_without_range = "number", click.FLOAT
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        number: float = click.FLOAT.convert(value, param, ctx)
+    def convert(self: Any, value: Any, param: Any, ctx: Any) -> Any:
+        number, low, high = self._type_without_range.convert(value, param, ctx), self.min, self.max
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
-        _fail_if_outside_range(self, number, param, ctx)
+        if not low <= number <= high:
+            text = f"{short_text(number)} is outside {short_text(low)} to {short_text(high)}"
+            self.fail(text, param, ctx)
+        if self.min_open and number == low:
+            self.fail(f"{short_text(number)} is not above {short_text(low)}", param, ctx)
         return number
 
 
-class IntegerInRange(click.IntRange):
+class Integer(click.IntRange):
     """Parameter type of integers in a range."""
 
-    name = "integer"
+    name, _type_without_range, convert = "integer", click.INT, Number.convert
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> int:
-        number: int = click.INT.convert(value, param, ctx)
-        _fail_if_outside_range(self, number, param, ctx)
-        return number
+
+def number(
+    *names: str, limits: tuple[float, float], min_open: bool = False, **settings: Any
+) -> Any:
+    return click.option(*names, type=Number(*limits, min_open=min_open), **settings)
+
+
+def integer(name: str, limits: tuple[int, int], **settings: Any) -> Any:
+    return click.option(name, type=Integer(*limits), **settings)
+
+
+def choice(name: str, words: list[str], default: str) -> Any:
+    return click.option(name, type=click.Choice(words), default=default)
 
 
 class DelayOrAuto(click.ParamType):
@@ -98,11 +117,11 @@ class DelayOrAuto(click.ParamType):
     name = "auto|SECONDS"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
-        return "auto" if value == "auto" else FiniteNumber(-10, 10).convert(value, param, ctx)
+        return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
-SCALE_TYPE = FiniteNumber(0, 100)
-POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
+SCALE_TYPE = Number(0, 100)
+POSITIVE_TYPE = Number(0, 1e5, min_open=True)
 
 
 class CommaSeparated(click.ParamType):
@@ -168,12 +187,12 @@ def _remove_empty_folders(new: list[Path]) -> None:
             return
 
 
-_SEED_TYPE = IntegerInRange(0, 2**32 - 1)
+_SEED_TYPE = Integer(0, 2**32 - 1)
 seed = click.option("--seed", type=_SEED_TYPE, help="Seed of noise.  [default: the scenario's]")
 seed_0 = click.option("--seed", type=_SEED_TYPE, default=0, help="Random seed.")
 jobs = click.option(
     "--jobs",
-    type=IntegerInRange(1, 4096),
+    type=Integer(1, 4096),
     callback=lambda _ctx, _param, count: count or -1,
     help="Number of parallel processes.  [default: one for each core]",
 )
@@ -285,7 +304,7 @@ def sensor_pose(text: str) -> Callable[[Any], Any]:
     return click.option(
         "--sensor-pose",
         nargs=6,
-        type=FiniteNumber(-1e3, 1e3),
+        type=Number(-1e3, 1e3),
         metavar="X Y Z ROLL PITCH YAW",
         help=text,
     )
