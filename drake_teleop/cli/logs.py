@@ -14,15 +14,8 @@ from drake_teleop.common import files
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import Identification, load_of_object
-from drake_teleop.logs import figures
+from drake_teleop.logs import figures, processing
 from drake_teleop.logs.contact import summarize_contacts
-from drake_teleop.logs.processing import (
-    DetectedLog,
-    EliminatedLog,
-    detect_log,
-    eliminate_log,
-    identify_log,
-)
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 
 if TYPE_CHECKING:
@@ -41,7 +34,7 @@ def identify_command(
 ) -> dict[str, Any]:
     """Identify the load of a log, write the results into `out`, return the summary."""
     gripper_load = None if gripper is None else Identification.load(gripper)
-    found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
+    found = processing.identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else load_of_object(result, gripper_load)
     summary = figures.summarize_log(log, found, cutoff_hz, result.delay_s) | {
@@ -105,7 +98,7 @@ def eliminate_command(
     load_file = Identification.load(load)
     scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
     scales |= dict(sigma_weight=sigma_weight, sigma_inertia=sigma_inertia)
-    found = eliminate_log(
+    found = processing.eliminate_log(
         log,
         load_file,
         **scales,
@@ -153,7 +146,7 @@ def eliminate_command(
     return summary
 
 
-def _wrench_table(found: EliminatedLog) -> pl.DataFrame:
+def _wrench_table(found: processing.EliminatedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
@@ -179,7 +172,9 @@ def detect_command(
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Detect contact in a log, write statistics and contact flags, return the summary."""
-    found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
+    found = processing.detect_log(
+        log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay
+    )
     eliminated = found.eliminated
     summary = figures.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
         "load": None if load is None else str(load),
@@ -210,7 +205,7 @@ def detect_command(
     return summary
 
 
-def _detection_table(found: DetectedLog) -> pl.DataFrame:
+def _detection_table(found: processing.DetectedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}

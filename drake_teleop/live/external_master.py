@@ -14,18 +14,10 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    quaternion_at,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    scale_vector,
-    vector_at,
-)
 from drake_teleop.live.station_swap import finish_master_side
 from drake_teleop.station.master_side import CLUTCH_PERIOD_S
 from drake_teleop.station.operator.operator import HandImpedance
@@ -51,8 +43,10 @@ _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 @njit(cache=True)
 def _pose_and_twist_on_path_into(path, time, out):
     share = min(max((time - path[_START_TIME_INDEX]) / POSE_PERIOD_S, 0.0), 1.0)
-    r = scale_vector(share, vector_at(path, _ROTATION_INDEX))
-    rotation = quaternion_product(quaternion_exponential(r), quaternion_at(path, _START_POSE_INDEX))
+    r = vectors.scale_vector(share, vectors.vector_at(path, _ROTATION_INDEX))
+    rotation = vectors.quaternion_product(
+        vectors.quaternion_exponential(r), vectors.quaternion_at(path, _START_POSE_INDEX)
+    )
     moves = 1.0 / POSE_PERIOD_S if share < 1.0 else 0.0
     for k in range(4):
         out[k] = rotation[k]
@@ -131,8 +125,10 @@ class ExternalMaster(LeafSystem):
         """Interpolate the device's X_BE to `target` (7,) over 2 ms; None: the hand lets go."""
         now, held, motion = self._current_pose_and_twist(context)[:7], 0.0, np.zeros(6)
         if target is not None:
-            turn = quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))
-            held, motion = 1.0, np.append(target[4:] - now[4:], quaternion_logarithm(turn))
+            turn = vectors.quaternion_product(
+                tuple(target[:4]), vectors.conjugate_quaternion(tuple(now[:4]))
+            )
+            held, motion = 1.0, np.append(target[4:] - now[4:], vectors.quaternion_logarithm(turn))
         path = [held, context.get_time(), *now, *motion]
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 

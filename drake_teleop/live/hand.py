@@ -14,30 +14,13 @@ from pydrake.systems.framework import (
     DiagramBuilder,
 )
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    add_cross_product,
-    conjugate_quaternion,
-    copy_into,
-    cross,
-    plus,
-    quaternion_at,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    scale_vector,
-    vector_at,
-)
 from drake_teleop.live.station_swap import finish_master_side
 from drake_teleop.station.master_side import MakeMasterSide
-from drake_teleop.station.operator.operator import (
-    HandImpedance,
-    Operator,
-    OperatorConfig,
-    hand_wrench_into,
-)
+from drake_teleop.station.operator import operator
 from drake_teleop.station.scenario import Scenario
 
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
@@ -81,8 +64,10 @@ def _intended_motion_into(path, time, pose, out):
         turning = turn_rate + _ROTATION_POLE_RAD_S * turn
         r[k] = (turn + turning * t) * turning_decay
         rate[k] = (turn_rate - _ROTATION_POLE_RAD_S * turning * t) * turning_decay
-    target = quaternion_at(path, _TARGET_POSE_INDEX)
-    orientation = quaternion_product(quaternion_exponential(vector_at(r, 0)), target)
+    target = vectors.quaternion_at(path, _TARGET_POSE_INDEX)
+    orientation = vectors.quaternion_product(
+        vectors.quaternion_exponential(vectors.vector_at(r, 0)), target
+    )
     for k in range(4):
         out[k] = orientation[k]
     # omega = rate + a r x rate + b r x (r x rate)
@@ -106,18 +91,22 @@ def _rotation_vector_rate(r, omega):
     if square > 1e-4:
         angle = math.sqrt(square)
         c = 1.0 / square - math.sin(angle) / (2.0 * angle * (1.0 - math.cos(angle)))
-    across = cross(r, omega)
-    return add_cross_product(plus(omega, scale_vector(-0.5, across)), scale_vector(c, r), across)
+    across = vectors.cross(r, omega)
+    return vectors.add_cross_product(
+        vectors.plus(omega, vectors.scale_vector(-0.5, across)), vectors.scale_vector(c, r), across
+    )
 
 
 @njit(cache=True)
 def _start_path_into(path, time, now, target, poles):
     path[_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, poles
-    copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
-    rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
-    rate = _rotation_vector_rate(rotation, vector_at(now, 10))
-    copy_into(path, _VELOCITY_INDEX, now, 7, 3)
-    copy_into(path, _ACCELERATION_INDEX, now, 13, 3)
+    vectors.copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
+    rotation = vectors.quaternion_logarithm(
+        vectors.quaternion_product(now, vectors.conjugate_quaternion(target))
+    )
+    rate = _rotation_vector_rate(rotation, vectors.vector_at(now, 10))
+    vectors.copy_into(path, _VELOCITY_INDEX, now, 7, 3)
+    vectors.copy_into(path, _ACCELERATION_INDEX, now, 13, 3)
     for k in range(3):
         path[_OFFSET_INDEX + k] = now[4 + k] - target[4 + k]
         path[_ROTATION_INDEX + k], path[_RATE_INDEX + k] = rotation[k], rate[k]
@@ -128,10 +117,10 @@ def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, 
     _intended_motion_into(path, time, pose, intention)
     for k in range(3):
         intention[4 + k] += mass / impedance[0] * intention[13 + k]
-    hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
+    operator.hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
 
 
-class LiveHand(Operator):
+class LiveHand(operator.Operator):
     """Hand of an operator that follows external targets.
 
     .. pydrake_system::
@@ -147,7 +136,7 @@ class LiveHand(Operator):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, config: OperatorConfig, start: Array) -> None:
+    def __init__(self, config: operator.OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
         self._scratch, self._mass = np.empty(_INTENDED_MOTION_SIZE), config.hand.mass
 
@@ -166,7 +155,9 @@ class LiveHand(Operator):
             _start_path_into(path, context.get_time(), now, target, _TRANSLATION_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def KeepWrench(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+    def KeepWrench(
+        self, context: Context, before: operator.HandImpedance, after: operator.HandImpedance
+    ) -> None:
         """Shift the intended motion so that the new impedance causes no step of the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD_INDEX] < 0.5:
@@ -174,14 +165,16 @@ class LiveHand(Operator):
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._current_motion(context)
         intended, now = tuple(intention[:4]), tuple(pose[:4])
-        rotation = quaternion_logarithm(quaternion_product(intended, conjugate_quaternion(now)))
+        rotation = vectors.quaternion_logarithm(
+            vectors.quaternion_product(intended, vectors.conjugate_quaternion(now))
+        )
         share = before.rotational_stiffness / after.rotational_stiffness
         displacement = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
         translation_share = before.damping / after.damping
         rotation_share = before.rotational_damping / after.rotational_damping
         damping = np.repeat([translation_share, rotation_share], 3)
-        turn = quaternion_exponential(scale_vector(share, rotation))
-        intention[:4] = quaternion_product(turn, now)
+        turn = vectors.quaternion_exponential(vectors.scale_vector(share, rotation))
+        intention[:4] = vectors.quaternion_product(turn, now)
         intention[4:7] = pose[4:] + displacement
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
