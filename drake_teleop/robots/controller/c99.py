@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -15,10 +14,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.version import __version__
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import design_low_pass
-from drake_teleop.robots import compensation_step as step
 from drake_teleop.robots.compensator import STALE_AGE_S, Compensator
-from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
 from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
@@ -29,26 +25,6 @@ _NUM_TEST_READINGS = 1000
 _TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
 
 Files = Mapping[str, str | bytes]
-
-
-@cache
-def c_kernel_text() -> str:
-    c = Translator()
-    values, row, out = (NUM_READING_VALUES,), (NUM_READING_VALUES + 6,), (12,)
-    c.translate_function(step.reading_problem, values=values, largest=values, limits=(6,))
-    factors = dict.fromkeys(("sigma_weight", "sigma_inertia", "gamma"), "double")
-    c.translate_function(step.set_scale_factors_into, **factors, scales=(4,))
-    arrays: dict[str, Any] = {"values": values, "gravity": (3,), "offsets": (6,), "phi": (10,)}
-    arrays |= {"no_load": (10,), "scales": (4,), "low_pass": ("low_pass_count",)}
-    arrays |= {"memory": (2, *out), "rest": (1, *row), "at": "int", "out": out}
-    c.translate_function(step.contact_and_scaled_wrench_into, **arrays)
-    c.translate_function(step.clip_wrenches, wrenches=out, limits=(6,))
-    moments: dict[str, Any] = {"count": "double", "mean": row, "squares": row}
-    c.translate_function(step.add_to_statistics, row=row, **moments)
-    c.translate_function(step.update_tare_offsets, **moments, noise_limits=(6,), offsets=(6,))
-    numbers = dict.fromkeys(("dt", "tangent", "ahead_s"), "double")
-    c.translate_function(design_low_pass, **numbers, low_pass=(7,))
-    return render_template("wrench_compensator.c", kernel=c.text, helpers=C_HELPER_FUNCTIONS)
 
 
 class ControllerTarget(NamedTuple):
@@ -99,7 +75,7 @@ def kernel_files(target: ControllerTarget) -> Files:
     settings, dt = target.settings_initializer(), repr(target.dt)
     return {
         "wrench_compensator.h": read_template("wrench_compensator.h"),
-        "wrench_compensator.c": c_kernel_text(),
+        "wrench_compensator.c": render_template("wrench_compensator.c"),
         "load.h": render_template("load.h", dt=dt, settings=settings, notes=target.notes),
     }
 
