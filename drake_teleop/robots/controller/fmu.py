@@ -10,24 +10,11 @@ import tempfile
 import zipfile
 from pathlib import Path
 from uuid import NAMESPACE_URL, uuid5
-from xml.etree.ElementTree import Element, SubElement
 
-from drake_teleop.common.version import __version__
 from drake_teleop.robots.controller import c99
-from drake_teleop.robots.export import indented_xml
 
-_MODEL_NAME, _XML_HEAD = "wrench_compensator", '<?xml version="1.0" encoding="UTF-8"?>\n'
+_MODEL_NAME = "wrench_compensator"
 _WRENCH_COMPONENT_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
-_UNIT_EXPONENTS = {
-    "N": {"kg": "1", "m": "1", "s": "-2"},
-    "N.m": {"kg": "1", "m": "2", "s": "-2"},
-    "m/s2": {"m": "1", "s": "-2"},
-    "rad/s": {"rad": "1", "s": "-1"},
-    "rad/s2": {"rad": "1", "s": "-2"},
-    "kg": {"kg": "1"},
-    "kg.m": {"kg": "1", "m": "1"},
-    "kg.m2": {"kg": "1", "m": "2"},
-}
 _PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
@@ -53,14 +40,9 @@ def _fmu_archive(
     sources = {**kernel, f"fmi{version[0]}.c": c99.read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
     c_files = [name for name in sources if name.endswith(".c")]
-    files["modelDescription.xml"] = _model_description(target, version, token, c_files)
+    files["modelDescription.xml"] = _model_description(target, version, token)
     if version == "3.0":
-        build = Element("fmiBuildDescription", fmiVersion="3.0")
-        configuration = SubElement(build, "BuildConfiguration", modelIdentifier=_MODEL_NAME)
-        group = SubElement(configuration, "SourceFileSet", language="C99")
-        for name in c_files:
-            SubElement(group, "SourceFile", name=name)
-        files["sources/buildDescription.xml"] = _XML_HEAD + indented_xml(build)
+        files["sources/buildDescription.xml"] = c99.read_template("buildDescription.xml")
     if cc is not None:
         binary = f"binaries/{_PLATFORM_OF_FMI_VERSION[version]}/{_MODEL_NAME}.so"
         files[binary] = _compile_library(cc, sources, c_files)
@@ -81,56 +63,18 @@ def _compile_library(compiler: str, sources: c99.Files, c_files: list[str]) -> b
         return (folder / "library.so").read_bytes()
 
 
-def _model_description(
-    target: c99.ControllerTarget, version: str, token: str, c_files: list[str]
-) -> str:
-    new = version == "3.0"
-    root = Element(
-        "fmiModelDescription",
-        {
-            "fmiVersion": version,
-            "modelName": _MODEL_NAME,
-            "instantiationToken" if new else "guid": token,
-            "description": "Wrist wrench without weight and inertia of the load",
-            "generationTool": f"drake_teleop {__version__}",
-        },
-    )
-    simulation = SubElement(root, "CoSimulation", modelIdentifier=_MODEL_NAME)
-    if new:
-        simulation.set("fixedInternalStepSize", repr(target.dt))
-    else:
-        files = SubElement(simulation, "SourceFiles")
-        for name in c_files:
-            SubElement(files, "File", name=name)
-    units = SubElement(root, "UnitDefinitions")
-    for unit, base in _UNIT_EXPONENTS.items():
-        SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", base)
-    SubElement(root, "DefaultExperiment", stepSize=repr(target.dt))
-    variables = SubElement(root, "ModelVariables")
-    listed = _model_variables(target)
-    for reference, (name, causality, unit, start) in enumerate(listed):
-        common = {"name": name, "valueReference": str(reference), "causality": causality}
-        common["variability"] = "tunable" if causality == "parameter" else "discrete"
-        values = {} if start is None else {"start": repr(start)}
-        values |= {"unit": unit} if unit else {}
-        if new:
-            SubElement(variables, "Int32" if name == "flags" else "Float64", common | values)
-        else:
-            variable = SubElement(variables, "ScalarVariable", common)
-            SubElement(variable, "Integer" if name == "flags" else "Real", values)
-    if new:
-        time = {"name": "time", "valueReference": str(len(listed)), "causality": "independent"}
-        SubElement(variables, "Float64", time | {"variability": "continuous"})
-    outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
-    structure = SubElement(root, "ModelStructure")
-    for tag in ("Output", "InitialUnknown"):
-        group = structure if new else SubElement(structure, f"{tag}s")
-        for k in outputs:
-            if new:
-                SubElement(group, tag, valueReference=str(k))
-            else:
-                SubElement(group, "Unknown", index=str(k + 1))
-    return _XML_HEAD + indented_xml(root)
+def _model_description(target: c99.ControllerTarget, version: str, token: str) -> str:
+    number, integer = ("Float64", "Int32") if version == "3.0" else ("Real", "Integer")
+    variables = []
+    for name, causality, unit, start in _model_variables(target):
+        values = "" if start is None else f' start="{start!r}"'
+        values += f' unit="{unit}"' if unit else ""
+        variability = "tunable" if causality == "parameter" else "discrete"
+        kind = integer if name == "flags" else number
+        variables.append((name, causality, variability, kind, values))
+    outputs = [k for k, variable in enumerate(variables) if variable[1] == "output"]
+    names = {"token": token, "dt": repr(target.dt), "variables": variables, "outputs": outputs}
+    return c99.render_template(f"modelDescription{version[0]}.xml", **names)
 
 
 def _model_variables(target: c99.ControllerTarget) -> list[tuple[str, str, str, float | None]]:
