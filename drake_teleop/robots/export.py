@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
@@ -122,27 +122,10 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
     return [*warnings, format.note] if format.note else warnings
 
 
-def _format_number(value: float) -> str:
-    return repr(float(value) + 0.0)
-
-
-def _format_row(values: Any) -> str:
-    return ", ".join(map(_format_number, values))
-
-
-def _ur_script(load: ExportedLoad) -> str:
-    com, inertia = _format_row(load.com), _format_row(load.inertia_entries)
-    return f"set_target_payload({_format_number(load.mass)}, [{com}], [{inertia}])\n"
-
-
 def _franka_json(load: ExportedLoad) -> str:
     inertia, identity = load.inertia.T.ravel().tolist(), np.eye(4).ravel().tolist()
     values = {"mass": load.mass, "centerOfMass": load.com.tolist(), "inertia": inertia}
-    return _json_text(values | {"transformation": identity})
-
-
-def _xarm_call(load: ExportedLoad) -> str:
-    return f"arm.set_tcp_load({_format_number(load.mass)}, [{_format_row(1e3 * load.com)}])\n"
+    return json.dumps(values | {"transformation": identity}, indent=2) + "\n"
 
 
 def _kth_yaml(load: ExportedLoad) -> str:
@@ -169,70 +152,23 @@ def _admittance_yaml(load: ExportedLoad) -> str:
     return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
 
 
-def _bota_json(load: ExportedLoad) -> str:
-    names = (name.capitalize() for name in _INERTIA_NAMES)
-    inertia = {name: float(x) for name, x in zip(names, load.inertia_entries, strict=True)}
-    bias = dict(zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), load.offsets.tolist(), strict=True))
-    properties = {
-        "mass": load.mass,
-        "com": dict(zip("xyz", load.com.tolist(), strict=True)),
-        "inertia": inertia,
-        "bias": bias,
-    }
-    config = {"enable_dynamic_compensation": True, "payload_properties": properties}
-    return _json_text({"payload_compensator_config": config})
+def _from_template(name: str) -> Callable[[ExportedLoad], str]:
+    """Return the function that writes a load by the template `formats/NAME.j2`."""
 
+    def write(load: ExportedLoad) -> str:
+        names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        entries = np.array(load.inertia_entries)
+        values = vars(load) | {
+            "entries": entries,
+            "inertia": dict(zip(names, entries, strict=True)),
+        }
+        return render_page("drake_teleop.robots", f"formats/{name}.j2", **values) + "\n"
 
-_INERTIA_NAMES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-
-
-def _urdf_xml(load: ExportedLoad) -> str:
-    root = Element("robot", name="load")
-    inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
-    SubElement(inertial, "origin", xyz=_space_separated(load.com), rpy="0 0 0")
-    SubElement(inertial, "mass", value=_format_number(load.mass))
-    inertia = zip(_INERTIA_NAMES, map(_format_number, load.inertia_entries), strict=True)
-    SubElement(inertial, "inertia", dict(inertia))
-    return indented_xml(root)
-
-
-def _sdf_xml(load: ExportedLoad) -> str:
-    root = Element("sdf", version="1.9")
-    link = SubElement(SubElement(root, "model", name="load"), "link", name="load")
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "pose").text = f"{_space_separated(load.com)} 0 0 0"
-    SubElement(inertial, "mass").text = _format_number(load.mass)
-    inertia = SubElement(inertial, "inertia")
-    for name, value in zip(_INERTIA_NAMES, load.inertia_entries, strict=True):
-        SubElement(inertia, name).text = _format_number(value)
-    return indented_xml(root)
-
-
-def _mjcf_xml(load: ExportedLoad) -> str:
-    root = Element("mujoco", model="load")
-    body = SubElement(SubElement(root, "worldbody"), "body", name="load")
-    SubElement(body, "freejoint")
-    inertial = SubElement(body, "inertial", pos=_space_separated(load.com))
-    inertial.set("mass", _format_number(load.mass))
-    inertial.set("fullinertia", _space_separated(load.inertia_entries))
-    return indented_xml(root)
-
-
-def indented_xml(root: Element) -> str:
-    indent(root)
-    return tostring(root, encoding="unicode") + "\n"
+    return write
 
 
 def _float_list(values: Array) -> list[float]:
     return [float(value) + 0.0 for value in values]
-
-
-def _space_separated(values: Any) -> str:
-    return " ".join(map(_format_number, values))
-
-
-def _json_text(document: dict[str, Any]) -> str:
-    return json.dumps(document, indent=2) + "\n"
 
 
 _SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
@@ -241,11 +177,11 @@ _format_of_sensor = partial(Format, of_sensor=True, inertia=False, comment="#")
 FORMATS = Registry(
     "export format",
     {
-        "ur": Format(_ur_script, comment="#"),
+        "ur": Format(_from_template("ur"), comment="#"),
         "franka": Format(
             _franka_json, note="transformation is the identity: use that of your end effector"
         ),
-        "xarm": Format(_xarm_call, inertia=False, comment="#"),
+        "xarm": Format(_from_template("xarm"), inertia=False, comment="#"),
         "kth": _format_of_sensor(
             _kth_yaml,
             offsets=True,
@@ -255,14 +191,14 @@ FORMATS = Registry(
         "ft_tools": _format_of_sensor(_ft_tools_yaml, offsets=True),
         "ros2-admittance": _format_of_sensor(_admittance_yaml, note=_SENSOR_FRAME_NOTE),
         "bota": Format(
-            _bota_json,
+            _from_template("bota"),
             of_sensor=True,
             offsets=True,
             note="the inertia is about the centre of mass; Bota does not document the point",
         ),
-        "urdf": Format(_urdf_xml, body=True),
-        "sdf": Format(_sdf_xml, body=True),
-        "mjcf": Format(_mjcf_xml, body=True),
+        "urdf": Format(_from_template("urdf"), body=True),
+        "sdf": Format(_from_template("sdf"), body=True),
+        "mjcf": Format(_from_template("mjcf"), body=True),
     },
     Format,
 )
