@@ -18,10 +18,10 @@ from typing import Any
 
 from drake_teleop.logs.causal import design_low_pass
 from drake_teleop.robots import compensation_step as step
-from drake_teleop.robots.controller import c99
+from drake_teleop.robots.controller import export
 from drake_teleop.robots.streams import NUM_READING_VALUES
 
-TEMPLATE = Path(c99.__file__).parent / "templates" / "wrench_compensator.c.j2"
+TEMPLATE = Path(export.__file__).parent / "templates" / "wrench_compensator.c.j2"
 
 C_HELPER_FUNCTIONS = """\
 static int isfinite_(double x) { return x - x == 0.0; }

@@ -18,7 +18,7 @@ from drake_teleop.cli.main import main
 from drake_teleop.common.compiled import njit
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensation_step import TARE_EXCEEDS_DRIFT, TARE_WRENCH_VARIES
-from drake_teleop.robots.controller.c99 import CFLAGS, kernel_files
+from drake_teleop.robots.controller.export import CFLAGS, kernel_files
 from drake_teleop.robots.streams import Reading, ReadingFlag
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
