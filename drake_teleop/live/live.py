@@ -18,7 +18,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live import inputs as live_inputs
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceLink
-from drake_teleop.live.external_master import POSE_PERIOD_MS
+from drake_teleop.live.hand import POSE_PERIOD_MS
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.scenarios import SCENE_NAMES
