@@ -48,7 +48,7 @@ EXPLAINED = {
     # Processes that this one starts; they communicate by pipes.
     ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
     # Module of the package by its name.
-    ("cli/printing.py", "import_module"),
+    ("cli/logs.py", "import_module"),
     ("__init__.py", "import_module"),
     ("robots/connections.py", "import_module"),
     # polars in a thread of its own.

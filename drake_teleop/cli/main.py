@@ -171,7 +171,7 @@ def parts() -> None:
 
     --register FILE adds your own parts: drake-teleop --register mine.py parts
     """
-    from drake_teleop.cli.printing import print_registered_names
+    from drake_teleop.cli.logs import print_registered_names
 
     print_registered_names()
 
