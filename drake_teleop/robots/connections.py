@@ -17,7 +17,7 @@ from drake_teleop.robots import assembly
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import JOINTS, WRENCH_AND_MOTION, Sink, Source
+from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY_PREFIX = "replay:"
@@ -148,13 +148,7 @@ def _open_streams(
                 what = "delivers no motion apart from its wrench"
                 remedy = "give a source such as rtde://HOST"
                 raise DrakeTeleopError(what, where=motion, remedy=remedy)
-        if arm is not None:
-            if JOINTS not in opened[-1].streams:
-                what = "delivers no joint positions for --model"
-                remedy = "give a source such as zenoh://HOST/TOPIC?joints=/joint_states"
-                raise DrakeTeleopError(what, where=motion or address, remedy=remedy)
-            opened[-1] = assembly.PoseSourceFromJoints(opened[-1], arm)
-        return assembly.WrenchAndMotionStreams(*opened, where=motion or address)
+        return assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)
     except BaseException:
         for each in opened:
             each.close()
