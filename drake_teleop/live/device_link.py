@@ -12,11 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    quaternion_logarithm,
-    quaternion_product,
-)
+from drake_teleop.common.vectors import conjugate_quaternion, quaternion_product
 from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
@@ -27,7 +23,7 @@ from drake_teleop.live.device_packets import (
     rejection_reason,
     unpack_state,
 )
-from drake_teleop.live.inputs import INPUT_UNIT_M, INPUT_UNIT_RAD
+from drake_teleop.live.inputs import inputs_at_displacement
 from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_END_TIMEOUT_S = 2.0  # s
@@ -118,13 +114,9 @@ class DeviceLink:
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
         first = self._origin
-        turn = quaternion_logarithm(
-            quaternion_product(state.quaternion_wxyz, conjugate_quaternion(first.quaternion_wxyz))
-        )
-        values: dict[str, float] = {"held": 1}
-        for k, name in enumerate("xyz"):
-            values[name] = (state.position[k] - first.position[k]) / INPUT_UNIT_M
-            values["r" + name] = turn[k] / INPUT_UNIT_RAD
+        moved = np.subtract(state.position, first.position)
+        back = conjugate_quaternion(first.quaternion_wxyz)
+        values = inputs_at_displacement(moved, quaternion_product(state.quaternion_wxyz, back))
         if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_AFTER_SILENCE_S:
             values["clutch"] = 0
         return values

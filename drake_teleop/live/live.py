@@ -294,7 +294,7 @@ class Live:
             "scene": self.requested_scene or self.scene,
             "record": self._folder,
             "stopped": self.stopped,
-            "inputs": {name: getattr(inputs, name) for name in live_inputs.INPUT_RANGES},
+            "inputs": dict(vars(inputs)),
         }
 
     def _state_name(self) -> str:

@@ -17,7 +17,7 @@ from drake_teleop.live.experiment.design import PegInSlot
 from drake_teleop.live.experiment.procedure import GAP_PHASE, INTERVAL_PHASE, Procedure
 from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import TrialStore
-from drake_teleop.live.inputs import INPUT_RANGES, Inputs
+from drake_teleop.live.inputs import Inputs
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
@@ -209,8 +209,7 @@ class GuidedExperiment:
         task = self._procedure.task
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
-        inputs = {name: getattr(Inputs(), name) for name in INPUT_RANGES}
-        inputs |= {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
+        inputs = vars(Inputs()) | {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
