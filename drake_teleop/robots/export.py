@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,11 +13,9 @@ from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import to_yaml_text
+from drake_teleop.common.texts import format_yaml_value
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
-
-STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 @dataclass(frozen=True)
@@ -121,53 +118,22 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
     return [*warnings, format.note] if format.note else warnings
 
 
-def _franka_json(load: ExportedLoad) -> str:
-    inertia, identity = load.inertia.T.ravel().tolist(), np.eye(4).ravel().tolist()
-    values = {"mass": load.mass, "centerOfMass": load.com.tolist(), "inertia": inertia}
-    return json.dumps(values | {"transformation": identity}, indent=2) + "\n"
-
-
-def _kth_yaml(load: ExportedLoad) -> str:
-    return to_yaml_text(
-        {
-            "bias": _float_list(load.offsets),
-            "gripper_com_frame_id": "ft_sensor",
-            "gripper_com_pose": [*_float_list(load.com), 0.0, 0.0, 0.0],
-            "gripper_mass": float(load.mass),
-        }
-    )
-
-
-def _ft_tools_yaml(load: ExportedLoad) -> str:
-    force, torque = (_float_list(part) for part in np.split(load.offsets, 2))
-    values = {"mass": float(load.mass), "sensor_frame_to_com": _float_list(load.com)}
-    return to_yaml_text(values | {"force_offset": force, "torque_offset": torque})
-
-
-def _admittance_yaml(load: ExportedLoad) -> str:
-    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY_M_S2)}
-    compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
-    parameters = {"gravity_compensation": compensation}
-    return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
-
-
 def _from_template(name: str) -> Callable[[ExportedLoad], str]:
     """Return the function that writes a load by the template `formats/NAME.j2`."""
 
+    def numbers(values: Iterable[float], separator: str = ", ") -> str:
+        return separator.join(repr(float(value) + 0.0) for value in values)
+
+    def yaml(values: Iterable[float]) -> str:
+        return format_yaml_value([float(value) + 0.0 for value in values])[1:-1]
+
     def write(load: ExportedLoad) -> str:
         names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        entries = np.array(load.inertia_entries)
-        values = vars(load) | {
-            "entries": entries,
-            "inertia": dict(zip(names, entries, strict=True)),
-        }
+        entries = dict(zip(names, load.inertia_entries, strict=True))
+        values = {**vars(load), "entries": entries, "numbers": numbers, "yaml": yaml}
         return render_page("drake_teleop.robots", f"formats/{name}.j2", **values) + "\n"
 
     return write
-
-
-def _float_list(values: Array) -> list[float]:
-    return [float(value) + 0.0 for value in values]
 
 
 _SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
@@ -178,17 +144,20 @@ FORMATS = Registry(
     {
         "ur": Format(_from_template("ur"), comment="#"),
         "franka": Format(
-            _franka_json, note="transformation is the identity: use that of your end effector"
+            _from_template("franka"),
+            note="transformation is the identity: use that of your end effector",
         ),
         "xarm": Format(_from_template("xarm"), inertia=False, comment="#"),
         "kth": _format_of_sensor(
-            _kth_yaml,
+            _from_template("kth"),
             offsets=True,
             note=f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
             " compensated force is twice the weight, change the sign of the mass",
         ),
-        "ft_tools": _format_of_sensor(_ft_tools_yaml, offsets=True),
-        "ros2-admittance": _format_of_sensor(_admittance_yaml, note=_SENSOR_FRAME_NOTE),
+        "ft_tools": _format_of_sensor(_from_template("ft_tools"), offsets=True),
+        "ros2-admittance": _format_of_sensor(
+            _from_template("ros2-admittance"), note=_SENSOR_FRAME_NOTE
+        ),
         "bota": Format(
             _from_template("bota"),
             of_sensor=True,
