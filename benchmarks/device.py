@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.live.device_client import VirtualDevice, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state, unpack_state
@@ -34,7 +35,6 @@ from drake_teleop.live.live import Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.scenarios import live_scenario, with_task_space_device
 from drake_teleop.live.session import Session
-from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.scenario import LoadScenario, replace

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -23,12 +23,15 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.haply import HaplyDevice
-from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _CLIENT_PERIOD_S, _MAX_CLIENT_PERIOD_S = 1e-3, 0.1  # s
 _MAX_STORED_FORCE_AGES = 100_000  # ticks
+_SIMULATION_STEPS_PER_MS = 10  # per ms
+_MASS_KG, _DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
+HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
+"""Function from time [s] to intended position [m] and velocity [m/s]."""
 
 
 class HapticDevice(Protocol):
@@ -116,6 +119,50 @@ class DeviceClient:
     def close(self) -> None:
         self._device.close()
         self._socket.close()
+
+
+class VirtualDevice:
+    """Simulated device in a moving hand; `energy`: work against the rendered force [J]."""
+
+    def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
+        held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
+        self._mass, self._k, self._d = _MASS_KG + held.mass, held.stiffness, held.damping
+        self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
+        self.energy, self._t = 0.0, 0.0
+
+    def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
+        """Simulate `seconds` under a constant force (3,) on the hand [N]."""
+        steps = max(math.ceil(seconds * 1e3 * _SIMULATION_STEPS_PER_MS - 1e-9), 1)
+        h = seconds / steps
+        for _ in range(steps):
+            self._t += h
+            at, speed = self._hand(self._t)
+            for i in range(3):
+                x, v = self.position[i], self.velocity[i]
+                elastic, damped = self._k * (at[i] - x), self._d * (speed[i] - v)
+                pull = force[i] - _DAMPING_NS_M * v + elastic + damped
+                v += h * pull / self._mass
+                self.velocity[i], self.position[i] = v, x + h * v
+                self.energy -= force[i] * h * v
+
+
+def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
+    """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""
+    lift, hold = 0.01, 0.6
+
+    def hand_motion(t: float) -> tuple[Sequence[float], Sequence[float]]:
+        phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)
+        if phase < way:
+            s, rate = phase / way, 1.0
+        elif phase < way + hold:
+            s, rate = 1.0, 0.0
+        else:
+            s, rate = (1.0 - phase) / way, -1.0
+        smooth, slope = s * s * (3.0 - 2.0 * s), 6.0 * s * (1.0 - s) * rate * hertz / way
+        far = depth + lift
+        return (0.0, 0.0, lift - far * smooth), (0.0, 0.0, -far * slope)
+
+    return hand_motion
 
 
 class RealTimeVirtualDevice:

@@ -39,8 +39,7 @@ from drake_teleop.common.progress import StartStage, UpdateProgress, show_progre
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceConnection
-from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
-from drake_teleop.live.pace import without_garbage_collection
+from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live, without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import (
     SCENE_NAMES,

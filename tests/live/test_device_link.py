@@ -15,7 +15,7 @@ from websockets.sync.server import serve
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
-from drake_teleop.live.device_client import DeviceClient
+from drake_teleop.live.device_client import DeviceClient, VirtualDevice, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceConnection, DeviceLink
 from drake_teleop.live.device_packets import (
@@ -33,7 +33,6 @@ from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.live.session import Session, read_drive
-from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.result import SimulationResult
 
 MS = 1e-3
