@@ -17,8 +17,12 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE
 from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.compensator import SCALE_NAMES, Compensator
-from drake_teleop.robots.ros2 import parse_ros2_address, shared_node
-from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of_address
+from drake_teleop.robots.ros2 import (
+    SOURCE_PARAMETERS,
+    domain_of_address,
+    parse_ros2_address,
+    shared_node,
+)
 
 _CALIBRATION_STOP_TIMEOUT_S = 3.0  # longest time for the last evaluation of a calibration [s]
 _CALIBRATE_PYTHON_CODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"

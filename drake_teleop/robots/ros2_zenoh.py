@@ -14,7 +14,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.ros2_messages import (
+from drake_teleop.robots.ros2 import (
     MESSAGE_TYPE_OF_TOPIC,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
