@@ -17,6 +17,8 @@ from drake_teleop.common.texts import format_yaml_value
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
+STANDARD_GRAVITY_M_S2 = 9.80665
+
 
 @dataclass(frozen=True)
 class ExportedLoad:
@@ -131,6 +133,7 @@ def _from_template(name: str) -> Callable[[ExportedLoad], str]:
         names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         entries = dict(zip(names, load.inertia_entries, strict=True))
         values = {**vars(load), "entries": entries, "numbers": numbers, "yaml": yaml}
+        values["weight"] = load.mass * STANDARD_GRAVITY_M_S2
         return render_page("drake_teleop.robots", f"formats/{name}.j2", **values) + "\n"
 
     return write
