@@ -204,7 +204,7 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
         for i in random.integers(0, len(text), random.integers(1, 8)):
             text[i] = chr(random.integers(1, 300))
         heard = parse_device_message("".join(text))
-        wrong += heard is not None and not np.isfinite([*heard.state.position]).all()
+        wrong += heard is not None and not np.isfinite([*heard[1].position]).all()
     link.close()
     return {"fuzz_messages": 2.0 * count, "fuzz_not_finite": wrong, "fuzz_packets_refused": refused}
 

@@ -40,8 +40,8 @@ class HapticDevice(Protocol):
     @property
     def limits(self) -> DeviceLimits: ...
 
-    def read(self) -> device_packets.DevicePose | None:
-        """Return the next pose; None if none is received for 0.5 s."""
+    def read(self) -> device_packets.DeviceState | None:
+        """Return the next pose, without number and time; None if none is received for 0.5 s."""
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
@@ -101,16 +101,12 @@ class DeviceClient:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send_pose(self, pose: device_packets.DevicePose, now: float, age: float) -> None:
+    def _send_pose(self, pose: device_packets.DeviceState, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
             self.force_ages_s.append(behind)
-        x, y, z = map(float, pose.position)
-        w, i, j, k = map(float, pose.quaternion_wxyz)
-        state = device_packets.DeviceState(
-            self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind
-        )
+        state = pose._replace(number=self._number, t=now, behind=behind)
         try:
             self._socket.send(device_packets.pack_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer
@@ -175,7 +171,7 @@ class RealTimeVirtualDevice:
         self._wrench: Sequence[float] = (0.0,) * 6
         self._due = self._simulated_until = time.perf_counter()
 
-    def read(self) -> device_packets.DevicePose:
+    def read(self) -> device_packets.DeviceState:
         self._due += _CLIENT_PERIOD_S
         now = time.perf_counter()
         if self._due > now:
@@ -185,7 +181,8 @@ class RealTimeVirtualDevice:
             self._due = self._simulated_until = now
         self.virtual.simulate_motion(self._wrench[:3], max(now - self._simulated_until, 1e-6))
         self._simulated_until = now
-        return device_packets.DevicePose(self.virtual.position)
+        x, y, z = self.virtual.position
+        return device_packets.DeviceState(0, 0.0, (x, y, z))
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         self._wrench = wrench
