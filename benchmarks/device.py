@@ -31,8 +31,7 @@ from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state, unpack_state
 from drake_teleop.live.haply import parse_device_message
-from drake_teleop.live.live import Live
-from drake_teleop.live.pace import without_garbage_collection
+from drake_teleop.live.live import Live, without_garbage_collection
 from drake_teleop.live.scenarios import live_scenario, with_task_space_device
 from drake_teleop.live.session import Session
 from drake_teleop.station.environment.solids import Wall
