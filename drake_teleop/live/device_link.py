@@ -36,6 +36,8 @@ _CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 class DeviceLink:
     """UDP link to one device client on this machine; 50 ms of silence admit another client.
 
+    The address is udp://127.0.0.1:PORT, or haply://HOST:PORT, whose client is a child process.
+
     Attributes:
         refused: number of invalid packets and packets of other senders.
         refusal: reason of the last refusal.
@@ -43,7 +45,12 @@ class DeviceLink:
     """
 
     def __init__(self, address: str) -> None:
-        host, port = host_and_port(address)
+        kind = address.partition("://")[0]
+        if kind not in ("udp", "haply"):
+            what = "is not the address of a haptic device"
+            remedy = "use udp://127.0.0.1:PORT or haply://localhost:10001"
+            raise DrakeTeleopError(what, where=address, remedy=remedy)
+        host, port = host_and_port(address) if kind == "udp" else (LOCALHOST, 0)
         if not _is_loopback(host):
             what = "is not an address of this machine (other senders could move the arm)"
             remedy = "use udp://127.0.0.1:PORT, and run the device's client on this machine"
@@ -60,6 +67,11 @@ class DeviceLink:
         # Arrival minus the device's time; the minimum is the clock offset.
         self._latencies: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
         self._force_ages: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
+        self._client: subprocess.Popen[bytes] | None = None
+        if kind == "haply":
+            station = f"udp://{LOCALHOST}:{self.port}"
+            client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
+            self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def receive_state(self, now: float) -> DeviceState | None:
         """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
@@ -158,6 +170,14 @@ class DeviceLink:
 
     def close(self) -> None:
         self._socket.close()
+        if self._client is None:
+            return
+        self._client.terminate()
+        try:
+            self._client.wait(_CLIENT_END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._client.kill()
+            self._client.wait()
 
 
 def _is_loopback(host: str) -> bool:
@@ -167,34 +187,3 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-class DeviceConnection:
-    """Link to a haptic device at udp://127.0.0.1:PORT or haply://HOST:PORT.
-
-    For a haply:// address it also runs the client process.
-    """
-
-    def __init__(self, address: str) -> None:
-        kind = address.partition("://")[0]
-        if kind not in ("udp", "haply"):
-            what = "is not the address of a haptic device"
-            remedy = "use udp://127.0.0.1:PORT or haply://localhost:10001"
-            raise DrakeTeleopError(what, where=address, remedy=remedy)
-        self.link = DeviceLink(address if kind == "udp" else f"udp://{LOCALHOST}:0")
-        self._client: subprocess.Popen[bytes] | None = None
-        if kind == "haply":
-            station = f"udp://{LOCALHOST}:{self.link.port}"
-            client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
-            self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
-
-    def close(self) -> None:
-        self.link.close()
-        if self._client is None:
-            return
-        self._client.terminate()
-        try:
-            self._client.wait(_CLIENT_END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._client.kill()
-            self._client.wait()

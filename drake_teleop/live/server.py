@@ -38,7 +38,7 @@ from drake_teleop.common.html import content_security_policy
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import PageValueCalculator
-from drake_teleop.live.device_link import DeviceConnection
+from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live, without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import (
@@ -87,7 +87,7 @@ class LiveDrive:
         self._pages: dict[ServerConnection, int] = {}
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
-        self._device = None if device is None else DeviceConnection(device)
+        self._link = None if device is None else DeviceLink(device)
         self._failed: BaseException | None = None
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._page_numbers = itertools.count(1)  # of pages
@@ -173,15 +173,14 @@ class LiveDrive:
         except (Exception, SystemExit) as error:  # SystemExit is a failed assertion of Drake
             self._failed = error
         finally:
-            if self._device is not None:
-                self._device.close()
+            if self._link is not None:
+                self._link.close()
             self._over.set()
             self._ready.set()
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
         show = self._views[SCENE_NAMES[0]].frame_part
-        link = None if self._device is None else self._device.link
-        live = Live(scenario, self._load, record, show, time.perf_counter(), link)
+        live = Live(scenario, self._load, record, show, time.perf_counter(), self._link)
         self.recorded = live.recorded
         return live
 
@@ -228,8 +227,8 @@ class LiveDrive:
                     pages = [(c, c.transport.get_write_buffer_size()) for c in server.connections]
                     ready = [c for c, unsent in pages if unsent < _MAX_UNSENT_BYTES]
                     broadcast(ready, json.dumps({"frame": frame}))
-                if self._device is not None and self._device.link.refusal != refusal:
-                    refusal = self._device.link.refusal
+                if self._link is not None and self._link.refusal != refusal:
+                    refusal = self._link.refusal
                     _print_to_stderr(f"a packet of the device was refused: it {refusal}")
                 await self._sleep_until_tick()
 
@@ -321,7 +320,7 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                ending = _START_TEXT_ENDINGS[self._device is not None]
+                ending = _START_TEXT_ENDINGS[self._link is not None]
                 _print_to_stderr(f"no page is open: the simulation waits{ending}")
 
 

@@ -17,7 +17,7 @@ from drake_teleop.common.progress import show_no_progress
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
 from drake_teleop.live.device_client import DeviceClient, VirtualDevice, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
-from drake_teleop.live.device_link import DeviceConnection, DeviceLink
+from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     DeviceState,
@@ -363,7 +363,7 @@ def test_inverse3_answers_every_message_of_its_service():
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
 def test_device_address_of_another_machine_or_kind_is_an_error(address):
     with pytest.raises(DrakeTeleopError, match=re.escape(address)):
-        DeviceConnection(address)
+        DeviceLink(address)
 
 
 def test_device_drives_without_a_page_and_releases_after_silence(scenario, load, link):

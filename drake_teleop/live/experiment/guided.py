@@ -266,10 +266,9 @@ class ExperimentDrive(LiveDrive):
         compile_slice_functions(first.scenario, first.load, device)
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
-        link = None if self._device is None else self._device.link
         shows = [view.frame_part for view in self._views.values()]
         setup = (self._procedure, self._stations, shows)
-        return GuidedExperiment(*setup, time.perf_counter(), link)
+        return GuidedExperiment(*setup, time.perf_counter(), self._link)
 
     def _page_html(self) -> str:
         panel = resources.files("drake_teleop.live.experiment") / "page.html"
