@@ -108,11 +108,10 @@ class LiveDrive:
         with show_progress(True) as stage:
             self._load = _identify_load(scenario, stage)
             progress = stage("Prepare the station and its 3D scenes")
-            self._scene_scenarios: dict[str, Scenario] = {}
             for name in SCENE_NAMES:
                 setup = load_scene(name, scenario)
-                self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
-                self._views[name] = PageScene(name, self._scene_scenarios[name])
+                setup = with_task_space_device(setup) if device else setup
+                self._views[name] = PageScene(name, setup)
                 progress(len(self._views) / (1 + len(SCENE_NAMES)))
             compile_slice_functions(scenario, self._load, device)
             progress(1.0)
@@ -243,12 +242,11 @@ class LiveDrive:
     async def _change_scene(self) -> None:
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
-        scenario = self._scene_scenarios[live.requested_scene]
-        show = self._views[live.requested_scene].frame_part
+        view = self._views[live.requested_scene]
 
         def identify() -> None:
             try:
-                found.set_result(_identify_load(scenario, self._start_stoppable_stage))
+                found.set_result(_identify_load(view.scenario, self._start_stoppable_stage))
             except Exception as error:
                 found.set_exception(error)
 
@@ -258,7 +256,7 @@ class LiveDrive:
                 return
             await asyncio.sleep(0.05)
         try:
-            live.change_scene(scenario, found.result(), show, time.perf_counter())
+            live.change_scene(view.scenario, found.result(), view.frame_part, time.perf_counter())
         except DrakeTeleopError as error:
             live.reject_scene(str(error), time.perf_counter())
             return
