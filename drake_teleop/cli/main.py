@@ -44,7 +44,7 @@ def cli(scripts: tuple[Path, ...]) -> None:
 
 @cli.command()
 @option.output_folder("reproduce")
-@option.seed
+@option.seed()
 @option.quiet
 def reproduce(out: Path, **options: Any) -> int:
     """Repeat the paper's experiments.
@@ -66,7 +66,7 @@ def reproduce(out: Path, **options: Any) -> int:
 @click.argument("scenario", type=option.SCENARIO_TYPE, required=False)
 @option.path("--inputs", metavar="DIR")
 @option.output_folder("run")
-@option.seed
+@option.seed()
 @click.option("--fresh", is_flag=True)
 @option.quiet
 def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) -> None:
@@ -226,7 +226,7 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @click.argument("log", type=option.PATH_TYPE)
 @option.load_file(required=True)
 @option.gripper_file
-@option.sigma("Scale of the non-contact wrench; with --gripper, of the gripper's.")
+@option.sigma
 @click.option("--sigma-object", type=option.SCALE_TYPE)
 @option.separate_sigmas
 @option.gamma
@@ -259,6 +259,7 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
             lag.
         --causal-tare: With --causal: length of the contact-free start of LOG that determines the
             offsets [s].  [default: offsets of the load file]
+        --sigma: Scale of the non-contact wrench; with --gripper, of the gripper's.
     """
     from drake_teleop.cli.logs import eliminate_command
 
@@ -267,7 +268,7 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("log", type=option.PATH_TYPE)
-@option.load_file(default="identified from LOG itself")
+@option.load_file()
 @option.free_motion_log
 @option.choice("--statistic", ["level", "cusum", "glr"], "level")
 @option.output_folder("detect")
@@ -282,6 +283,7 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 
     Options:
         --statistic: Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.
+        --load: identification.json of the load.  [default: identified from LOG itself]
     """
     from drake_teleop.cli.logs import detect_command
 
@@ -334,10 +336,10 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @click.argument("source")
 @option.load_file(required=True)
 @click.option("--out", "sink", default="-", show_default=False, metavar="SINK")
-@option.sigma("Scale of the non-contact wrench.")
+@option.sigma
 @option.separate_sigmas
 @option.gamma
-@option.rate_hz("Rate of the wrenches; not needed for replay:, rtde:// and netft://.")
+@option.rate_hz()
 @click.option("--predicted", is_flag=True)
 @click.option("--watch", is_flag=True)
 @option.path("--free", metavar="LOG")
@@ -362,6 +364,8 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
             `detect`.
         --tare: Tare at the start: keep the tool free, at rest.
         --control: UDP port on localhost that accepts the request `tare`.
+        --sigma: Scale of the non-contact wrench.
+        --rate: Rate of the wrenches; not needed for replay:, rtde:// and netft://.
     """
     from drake_teleop.robots.compensate import run_compensate_command
 
@@ -372,10 +376,10 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @click.argument("source")
 @click.argument("sink")
 @option.load_file(required=True)
-@option.sigma("Scale of the non-contact wrench.")
+@option.sigma
 @option.separate_sigmas
 @option.gamma
-@option.rate_hz("Rate of the wrenches.", required=True)
+@option.rate_hz(required=True)
 @click.option("--watch", is_flag=True)
 @option.stream_options
 @option.output_folder("ros2")
@@ -389,6 +393,8 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
 
     Options:
         --watch: Flag contact, and a change of the load.
+        --sigma: Scale of the non-contact wrench.
+        --rate: Rate of the wrenches.
     """
     from drake_teleop.robots.ros2_node import run_ros2_command
 
@@ -442,9 +448,9 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
 @cli.command()
 @click.argument("identification", type=option.PATH_TYPE)
 @click.option("--to", required=True, type=_EXPORT_FORMAT_TYPE)
-@option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
+@option.sensor_pose
 @option.choice("--sign", ["-1", "1"], "-1")
-@option.rate_hz("Rate of the sensor's readings; required by c99, fmu and ros2_filter.")
+@option.rate_hz()
 @option.cutoff_hz
 @option.sensor_range
 @option.output_folder("export")
@@ -461,6 +467,8 @@ def export(
     Options:
         --to: Robot or file format.
         --sign: As in the log description: -1 if the sensor measures the wrench of the load on it.
+        --sensor-pose: Pose of the sensor in the flange [m, deg].  [default: same frames]
+        --rate: Rate of the sensor's readings; required by c99, fmu and ros2_filter.
     """
     from drake_teleop.load.identification import Identification
 
