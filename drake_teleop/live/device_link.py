@@ -56,7 +56,6 @@ class DeviceLink:
             remedy = "use udp://127.0.0.1:PORT, and run the device's client on this machine"
             raise DrakeTeleopError(what, where=address, remedy=remedy)
         self._socket = open_udp_receiver(host, port)
-        self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
         self.refused = self.lost = 0
         self.refusal = ""

@@ -33,7 +33,6 @@ class TareRequestPort:
 
     def __init__(self, port: int) -> None:
         self._socket = open_udp_receiver(LOCALHOST, port)
-        self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
 
     def answer_request(self, tare: Callable[[], str]) -> None:
