@@ -90,9 +90,9 @@ def _help_of_options(text: str) -> dict[str, str]:
 class DocumentedCommand(click.Command):
     """Command whose docstring ends with `Options:` and the help of its own options."""
 
-    def __init__(self, *arguments: Any, help: str | None, **settings: Any) -> None:
+    def __init__(self, name: str | None, *, help: str | None = None, **settings: Any) -> None:
         text, _, listed = cleandoc(help or "").partition("\n\nOptions:")
-        super().__init__(*arguments, help=text, **settings)
+        super().__init__(name, help=text, **settings)
         texts = _help_of_options(_SHARED_HELP) | _help_of_options(listed)
         for each in self.params:
             if isinstance(each, click.Option):
