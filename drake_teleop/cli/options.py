@@ -112,7 +112,7 @@ class Number(click.FloatRange):
 
     def convert(self: Any, value: Any, param: Any, ctx: Any) -> Any:
         number, low, high = self._type_without_range.convert(value, param, ctx), self.min, self.max
-        if not math.isfinite(number):
+        if isinstance(number, float) and not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
         if not low <= number <= high:
             text = f"{short_text(number)} is outside {short_text(low)} to {short_text(high)}"
