@@ -285,7 +285,7 @@ class Ros2Sink:
         from rclpy.qos import qos_profile_sensor_data
 
         topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
+        self._which = parsed.wrench_name()
         names = "DiagnosticArray", "DiagnosticStatus", "KeyValue"
         types = (WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in types}
