@@ -58,7 +58,6 @@ _ASYNCIO_ITERATIONS_PER_MESSAGE = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
-_START_TEXT_ENDINGS = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -88,6 +87,7 @@ class LiveDrive:
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
         self._link = None if device is None else DeviceLink(device)
+        self._start_condition = "" if device is None else " or until the device sends"
         self._failed: BaseException | None = None
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._page_numbers = itertools.count(1)  # of pages
@@ -129,8 +129,10 @@ class LiveDrive:
             self._stop_threads_or_exit_process()
         self._raise_failure()
 
-    def wait_for_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`."""
+    def announce_and_wait(self, who: str) -> str:
+        """Print the page's address; wait for Ctrl-C or SIGTERM and return its name, or "stop"."""
+        condition = f"the simulation waits until this page is open{self._start_condition}"
+        print(f"{who} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
         try:
             self.wait()
             return "stop"
@@ -318,8 +320,7 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                ending = _START_TEXT_ENDINGS[self._link is not None]
-                _print_to_stderr(f"no page is open: the simulation waits{ending}")
+                _print_to_stderr(f"no page is open: the simulation waits{self._start_condition}")
 
 
 def _identify_load(scenario: Scenario, progress: bool | StartStage) -> IdentifiedLoad | None:
@@ -387,17 +388,12 @@ def run_drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
-    print(f"drive it at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it", flush=True)
-    reason = live.wait_for_signal()
+    reason = live.announce_and_wait("drive it")
     print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:
         raise DrakeTeleopError(f"the simulation has stopped: {live.ended}", where="drive")
-
-
-def start_condition_text(device: str | None) -> str:
-    return "the simulation waits until this page is open" + _START_TEXT_ENDINGS[device is not None]
 
 
 def _print_to_stderr(text: str) -> None:

@@ -25,7 +25,7 @@ from drake_teleop.live.inputs import Inputs
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_task_space_device
-from drake_teleop.live.server import LiveDrive, compile_slice_functions, start_condition_text
+from drake_teleop.live.server import LiveDrive, compile_slice_functions
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -286,9 +286,7 @@ def serve_experiment(
     live, who = ExperimentDrive(procedure, scenarios, port, device), procedure.participant
     if browser:
         webbrowser.open(live.url)
-    condition = start_condition_text(device)
-    print(f"participant {who} at {live.url}\n{condition}; Ctrl-C ends it", flush=True)
-    reason = live.wait_for_signal()
+    reason = live.announce_and_wait(f"participant {who}")
     done, trials = procedure.trial_number, len(procedure.trials)
     what = f"participant {who} has done {done} of {trials} trials"
     if live.ended:
