@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -140,37 +140,31 @@ def _from_template(name: str) -> Callable[[ExportedLoad], str]:
 
 
 _SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
-_format_of_sensor = partial(Format, of_sensor=True, inertia=False, comment="#")
-
+_OF_SENSOR: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
+_SHIPPED_FORMATS: dict[str, dict[str, Any]] = {
+    "ur": {"comment": "#"},
+    "franka": {"note": "transformation is the identity: use that of your end effector"},
+    "xarm": {"inertia": False, "comment": "#"},
+    "kth": {
+        **_OF_SENSOR,
+        "offsets": True,
+        "note": f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+        " compensated force is twice the weight, change the sign of the mass",
+    },
+    "ft_tools": _OF_SENSOR | {"offsets": True},
+    "ros2-admittance": _OF_SENSOR | {"note": _SENSOR_FRAME_NOTE},
+    "bota": {
+        "of_sensor": True,
+        "offsets": True,
+        "note": "the inertia is about the centre of mass; Bota does not document the point",
+    },
+    "urdf": {"body": True},
+    "sdf": {"body": True},
+    "mjcf": {"body": True},
+}
 FORMATS = Registry(
     "export format",
-    {
-        "ur": Format(_from_template("ur"), comment="#"),
-        "franka": Format(
-            _from_template("franka"),
-            note="transformation is the identity: use that of your end effector",
-        ),
-        "xarm": Format(_from_template("xarm"), inertia=False, comment="#"),
-        "kth": _format_of_sensor(
-            _from_template("kth"),
-            offsets=True,
-            note=f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
-            " compensated force is twice the weight, change the sign of the mass",
-        ),
-        "ft_tools": _format_of_sensor(_from_template("ft_tools"), offsets=True),
-        "ros2-admittance": _format_of_sensor(
-            _from_template("ros2-admittance"), note=_SENSOR_FRAME_NOTE
-        ),
-        "bota": Format(
-            _from_template("bota"),
-            of_sensor=True,
-            offsets=True,
-            note="the inertia is about the centre of mass; Bota does not document the point",
-        ),
-        "urdf": Format(_from_template("urdf"), body=True),
-        "sdf": Format(_from_template("sdf"), body=True),
-        "mjcf": Format(_from_template("mjcf"), body=True),
-    },
+    {name: Format(_from_template(name), **each) for name, each in _SHIPPED_FORMATS.items()},
     Format,
 )
 """Export formats by name."""
