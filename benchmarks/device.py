@@ -26,15 +26,14 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.live.device_client import VirtualDevice, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state, unpack_state
 from drake_teleop.live.haply import parse_device_message
-from drake_teleop.live.live import Live
-from drake_teleop.live.pace import without_garbage_collection
+from drake_teleop.live.live import Live, without_garbage_collection
 from drake_teleop.live.scenarios import live_scenario, with_task_space_device
 from drake_teleop.live.session import Session
-from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -204,7 +203,7 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
         for i in random.integers(0, len(text), random.integers(1, 8)):
             text[i] = chr(random.integers(1, 300))
         heard = parse_device_message("".join(text))
-        wrong += heard is not None and not np.isfinite([*heard.state.position]).all()
+        wrong += heard is not None and not np.isfinite([*heard[1].position]).all()
     link.close()
     return {"fuzz_messages": 2.0 * count, "fuzz_not_finite": wrong, "fuzz_packets_refused": refused}
 

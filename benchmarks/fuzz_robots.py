@@ -16,7 +16,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.robots.assembly import ReadingAssembler, WrenchAndMotionStreams
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
-from drake_teleop.robots.ros2_messages import MESSAGE_TYPE_OF_TOPIC
+from drake_teleop.robots.ros2 import MESSAGE_TYPE_OF_TOPIC
 from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
 from drake_teleop.robots.rtde import readings_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT

@@ -33,7 +33,7 @@ from drake_teleop.robots.compensation_step import (
     contact_and_scaled_wrench_into,
     reading_problem,
 )
-from drake_teleop.robots.controller.c99 import CFLAGS, ControllerTarget, kernel_files
+from drake_teleop.robots.controller.export import CFLAGS, ControllerTarget, kernel_files
 from drake_teleop.robots.streams import Reading
 
 HERE = Path(__file__).parent

@@ -30,8 +30,7 @@ import numpy as np
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.inputs import NETWORKS, SLICE_MS
-from drake_teleop.live.live import FRAME_PERIOD_S, Live
-from drake_teleop.live.pace import without_garbage_collection
+from drake_teleop.live.live import FRAME_PERIOD_S, Live, without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.session import Session, read_drive

@@ -89,7 +89,7 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
     from drake_teleop.robots.compensate import compensate_stream
     from drake_teleop.robots.compensator import Compensator
     from drake_teleop.robots.connections import open_sink, open_source
-    from drake_teleop.robots.ros2_messages import MessageConverter
+    from drake_teleop.robots.ros2 import MessageConverter
 
     rng = np.random.default_rng(7)
     phi = load_of(rng)

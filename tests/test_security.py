@@ -48,7 +48,7 @@ EXPLAINED = {
     # Processes that this one starts; they communicate by pipes.
     ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
     # Module of the package by its name.
-    ("cli/printing.py", "import_module"),
+    ("cli/logs.py", "import_module"),
     ("__init__.py", "import_module"),
     ("robots/connections.py", "import_module"),
     # polars in a thread of its own.
@@ -59,7 +59,7 @@ EXPLAINED = {
     ("robots/rtde.py", "subprocess"),
     ("robots/changes.py", "subprocess"),  # the test of the fit, parallel to the loop
     # C compiler of the system, with sources of the package and numbers.
-    ("robots/controller/fmu.py", "subprocess"),
+    ("robots/controller/export.py", "subprocess"),
     ("robots/ros2_node.py", "subprocess"),  # for the command `calibrate`
     # Packages of messages by names in the code.
     ("robots/ros2.py", "import_module"),
@@ -109,7 +109,7 @@ WRITING = {
     ("robots/lines.py", ".write_csv"),
     # Under a temporary name until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
-    ("robots/controller/fmu.py", ".write_text"),  # temporary folder for the compiler
+    ("robots/controller/export.py", ".write_text"),  # temporary folder for the compiler
     ("robots/controller/export.py", ".write_bytes"),  # by `replace_file_on_success`
     # Figures in the file of --json.
     ("live/device_client.py", ".write_text"),

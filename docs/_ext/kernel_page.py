@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_teleop.load.identification import Identification
-from drake_teleop.robots.controller.c99 import CFLAGS, ControllerTarget, kernel_files
+from drake_teleop.robots.controller.export import CFLAGS, ControllerTarget, kernel_files
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx

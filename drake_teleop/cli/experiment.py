@@ -9,7 +9,7 @@ import polars as pl
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
-from drake_teleop.live.experiment.procedure import plan_trials
+from drake_teleop.live.experiment.procedure import Procedure, plan_trials
 from drake_teleop.live.experiment.results import write_results
 from drake_teleop.live.experiment.store import MAX_PARTICIPANT_NUMBER, TrialStore, open_trial_store
 from drake_teleop.station.scenario import Scenario
@@ -28,10 +28,10 @@ def experiment_command(
             if simulated:
                 _simulate_participants(experiment, scenarios, store, simulated)
             else:
-                from drake_teleop.live.experiment.server import serve_experiment
+                from drake_teleop.live.experiment.guided import serve_experiment
 
                 number = next_participant(store, len(plan_trials(experiment, 1)), participant)
-                serve_experiment(experiment, scenarios, store, number, **page)
+                serve_experiment(Procedure(experiment, number, store), scenarios, **page)
         finally:
             table = write_results(experiment, store)
             print(f"written {out / 'results.csv'} and .png, from {out / 'trials.csv'}", flush=True)
@@ -66,5 +66,6 @@ def _simulate_participants(
         print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)
 
     for number in range(1, count + 1):
-        simulate_participant(experiment, scenarios, stations, store, number, print_progress)
+        procedure = Procedure(experiment, number, store)
+        simulate_participant(procedure, stations, print_progress)
     print()

@@ -1,28 +1,22 @@
-"""Commands `identify`, `eliminate` and `detect`: write the results, print a table."""
+"""Commands `identify`, `eliminate` and `detect`: write the results, print a table; `parts`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
 from drake_teleop.common import files
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
-from drake_teleop.load.identification import Identification, load_of_object
-from drake_teleop.logs import figures
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
+from drake_teleop.logs import figures, processing
 from drake_teleop.logs.contact import summarize_contacts
-from drake_teleop.logs.processing import (
-    DetectedLog,
-    EliminatedLog,
-    detect_log,
-    eliminate_log,
-    identify_log,
-)
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 
 if TYPE_CHECKING:
@@ -41,7 +35,7 @@ def identify_command(
 ) -> dict[str, Any]:
     """Identify the load of a log, write the results into `out`, return the summary."""
     gripper_load = None if gripper is None else Identification.load(gripper)
-    found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
+    found = processing.identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else load_of_object(result, gripper_load)
     summary = figures.summarize_log(log, found, cutoff_hz, result.delay_s) | {
@@ -85,46 +79,27 @@ def eliminate_command(
     load: Path,
     out: Path,
     *,
-    gripper: Path | None = None,
-    sigma: float = 0.0,
-    sigma_object: float | None = None,
-    gamma: float = 1.0,
-    eta: float | None = None,
     offsets: str = "record",
-    untouched_s: tuple[float, float] | None = None,
-    sigma_weight: float | None = None,
-    sigma_inertia: float | None = None,
-    causal: str | None = None,
-    causal_tare_s: float | None = None,
-    free: Path | None = None,
     cutoff_hz: float | None = 30.0,
-    delay: str | float = "auto",
     quiet: bool = False,
+    **options: Any,
 ) -> dict[str, Any]:
-    """Remove the load's wrench from a log, write the contact wrench, return the summary."""
+    """Remove the load's wrench from a log, write the contact wrench, return the summary.
+
+    `options` are other options of `eliminate_log`.
+    """
     load_file = Identification.load(load)
-    scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
-    scales |= dict(sigma_weight=sigma_weight, sigma_inertia=sigma_inertia)
-    found = eliminate_log(
-        log,
-        load_file,
-        **scales,
-        gripper=gripper,
-        tare=offsets == "record",
-        untouched_s=untouched_s,
-        causal=causal,
-        causal_tare_s=causal_tare_s,
-        free=free,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-    )
+    tare = offsets == "record"
+    found = processing.eliminate_log(log, load_file, tare=tare, cutoff_hz=cutoff_hz, **options)
+    scales: dict[str, Any] = {"sigma": 0.0, "sigma_object": None, "gamma": 1.0, "eta": None}
+    scales |= {"sigma_weight": None, "sigma_inertia": None}
     summary = figures.summarize_log(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
-        "gripper": None if gripper is None else str(gripper),
-        **scales,
-        "free": None if free is None else str(free),
+        "gripper": _text_or_none(options.get("gripper")),
+        **{name: options.get(name, default) for name, default in scales.items()},
+        "free": _text_or_none(options.get("free")),
         "offsets_from": offsets,
-        "untouched_s": untouched_s,
+        "untouched_s": options.get("untouched_s"),
         "tare": found.offsets - load_file.offsets,
         "tare_fraction": found.tare_fraction,
     }
@@ -140,7 +115,7 @@ def eliminate_command(
     summary = files.to_json_data(
         summary
         | figures.summarize_wrenches(found)
-        | figures.summarize_detected_contact(found, causal_tare_s)
+        | figures.summarize_detected_contact(found, options.get("causal_tare_s"))
     )
     from drake_teleop.logs.pictures import draw_elimination
 
@@ -153,7 +128,11 @@ def eliminate_command(
     return summary
 
 
-def _wrench_table(found: EliminatedLog) -> pl.DataFrame:
+def _text_or_none(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _wrench_table(found: processing.EliminatedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
@@ -179,11 +158,13 @@ def detect_command(
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Detect contact in a log, write statistics and contact flags, return the summary."""
-    found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
+    found = processing.detect_log(
+        log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay
+    )
     eliminated = found.eliminated
     summary = figures.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
-        "load": None if load is None else str(load),
-        "free": None if free is None else str(free),
+        "load": _text_or_none(load),
+        "free": _text_or_none(free),
         "free_s": found.free_duration_s,
         "statistic": statistic,
         "threshold": found.threshold,
@@ -210,7 +191,7 @@ def detect_command(
     return summary
 
 
-def _detection_table(found: DetectedLog) -> pl.DataFrame:
+def _detection_table(found: processing.DetectedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
@@ -218,3 +199,157 @@ def _detection_table(found: DetectedLog) -> pl.DataFrame:
     contact = found.eliminated.contact
     columns |= {f"contact_{c}": contact[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})
+
+
+def _make_table(
+    title: str, summary: dict[str, Any], headings: Sequence[str], left: Sequence[str] = ()
+) -> Any:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=f"{title} {Path(summary['log']).name}", title_justify="left")
+    for heading in headings:
+        table.add_column(escape(heading), justify="left" if heading in left else "right")
+    return table
+
+
+def print_identification(summary: dict[str, Any], out: Path) -> None:
+    headings = ("", "value", "std", "unit")
+    table = _make_table("Load identified from", summary, headings, left=("", "unit"))
+    offsets, deviations, units = summary["offsets"], summary["offsets_std"], ["N", "N m"]
+    rows = _load_rows(summary) + [
+        (name, offsets[i], deviations[i], 1.0, units[i // 3], name)
+        for i, name in enumerate(PARAMETER_NAMES[:6])
+    ]
+    _add_parameter_rows(table, rows, summary["identifiable"])
+    if "object" in summary:
+        table.add_section()
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
+        _add_parameter_rows(table, rows, summary["object"]["identifiable"])
+    figures = (
+        "com from, and inertia about, the origin So of the sensor frame S\n"
+        f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
+        f" {summary['residual_rms_torque']:.4g} N m rms of |tau|,"
+        f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
+    )
+    if summary["rejected"] > 0:
+        figures += f"; {summary['rejected']:.1%} of them rejected as disturbed"
+    print_table_and_notes(table, figures, summary, out)
+
+
+_ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
+"""Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
+
+
+def _load_rows(load: dict[str, Any]) -> list[_ParameterRow]:
+    rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
+    rows += [
+        (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
+        for i, axis in enumerate("xyz")
+    ]
+    return rows + [
+        (name, load["phi"][4 + i], load["phi_std"][4 + i], 1e3, "g m^2", name)
+        for i, name in enumerate(PARAMETER_NAMES[10:])
+    ]
+
+
+def _add_parameter_rows(table: Any, rows: list[_ParameterRow], identifiable: list[str]) -> None:
+    for label, value, std, scale, unit, name in rows:
+        # The centre of mass is the moment over the mass.
+        needed = {"m", name} if name.startswith("m c") else {name}
+        if needed <= set(identifiable):
+            table.add_row(label, f"{value * scale:.4f}", f"{std * scale:.4f}", unit)
+        else:
+            table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")
+
+
+def print_elimination(summary: dict[str, Any], out: Path) -> None:
+    headings = ("rms of", "|F| [N]", "|tau| [N m]")
+    table = _make_table("Contact wrench in", summary, headings, left=("rms of",))
+    for label, name in (
+        ("measured, without offsets", "raw"),
+        ("less static weight only", "gravity_only"),
+        ("less the non-contact wrench", "residual"),
+    ):
+        force, torque = summary[f"{name}_rms"], summary[f"{name}_torque_rms"]
+        if force is not None:
+            table.add_row(label, f"{force:.4g}", f"{torque:.4g}")
+    figures = (
+        f"largest contact force {summary['residual_peak']:.4g} N,"
+        f" torque {summary['residual_torque_peak']:.4g} N m"
+    )
+    contacts = summary["contacts"]
+    if contacts:
+        first = ", ".join(f"{c['start_s']:.3f}" for c in contacts[:5])
+        more = " ..." if len(contacts) > 5 else ""
+        figures += f"; {len(contacts)} contacts, from {first}{more} s"
+    elif contacts is not None:
+        figures += "; no contact found"
+    causal = summary["causal"]
+    if causal is not None:
+        late = "late" if causal["mode"] == "delayed" else "compensated by prediction"
+        figures += (
+            f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
+            f" rms of |F| {causal['residual_rms']:.4g} N,"
+            f" of |tau| {causal['residual_torque_rms']:.4g} N m"
+        )
+    print_table_and_notes(table, figures, summary, out)
+
+
+def print_detection(summary: dict[str, Any], out: Path) -> None:
+    headings = ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "direction in S")
+    table = _make_table("Contact in", summary, headings)
+    for c in summary["contacts"]:
+        push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
+        table.add_row(
+            f"{c['start_s']:.3f}", f"{c['stop_s']:.3f}", f"{c['peak_N']:.3g}",
+            f"{c['peak_Nm']:.3g}", push,
+        )  # fmt: skip
+    if not summary["contacts"]:
+        table.add_row("none", *[""] * 4)
+    said = {"raw": "measured", "gravity_only": "without the weight", "eliminated": "contact"}
+    shares = ", ".join(
+        f"{said[name]} {100 * share:.3g} %"
+        for name, share in summary["above_force_threshold"].items()
+        if share is not None
+    )
+    figures = (
+        f"above the threshold ({summary['statistic']} {summary['threshold']:.3g})"
+        f" {100 * summary['above_threshold']:.3g} % of the time, in contact"
+        f" {100 * summary['in_contact']:.3g} %\n"
+        f"|F| above {summary['force_threshold']:.3g} N, of the time: {shares}"
+    )
+    print_table_and_notes(table, figures, summary, out)
+
+
+def print_table_and_notes(table: Any, text: str, summary: dict[str, Any], out: Path) -> None:
+    """Print a table, a text, the delay, the notes and the output folder."""
+    from rich.console import Console
+
+    lines = [text]
+    if summary["delay_source"] != "static":
+        delay = f"{summary['delay_s'] * 1e3:.2f} ms behind the wrench ({summary['delay_source']})"
+        lines.append(f"motion {delay}")
+    lines += [f"note: {note}" for note in summary["notes"]]
+    console = Console()
+    console.print(table)
+    for line in [*lines, f"written to {out}"]:
+        console.print(line, highlight=False, markup=False)
+
+
+def print_registered_names() -> None:
+    import click
+
+    from drake_teleop.common.registry import REGISTRIES
+
+    for module in (
+        "load.batch.methods",
+        "logs.read.table_files",
+        "robots.connections",
+        "robots.export",
+        "station.scenario",
+    ):
+        import_module(f"drake_teleop.{module}")
+    for kind, table in sorted(REGISTRIES.items()):
+        names = [name if name in table.shipped else f"{name}*" for name in table]
+        click.echo(f"{kind}: {', '.join(names)}")

@@ -18,11 +18,7 @@ from drake_teleop.common.interruption import INTERRUPTED_EVENT, install_interrup
 from drake_teleop.common.version import __version__
 
 
-@click.group(
-    context_settings=dict(
-        help_option_names=["-h", "--help"], max_content_width=100, show_default=True
-    )
-)
+@click.group(cls=option.CommandGroup, context_settings=option.HELP_SETTINGS)
 @click.version_option(__version__, prog_name="drake-teleop")
 @option.path(
     "--register",
@@ -48,7 +44,7 @@ def cli(scripts: tuple[Path, ...]) -> None:
 
 @cli.command()
 @option.output_folder("reproduce")
-@option.seed
+@option.seed()
 @option.quiet
 def reproduce(out: Path, **options: Any) -> int:
     """Repeat the paper's experiments.
@@ -68,20 +64,20 @@ def reproduce(out: Path, **options: Any) -> int:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE, required=False)
-@option.path(
-    "--inputs",
-    metavar="DIR",
-    help="Folder of `drive --record`; repeat this session with identical results.",
-)
+@option.path("--inputs", metavar="DIR")
 @option.output_folder("run")
-@option.seed
-@click.option("--fresh", is_flag=True, help="Identify the load again; ignore the cache.")
+@option.seed()
+@click.option("--fresh", is_flag=True)
 @option.quiet
 def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) -> None:
     """Simulate one scenario, or repeat a session of `drive`.
 
     SCENARIO is a shipped name or a YAML file. Writes the log, pictures and a 3D replay. The load is
     identified first and kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
+
+    Options:
+        --inputs: Folder of `drive --record`; repeat this session with identical results.
+        --fresh: Identify the load again; ignore the cache.
     """
     from drake_teleop.lab.run import run_command
 
@@ -97,42 +93,16 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE, default="contact_transition")
-@option.path("--record", metavar="DIR", help="Record the session in DIR.")
-@click.option(
-    "--port",
-    type=option.IntegerInRange(0, 65535),
-    default=0,
-    show_default="any free port",
-    help="TCP port of the page on localhost.",
+@option.path("--record", metavar="DIR")
+@option.integer("--port", limits=(0, 65535), default=0, show_default="any free port")
+@click.option("--no-browser", is_flag=True)
+@click.option("--device", metavar="ADDRESS")
+@click.option("--study", metavar="FILE")
+@option.path("--results", default=Path("out/experiment"), metavar="DIR")
+@option.integer(
+    "--participant", limits=(1, 9999), show_default="the first with trials left, or a new one"
 )
-@click.option("--no-browser", is_flag=True, help="Print the page's address; open no browser.")
-@click.option(
-    "--device",
-    metavar="ADDRESS",
-    help="Haptic device of the operator: udp://127.0.0.1:PORT or haply://localhost:10001.",
-)
-@click.option(
-    "--study", metavar="FILE", help="Experiment with participants; SCENARIO is then unused."
-)
-@option.path(
-    "--results",
-    default=Path("out/experiment"),
-    metavar="DIR",
-    help="Folder for results of --study; the same folder continues an experiment.",
-)
-@click.option(
-    "--participant",
-    type=option.IntegerInRange(1, 9999),
-    show_default="the first with trials left, or a new one",
-    help="Number that identifies the participant of --study.",
-)
-@click.option(
-    "--simulated",
-    type=option.IntegerInRange(0, 9999),
-    default=0,
-    show_default=False,
-    help="Number of participants to simulate in --study; 0: people, on the page.",
-)
+@option.integer("--simulated", limits=(0, 9999), default=0, show_default=False)
 def drive(
     scenario: str,
     record: Path | None,
@@ -149,6 +119,16 @@ def drive(
     grip. One page on this machine moves the hand by mouse, keys, touch or gamepad (it vibrates in
     contact), and shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded session.
     In an experiment (--study: name or YAML file) participants compare two intervals.
+
+    Options:
+        --record: Record the session in DIR.
+        --port: TCP port of the page on localhost.
+        --no-browser: Print the page's address; open no browser.
+        --device: Haptic device of the operator: udp://127.0.0.1:PORT or haply://localhost:10001.
+        --study: Experiment with participants; SCENARIO is then unused.
+        --results: Folder for results of --study; the same folder continues an experiment.
+        --participant: Number that identifies the participant of --study.
+        --simulated: Number of participants to simulate in --study; 0: people, on the page.
     """
     options["browser"] = not no_browser
     if study is None:
@@ -191,16 +171,14 @@ def parts() -> None:
 
     --register FILE adds your own parts: drake-teleop --register mine.py parts
     """
-    from drake_teleop.cli.printing import print_registered_names
+    from drake_teleop.cli.logs import print_registered_names
 
     print_registered_names()
 
 
 @cli.command()
 @click.argument("folder", type=option.PATH_TYPE)
-@click.option(
-    "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: YAML file beside it]"
-)
+@click.option("--scenario", metavar="SCENARIO")
 @option.output_folder("replay")
 @option.quiet
 def replay(folder: Path, out: Path, **options: Any) -> None:
@@ -208,6 +186,9 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 
     FOLDER is the output of `run` or `reproduce`, or one log (.parquet) in it. Writes a 3D replay of
     each log: one HTML file that any browser shows without a network.
+
+    Options:
+        --scenario: Scenario of the log.  [default: YAML file beside it]
     """
     from drake_teleop.station.replay import replay_command
 
@@ -221,8 +202,6 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
     "--method",
     type=option.RegisteredName("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
-    help="Least squares; whitened: weighted by noise; robust: also without disturbed samples;"
-    " consistent: also possible for a rigid body.",
 )
 @option.output_folder("identify")
 @option.cutoff_hz
@@ -233,6 +212,10 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 
     LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Estimates the load's mass,
     centre of mass and inertia, the sensor's offsets and the delay, each with its uncertainty.
+
+    Options:
+        --method: Least squares; whitened: weighted by noise; robust: also without disturbed
+            samples; consistent: also possible for a rigid body.
     """
     from drake_teleop.cli.logs import identify_command
 
@@ -243,45 +226,16 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @click.argument("log", type=option.PATH_TYPE)
 @option.load_file(required=True)
 @option.gripper_file
-@option.sigma("Scale of the non-contact wrench; with --gripper, of the gripper's.")
-@click.option(
-    "--sigma-object",
-    type=option.SCALE_TYPE,
-    help="With --gripper: scale of the object's non-contact wrench.  [default: value of --sigma]",
-)
+@option.sigma
+@click.option("--sigma-object", type=option.SCALE_TYPE)
 @option.separate_sigmas
 @option.gamma
-@click.option(
-    "--eta",
-    type=option.FiniteNumber(0, 1),
-    help="With --gripper: kept share of the object's non-contact wrench; not with other scales.",
-)
-@option.choice(
-    "--offsets",
-    ["record", "load"],
-    "record",
-    "Source of the sensor offsets: LOG (record) or the load file (load).",
-)
-@click.option(
-    "--untouched",
-    "untouched_s",
-    type=option.FiniteNumber(0, 36000),
-    nargs=2,
-    metavar="START STOP",
-    help="Contact-free time of LOG [s], which determines the offsets.  [default: the whole LOG]",
-)
-@click.option(
-    "--causal",
-    type=click.Choice(["delayed", "predicted"]),
-    help="Add a causal result: late by the lag of the low-pass, or extrapolated over this lag.",
-)
-@click.option(
-    "--causal-tare",
-    "causal_tare_s",
-    type=option.FiniteNumber(0, 36000, min_open=True),
-    metavar="SECONDS",
-    help="With --causal: length of the contact-free start of LOG that determines the offsets [s]."
-    "  [default: offsets of the load file]",
+@option.number("--eta", limits=(0, 1))
+@option.choice("--offsets", ["record", "load"], "record")
+@option.number("--untouched", "untouched_s", limits=(0, 36000), nargs=2, metavar="START STOP")
+@click.option("--causal", type=click.Choice(["delayed", "predicted"]))
+@option.number(
+    "--causal-tare", "causal_tare_s", limits=(0, 36000), min_open=True, metavar="SECONDS"
 )
 @option.free_motion_log
 @option.output_folder("eliminate")
@@ -293,6 +247,19 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
     LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Writes a table of the
     contact wrench and the scaled wrench.
+
+    Options:
+        --sigma-object: With --gripper: scale of the object's non-contact wrench.  [default: value
+            of --sigma]
+        --eta: With --gripper: kept share of the object's non-contact wrench; not with other scales.
+        --offsets: Source of the sensor offsets: LOG (record) or the load file (load).
+        --untouched: Contact-free time of LOG [s], which determines the offsets.  [default: the
+            whole LOG]
+        --causal: Add a causal result: late by the lag of the low-pass, or extrapolated over this
+            lag.
+        --causal-tare: With --causal: length of the contact-free start of LOG that determines the
+            offsets [s].  [default: offsets of the load file]
+        --sigma: Scale of the non-contact wrench; with --gripper, of the gripper's.
     """
     from drake_teleop.cli.logs import eliminate_command
 
@@ -301,14 +268,9 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("log", type=option.PATH_TYPE)
-@option.load_file(default="identified from LOG itself")
+@option.load_file()
 @option.free_motion_log
-@option.choice(
-    "--statistic",
-    ["level", "cusum", "glr"],
-    "level",
-    "Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.",
-)
+@option.choice("--statistic", ["level", "cusum", "glr"], "level")
 @option.output_folder("detect")
 @option.cutoff_hz
 @option.delay
@@ -318,6 +280,10 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 
     LOG is a canonical log (.csv, .parquet) or a log description (.yaml). The load's own wrench is
     eliminated; noise of the remaining wrench is modelled as rising with the acceleration.
+
+    Options:
+        --statistic: Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.
+        --load: identification.json of the load.  [default: identified from LOG itself]
     """
     from drake_teleop.cli.logs import detect_command
 
@@ -344,12 +310,8 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 @cli.command()
 @click.argument("path", type=option.PATH_TYPE)
 @option.load_file()
-@click.option("--identify", is_flag=True, help="Identify the load from all episodes.")
-@option.path(
-    "--description",
-    metavar="FILE",
-    help="Log description, for all episodes, without `file`.  [default: drafted from the episodes]",
-)
+@click.option("--identify", is_flag=True)
+@option.path("--description", metavar="FILE")
 @option.jobs
 @option.output_folder("dataset")
 @option.quiet
@@ -359,6 +321,11 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
     PATH is a LeRobot folder, a robomimic file (.hdf5), a .zarr, or a folder with a table for each
     episode. Needs --load or --identify. Writes a copy with contact wrench and contact flags, and a
     verdict for each episode. After an interruption, repeat the command.
+
+    Options:
+        --identify: Identify the load from all episodes.
+        --description: Log description, for all episodes, without `file`.  [default: drafted from
+            the episodes]
     """
     from drake_teleop.logs.dataset.dataset import dataset_command
 
@@ -368,32 +335,16 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @cli.command()
 @click.argument("source")
 @option.load_file(required=True)
-@click.option(
-    "--out",
-    "sink",
-    default="-",
-    show_default=False,
-    metavar="SINK",
-    help="Destination.  [default: stdout]",
-)
-@option.sigma("Scale of the non-contact wrench.")
+@click.option("--out", "sink", default="-", show_default=False, metavar="SINK")
+@option.sigma
 @option.separate_sigmas
 @option.gamma
-@option.rate_hz("Rate of the wrenches; not needed for replay:, rtde:// and netft://.")
-@click.option("--predicted", is_flag=True, help="Extrapolate the results over the low-pass lag.")
-@click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
-@option.path(
-    "--free",
-    metavar="LOG",
-    help="Log of free motion, whose noise sets the threshold of contact flags, as for `detect`.",
-)
-@click.option("--tare", is_flag=True, help="Tare at the start: keep the tool free, at rest.")
-@click.option(
-    "--control",
-    type=option.IntegerInRange(1, 65535),
-    metavar="PORT",
-    help="UDP port on localhost that accepts the request `tare`.",
-)
+@option.rate_hz()
+@click.option("--predicted", is_flag=True)
+@click.option("--watch", is_flag=True)
+@option.path("--free", metavar="LOG")
+@click.option("--tare", is_flag=True)
+@option.integer("--control", limits=(1, 65535), metavar="PORT")
 @option.stream_options
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
@@ -404,6 +355,17 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     An invalid wrench is replaced by zero, with a flag. --cutoff is causal here. --delay is the
     delay of the motion behind the wrench; auto starts with the value in the load file.
     The command ends with the source or with Ctrl-C.
+
+    Options:
+        --out: Destination.  [default: stdout]
+        --predicted: Extrapolate the results over the low-pass lag.
+        --watch: Flag contact, and a change of the load.
+        --free: Log of free motion, whose noise sets the threshold of contact flags, as for
+            `detect`.
+        --tare: Tare at the start: keep the tool free, at rest.
+        --control: UDP port on localhost that accepts the request `tare`.
+        --sigma: Scale of the non-contact wrench.
+        --rate: Rate of the wrenches; not needed for replay:, rtde:// and netft://.
     """
     from drake_teleop.robots.compensate import run_compensate_command
 
@@ -414,11 +376,11 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @click.argument("source")
 @click.argument("sink")
 @option.load_file(required=True)
-@option.sigma("Scale of the non-contact wrench.")
+@option.sigma
 @option.separate_sigmas
 @option.gamma
-@option.rate_hz("Rate of the wrenches.", required=True)
-@click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
+@option.rate_hz(required=True)
+@click.option("--watch", is_flag=True)
 @option.stream_options
 @option.output_folder("ros2")
 @click.pass_context
@@ -428,6 +390,11 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     SOURCE and SINK are ros2://TOPIC as for `compensate`. The node /drake_teleop has the services
     tare, load and calibrate, and the parameters sigma, gamma, sigma_weight, sigma_inertia, load,
     until and seconds. Flags are on /diagnostics. Calibrations are written to --out.
+
+    Options:
+        --watch: Flag contact, and a change of the load.
+        --sigma: Scale of the non-contact wrench.
+        --rate: Rate of the wrenches.
     """
     from drake_teleop.robots.ros2_node import run_ros2_command
 
@@ -449,18 +416,8 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
 
 @cli.command()
 @click.argument("source")
-@click.option(
-    "--until",
-    default="mass 0.5 %, com 0.5 mm, inertia 5 %",
-    metavar="TOLERANCE",
-    help="Required accuracy; mass, com or inertia may be left out.",
-)
-@click.option(
-    "--seconds",
-    type=option.FiniteNumber(1, 36000),
-    default=120.0,
-    help="Maximum duration of the recording [s].",
-)
+@click.option("--until", default="mass 0.5 %, com 0.5 mm, inertia 5 %", metavar="TOLERANCE")
+@option.number("--seconds", limits=(1, 36000), default=120.0)
 @option.stream_options
 @option.output_folder("calibrate")
 @option.quiet
@@ -470,6 +427,10 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
     SOURCE is as for `compensate`. Move the tool manually or by the motion of `excite`, without
     contact. The command ends when all tolerances are reached; it writes the log and the results of
     `identify`. The exit status is 1 if the time ends before.
+
+    Options:
+        --until: Required accuracy; mass, com or inertia may be left out.
+        --seconds: Maximum duration of the recording [s].
     """
     from drake_teleop.cli.calibrate import calibrate_command
 
@@ -486,15 +447,10 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
 
 @cli.command()
 @click.argument("identification", type=option.PATH_TYPE)
-@click.option("--to", required=True, type=_EXPORT_FORMAT_TYPE, help="Robot or file format.")
-@option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
-@option.choice(
-    "--sign",
-    ["-1", "1"],
-    "-1",
-    "As in the log description: -1 if the sensor measures the wrench of the load on it.",
-)
-@option.rate_hz("Rate of the sensor's readings; required by c99, fmu and ros2_filter.")
+@click.option("--to", required=True, type=_EXPORT_FORMAT_TYPE)
+@option.sensor_pose
+@option.choice("--sign", ["-1", "1"], "-1")
+@option.rate_hz()
 @option.cutoff_hz
 @option.sensor_range
 @option.output_folder("export")
@@ -507,6 +463,12 @@ def export(
     compensation or a model. c99, fmu and ros2_filter write the compensation itself into --out, as
     code of a controller with --rate, --cutoff and --range. Values that are dropped or not
     identified are listed on stderr.
+
+    Options:
+        --to: Robot or file format.
+        --sign: As in the log description: -1 if the sensor measures the wrench of the load on it.
+        --sensor-pose: Pose of the sensor in the flange [m, deg].  [default: same frames]
+        --rate: Rate of the sensor's readings; required by c99, fmu and ros2_filter.
     """
     from drake_teleop.load.identification import Identification
 
@@ -546,9 +508,7 @@ def sample_log(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE)
-@option.choice(
-    "--direction", ["x", "y", "z"], "z", "Direction of the task, an axis of the world frame."
-)
+@option.choice("--direction", ["x", "y", "z"], "z")
 @option.output_folder("analyze")
 @option.quiet
 def analyze(scenario: str, out: Path, **options: Any) -> None:
@@ -556,6 +516,9 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
     SCENARIO is a shipped name or a YAML file. Linearises the station: margins, passivity, rendered
     impedance, maps over two parameters. Writes pictures and report.html.
+
+    Options:
+        --direction: Direction of the task, an axis of the world frame.
     """
     from drake_teleop.lab.analysis.analyze import analyze_command
 
@@ -563,15 +526,9 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command("compare-passivity")
-@click.option(
-    "--networks", type=option.NAMES_TYPE, help="Network presets.  [default: all but ideal]"
-)
-@click.option("--methods", type=option.NAMES_TYPE, help="Passivity methods.  [default: all]")
-@click.option(
-    "--scenario",
-    default="contact_transition",
-    help="Scenario of the station: a shipped name or a YAML file.",
-)
+@click.option("--networks", type=option.NAMES_TYPE)
+@click.option("--methods", type=option.NAMES_TYPE)
+@click.option("--scenario", default="contact_transition")
 @option.jobs
 @option.output_folder("compare-passivity")
 @option.seed_0
@@ -584,6 +541,11 @@ def compare_passivity(
     The station moves freely and presses on a soft and a stiff sheet spring. In a model with one
     degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
     pictures and report.html.
+
+    Options:
+        --networks: Network presets.  [default: all but ideal]
+        --methods: Passivity methods.  [default: all]
+        --scenario: Scenario of the station: a shipped name or a YAML file.
     """
     from drake_teleop.lab.comparison.compare_passivity import NETWORKS, compare_command
 
@@ -592,19 +554,10 @@ def compare_passivity(
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE)
-@click.option(
-    "--hands", type=option.NAMES_TYPE, help="Grips of the operator.  [default: light,firm]"
-)
-@click.option(
-    "--walls", type=option.POSITIVES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]"
-)
-@click.option("--network", help="Network preset.  [default: that of the scenario]")
-@option.choice(
-    "--task",
-    ["press", "touch", "insert"],
-    "press",
-    "Task; it sets the required stability margin of gamma.",
-)
+@click.option("--hands", type=option.NAMES_TYPE)
+@click.option("--walls", type=option.POSITIVES_TYPE)
+@click.option("--network")
+@option.choice("--task", ["press", "touch", "insert"], "press")
 @option.jobs
 @option.output_folder("tune")
 @option.quiet
@@ -620,6 +573,12 @@ def tune(
     SCENARIO is a shipped name or a YAML file. Finds the settings with the smallest detectable
     contact force that are stable for these grips and walls. Writes tuned.yaml and report.html.
     After an interruption, repeat the command.
+
+    Options:
+        --hands: Grips of the operator.  [default: light,firm]
+        --walls: Wall stiffnesses [kN/m].  [default: 0.5,20]
+        --network: Network preset.  [default: that of the scenario]
+        --task: Task; it sets the required stability margin of gamma.
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
@@ -631,8 +590,8 @@ def tune(
 @click.argument("study", type=option.STUDY_TYPE)
 @option.jobs
 @option.dask_cluster
-@click.option("--shard", metavar="K/N", help="Run only part K of N, e.g. 3/8; see docs/cluster.md.")
-@click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
+@click.option("--shard", metavar="K/N")
+@click.option("--merge", is_flag=True)
 @option.skip_run_count_question
 @option.output_folder("study")
 @option.quiet
@@ -641,6 +600,10 @@ def study(study: Path, out: Path, **options: Any) -> None:
 
     STUDY is a YAML file with factors, design, repeats and measures, or a shipped name. Writes one
     table with a row for each run, and pictures. After an interruption, repeat the command.
+
+    Options:
+        --shard: Run only part K of N, e.g. 3/8; see docs/cluster.md.
+        --merge: Collect the runs of all shards in --out.
     """
     from drake_teleop.lab.studies.study import study_command
 
@@ -650,9 +613,7 @@ def study(study: Path, out: Path, **options: Any) -> None:
 @cli.command("scaling-study")
 @option.jobs
 @option.dask_cluster
-@click.option(
-    "--repeats", type=option.IntegerInRange(1, 10**6), help="Runs per combination.  [default: 12]"
-)
+@option.integer("--repeats", limits=(1, 10**6))
 @option.skip_run_count_question
 @option.output_folder("scaling-study")
 @option.quiet
@@ -661,6 +622,9 @@ def scaling_study(out: Path, **options: Any) -> None:
 
     Simulates the operator's tasks for combinations of sigma, gamma and eta, in about 1000 runs.
     After an interruption, repeat the command.
+
+    Options:
+        --repeats: Runs per combination.  [default: 12]
     """
     from drake_teleop.lab.studies.scaling_study import scaling_study_command
 
@@ -669,53 +633,16 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE, default="identification")
-@option.path("--model", help="Other arm: URDF, SDF, MJCF or .dmd.yaml.")
+@option.path("--model")
 @option.sensor_frame()
 @option.package_paths
-@click.option(
-    "--acceleration",
-    type=option.POSITIVES_TYPE,
-    default=(),
-    help="With --model: acceleration limits [rad/s^2], one for all joints or one for each.",
-)
-@click.option(
-    "--payload",
-    type=option.FiniteNumber(0, 1e4, min_open=True),
-    metavar="KG",
-    help="With --model: heaviest load of the sensor [kg]."
-    "  [default: 130 % of the model's mass beyond the sensor]",
-)
-@option.choice(
-    "--criterion",
-    ["kappa_w10", "kappa10", "kappa16", "A16", "D16"],
-    "kappa_w10",
-    "Condition number (kappa_w10: whitened; kappa10: SI units; kappa16: with offsets)"
-    " or predicted errors (A16: rms; D16: geometric mean).",
-)
-@click.option(
-    "--period",
-    type=option.FiniteNumber(0.5, 600),
-    default=6.0,
-    metavar="SECONDS",
-    help="Duration of one period of the motion.",
-)
-@click.option(
-    "--harmonics",
-    type=option.IntegerInRange(2, 20),
-    help="Number of harmonics.  [default: 5; 3 with --until]",
-)
-@click.option(
-    "--until",
-    metavar="TOLERANCE",
-    help='Find the shortest motion for an accuracy such as "mass 0.5 %, com 0.5 mm, inertia 5 %".',
-)
-@click.option(
-    "--time",
-    "seconds",
-    type=option.FiniteNumber(0, 1e6, min_open=True),
-    metavar="SECONDS",
-    help="CPU time of the optimiser.  [default: time for four starts, with reproducible results]",
-)
+@click.option("--acceleration", type=option.POSITIVES_TYPE, default=())
+@option.number("--payload", limits=(0, 1e4), min_open=True, metavar="KG")
+@option.choice("--criterion", ["kappa_w10", "kappa10", "kappa16", "A16", "D16"], "kappa_w10")
+@option.number("--period", limits=(0.5, 600), default=6.0, metavar="SECONDS")
+@option.integer("--harmonics", limits=(2, 20))
+@click.option("--until", metavar="TOLERANCE")
+@option.number("--time", "seconds", limits=(0, 1e6), min_open=True, metavar="SECONDS")
 @option.seed_0
 @option.output_folder("excite")
 @option.quiet
@@ -725,6 +652,21 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     The motion is for the slave of SCENARIO, or with --model for another arm with SCENARIO's sensor.
     It is a Fourier series from rest to rest, optimised and checked against every limit and for
     collisions. Check the 3D replay, excitation.html, before a robot runs the motion.
+
+    Options:
+        --model: Other arm: URDF, SDF, MJCF or .dmd.yaml.
+        --acceleration: With --model: acceleration limits [rad/s^2], one for all joints or one for
+            each.
+        --payload: With --model: heaviest load of the sensor [kg].  [default: 130 % of the model's
+            mass beyond the sensor]
+        --criterion: Condition number (kappa_w10: whitened; kappa10: SI units; kappa16: with
+            offsets) or predicted errors (A16: rms; D16: geometric mean).
+        --period: Duration of one period of the motion.
+        --harmonics: Number of harmonics.  [default: 5; 3 with --until]
+        --until: Find the shortest motion for an accuracy such as "mass 0.5 %, com 0.5 mm, inertia 5
+            %".
+        --time: CPU time of the optimiser.  [default: time for four starts, with reproducible
+            results]
     """
     if options["until"] is not None:
         option.refuse_given_options("criterion", "period", "seconds", remedy="remove it or --until")
@@ -735,26 +677,24 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("folder", type=option.PATH_TYPE)
-@option.path("--arm", required=True, help="Arm model: URDF, SDF, MJCF or .dmd.yaml.")
+@option.path("--arm", required=True)
 @option.sensor_frame(required=True)
 @option.package_paths
-@option.path(
-    "--tool",
-    help="Model of the tool.  [default: the arm's model beyond the sensor, or a default tool]",
-)
-@click.option(
-    "--device",
-    default="phantom_premium_15",
-    metavar="NAME",
-    help="Preset of the master's haptic device.",
-)
-@click.option("--sensor", metavar="PRESET", help="Preset of the wrist sensor.")
+@option.path("--tool")
+@click.option("--device", default="phantom_premium_15", metavar="NAME")
+@click.option("--sensor", metavar="PRESET")
 @option.quiet
 def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
     """Create a station with your own arm.
 
     Writes FOLDER/station.yaml, a short commented scenario: start of the arm, scales that fit the
     device, a wall below the tool. Then simulates it once, into FOLDER/first_run.
+
+    Options:
+        --arm: Arm model: URDF, SDF, MJCF or .dmd.yaml.
+        --tool: Model of the tool.  [default: the arm's model beyond the sensor, or a default tool]
+        --device: Preset of the master's haptic device.
+        --sensor: Preset of the wrist sensor.
     """
     from drake_teleop.lab.new_station import new_command
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from functools import partial, wraps
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
@@ -52,44 +54,92 @@ STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
 path = partial(click.option, type=PATH_TYPE)
 
 
-def choice(name: str, words: list[str], default: str, text: str) -> Callable[[Any], Any]:
-    return click.option(name, type=click.Choice(words), default=default, help=text)
+HELP_SETTINGS = dict(help_option_names=["-h", "--help"], max_content_width=100, show_default=True)
 
 
-def _fail_if_outside_range(
-    kind: click.FloatRange | click.IntRange, number: float, param: Any, ctx: Any
-) -> None:
-    low, high = kind.min, kind.max
-    if high is not None and not (low or 0) <= number <= high:
-        text = f"{short_text(number)} is outside {short_text(low or 0)} to {short_text(high)}"
-        kind.fail(text, param, ctx)
-    if low is not None and (number < low or (kind.min_open and number == low)):
-        relation = "not above" if kind.min_open else "below"
-        kind.fail(f"{short_text(number)} is {relation} {short_text(low)}", param, ctx)
+_SHARED_HELP = """
+    --cluster: Dask scheduler that runs the processes; local: start one on this machine.
+    --cutoff: Cutoff of the low-pass on all signals; zero-phase for logs, causal for live streams.
+    --delay: Delay of the motion behind the wrench [s], or auto to estimate it.
+    --free: Log of free motion with this load, for the threshold of contact.  [default: quiet parts
+        of LOG]
+    --gamma: Scale of the contact wrench.
+    --gripper: identification.json of the gripper without the object, in the same sensor frame.
+    --jobs: Number of parallel processes.  [default: one for each core]
+    --load: identification.json of the load.
+    --model: Model of the arm (URDF, SDF, MJCF), if SOURCE gives joint angles, no poses.
+    --motion: Another source of the motion, as for SOURCE.
+    --out: Output folder.
+    --package-path: Folder to search for package:// files of the model; may be repeated.
+    --quiet: Print no progress bars and no tables.
+    --range: Range of the sensor [N, N m]; readings at its limits are not used.
+    --real-time: Replay a log at its recorded speed.
+    --seed: Seed of noise.  [default: the scenario's]
+    --sensor-frame: Frame or link of the model at which the wrist sensor measures.
+    --sensor-pose: Pose of the sensor in the frame of the streamed poses [m, deg].
+    --sigma-inertia: Scale of the load's inertia alone.  [default: value of --sigma]
+    --sigma-weight: Scale of the load's weight alone.  [default: value of --sigma]
+    --yes: Start more than 100,000 runs without a question."""
 
 
-class FiniteNumber(click.FloatRange):
+def _help_of_options(text: str) -> dict[str, str]:
+    found = re.findall(r"^ {4}(--[\w-]+): ((?:.|\n {8})+)", text, re.M)
+    return {name: meaning.replace("\n" + " " * 8, " ") for name, meaning in found}
+
+
+class DocumentedCommand(click.Command):
+    """Command whose docstring ends with `Options:` and the help of its own options."""
+
+    def __init__(self, name: str | None, *, help: str | None = None, **settings: Any) -> None:
+        text, _, listed = cleandoc(help or "").partition("\n\nOptions:")
+        super().__init__(name, help=text, **settings)
+        texts = _help_of_options(_SHARED_HELP) | _help_of_options(listed)
+        for each in self.params:
+            if isinstance(each, click.Option):
+                each.help = each.help or texts[each.opts[0]]
+
+
+class CommandGroup(click.Group):
+    """Group of a `DocumentedCommand` for each decorated function."""
+
+    command_class = DocumentedCommand
+
+
+class Number(click.FloatRange):
     """Parameter type of finite numbers in a range; click's type accepts nan and inf."""
 
-    name = "number"
+    name, _type_without_range = "number", click.FLOAT
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        number: float = click.FLOAT.convert(value, param, ctx)
-        if not math.isfinite(number):
+    def convert(self: Any, value: Any, param: Any, ctx: Any) -> Any:
+        number, low, high = self._type_without_range.convert(value, param, ctx), self.min, self.max
+        if isinstance(number, float) and not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
-        _fail_if_outside_range(self, number, param, ctx)
+        if not low <= number <= high:
+            text = f"{short_text(number)} is outside {short_text(low)} to {short_text(high)}"
+            self.fail(text, param, ctx)
+        if self.min_open and number == low:
+            self.fail(f"{short_text(number)} is not above {short_text(low)}", param, ctx)
         return number
 
 
-class IntegerInRange(click.IntRange):
+class Integer(click.IntRange):
     """Parameter type of integers in a range."""
 
-    name = "integer"
+    name, _type_without_range, convert = "integer", click.INT, Number.convert
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> int:
-        number: int = click.INT.convert(value, param, ctx)
-        _fail_if_outside_range(self, number, param, ctx)
-        return number
+
+def number(
+    *names: str, limits: tuple[float, float], min_open: bool = False, **settings: Any
+) -> Any:
+    return click.option(*names, type=Number(*limits, min_open=min_open), **settings)
+
+
+def integer(name: str, limits: tuple[int, int], **settings: Any) -> Any:
+    return click.option(name, type=Integer(*limits), **settings)
+
+
+def choice(name: str, words: list[str], default: str) -> Any:
+    return click.option(name, type=click.Choice(words), default=default)
 
 
 class DelayOrAuto(click.ParamType):
@@ -98,11 +148,11 @@ class DelayOrAuto(click.ParamType):
     name = "auto|SECONDS"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
-        return "auto" if value == "auto" else FiniteNumber(-10, 10).convert(value, param, ctx)
+        return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
-SCALE_TYPE = FiniteNumber(0, 100)
-POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
+SCALE_TYPE = Number(0, 100)
+POSITIVE_TYPE = Number(0, 1e5, min_open=True)
 
 
 class CommaSeparated(click.ParamType):
@@ -145,7 +195,6 @@ def output_folder(command: str) -> Callable[[Any], Any]:
         type=PATH_TYPE,
         default=Path("out") / command,
         metavar="DIR",
-        help="Output folder.",
         callback=_remove_new_empty_folders_at_end,
     )
 
@@ -168,60 +217,26 @@ def _remove_empty_folders(new: list[Path]) -> None:
             return
 
 
-_SEED_TYPE = IntegerInRange(0, 2**32 - 1)
-seed = click.option("--seed", type=_SEED_TYPE, help="Seed of noise.  [default: the scenario's]")
-seed_0 = click.option("--seed", type=_SEED_TYPE, default=0, help="Random seed.")
 jobs = click.option(
-    "--jobs",
-    type=IntegerInRange(1, 4096),
-    callback=lambda _ctx, _param, count: count or -1,
-    help="Number of parallel processes.  [default: one for each core]",
+    "--jobs", type=Integer(1, 4096), callback=lambda _ctx, _param, count: count or -1
 )
-dask_cluster = click.option(
-    "--cluster",
-    metavar="ADDRESS",
-    help="Dask scheduler that runs the processes; local: start one on this machine.",
-)
-quiet = click.option("--quiet", is_flag=True, help="Print no progress bars and no tables.")
-cutoff_hz = click.option(
-    "--cutoff",
-    "cutoff_hz",
-    type=POSITIVE_TYPE,
-    default=30.0,
-    metavar="HZ",
-    help="Cutoff of the low-pass on all signals; zero-phase for logs, causal for live streams.",
-)
-sensor_range = click.option(
-    "--range",
-    "largest",
-    type=POSITIVE_TYPE,
-    nargs=2,
-    metavar="N NM",
-    help="Range of the sensor [N, N m]; readings at its limits are not used.",
-)
-delay = click.option(
-    "--delay",
-    type=DelayOrAuto(),
-    default="auto",
-    help="Delay of the motion behind the wrench [s], or auto to estimate it.",
-)
-gamma = click.option("--gamma", type=SCALE_TYPE, default=1.0, help="Scale of the contact wrench.")
-package_paths = path(
-    "--package-path",
-    "package_paths",
-    multiple=True,
-    metavar="DIR",
-    help="Folder to search for package:// files of the model; may be repeated.",
-)
-gripper_file = path(
-    "--gripper",
-    help="identification.json of the gripper without the object, in the same sensor frame.",
-)
-free_motion_log = path(
-    "--free",
-    metavar="LOG",
-    help="Log of free motion with this load, for the threshold of contact."
-    "  [default: quiet parts of LOG]",
+seed = partial(click.option, "--seed", type=Integer(0, 2**32 - 1))
+seed_0 = seed(default=0, help="Random seed.")
+dask_cluster = click.option("--cluster", metavar="ADDRESS")
+quiet = click.option("--quiet", is_flag=True)
+cutoff_hz = click.option("--cutoff", "cutoff_hz", type=POSITIVE_TYPE, default=30.0, metavar="HZ")
+rate_hz = partial(click.option, "--rate", "rate_hz", type=POSITIVE_TYPE, metavar="HZ")
+sensor_range = click.option("--range", "largest", type=POSITIVE_TYPE, nargs=2, metavar="N NM")
+delay = click.option("--delay", type=DelayOrAuto(), default="auto")
+sigma = click.option("--sigma", type=SCALE_TYPE, default=0.0)
+gamma = click.option("--gamma", type=SCALE_TYPE, default=1.0)
+load_file = partial(path, "--load")
+gripper_file = path("--gripper")
+free_motion_log = path("--free", metavar="LOG")
+package_paths = path("--package-path", "package_paths", multiple=True, metavar="DIR")
+sensor_frame = partial(click.option, "--sensor-frame", metavar="NAME")
+sensor_pose = click.option(
+    "--sensor-pose", nargs=6, type=Number(-1e3, 1e3), metavar="X Y Z ROLL PITCH YAW"
 )
 
 
@@ -248,47 +263,14 @@ def confirm_at_terminal(question: str) -> bool:
 
 
 skip_run_count_question = click.option(
-    "--yes",
-    is_flag=True,
-    callback=lambda _ctx, _param, is_set: is_set or confirm_at_terminal,
-    help="Start more than 100,000 runs without a question.",
+    "--yes", is_flag=True, callback=lambda _ctx, _param, is_set: is_set or confirm_at_terminal
 )
 
 
-def load_file(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
-    text = "identification.json of the load." + (f"  [default: {default}]" if default else "")
-    return click.option("--load", type=PATH_TYPE, required=required, help=text)
-
-
-def sigma(text: str) -> Callable[[Any], Any]:
-    return click.option("--sigma", type=SCALE_TYPE, default=0.0, help=text)
-
-
 def separate_sigmas(command: Any) -> Any:
-    text = "Scale of the load's {} alone.  [default: value of --sigma]"
     for part in ("inertia", "weight"):
-        command = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))(command)
+        command = click.option(f"--sigma-{part}", type=SCALE_TYPE)(command)
     return command
-
-
-def rate_hz(text: str, *, required: bool = False) -> Callable[[Any], Any]:
-    names = ("--rate", "rate_hz")
-    return click.option(*names, type=POSITIVE_TYPE, required=required, metavar="HZ", help=text)
-
-
-def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
-    text = "Frame or link of the model at which the wrist sensor measures."
-    return click.option("--sensor-frame", required=required, metavar="NAME", help=text)
-
-
-def sensor_pose(text: str) -> Callable[[Any], Any]:
-    return click.option(
-        "--sensor-pose",
-        nargs=6,
-        type=FiniteNumber(-1e3, 1e3),
-        metavar="X Y Z ROLL PITCH YAW",
-        help=text,
-    )
 
 
 def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -309,18 +291,13 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         delay,
         cutoff_hz,
-        click.option("--real-time", is_flag=True, help="Replay a log at its recorded speed."),
+        click.option("--real-time", is_flag=True),
         sensor_range,
-        sensor_pose("Pose of the sensor in the frame of the streamed poses [m, deg]."),
+        sensor_pose,
         package_paths,
         sensor_frame(),
-        path(
-            "--model",
-            help="Model of the arm (URDF, SDF, MJCF), if SOURCE gives joint angles, no poses.",
-        ),
-        click.option(
-            "--motion", metavar="SOURCE", help="Another source of the motion, as for SOURCE."
-        ),
+        path("--model"),
+        click.option("--motion", metavar="SOURCE"),
     ):
         decorated = option(decorated)
     return decorated

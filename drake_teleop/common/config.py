@@ -272,13 +272,11 @@ def _block_class_of_tag(blocks: tuple[type, ...], value: Any, place: str) -> typ
 
 
 def _has_value_type(kind: type, value: Any, *, from_file: bool) -> bool:
-    if kind in (bool, str):
-        return isinstance(value, kind)
-    if isinstance(value, bool):
+    if isinstance(value, bool) and kind is not bool:
         return False
-    if kind is int:
-        return isinstance(value, numbers.Integral)
-    return isinstance(value, numbers.Real) or (from_file and _is_numeric_text(value))
+    required = {int: numbers.Integral, float: numbers.Real}.get(kind, kind)
+    numeric_text = kind is float and from_file and _is_numeric_text(value)
+    return isinstance(value, required) or numeric_text
 
 
 def _is_numeric_text(value: Any) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from io import BytesIO
-from typing import Any
+from pathlib import Path
 
 import matplotlib as mpl
 from cycler import cycler
@@ -22,34 +22,11 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 #: Resolution of pictures in HTML pages [dots per inch].
 PAGE_DPI = 160
 
-_PLOT_STYLE: dict[Any, Any] = {
-    "figure.dpi": 110,
-    "figure.constrained_layout.use": True,
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.labelsize": 9.5,
-    "axes.edgecolor": "#9CA3AF",
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E5E7EB",
-    "grid.linewidth": 0.6,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": BLACK,
-    "ytick.labelcolor": BLACK,
-    "lines.linewidth": 1.2,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-}
-
 
 def plot_style() -> AbstractContextManager[None]:
-    return mpl.rc_context({**_PLOT_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
+    sheet = Path(__file__).with_name("figures.mplstyle")
+    style = mpl.rc_params_from_file(sheet, use_default_template=False)
+    return mpl.rc_context({**style, "axes.prop_cycle": cycler(color=COLOURS)})
 
 
 class Picture(Figure):

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -23,12 +23,15 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.haply import HaplyDevice
-from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _CLIENT_PERIOD_S, _MAX_CLIENT_PERIOD_S = 1e-3, 0.1  # s
 _MAX_STORED_FORCE_AGES = 100_000  # ticks
+_SIMULATION_STEPS_PER_MS = 10  # per ms
+_MASS_KG, _DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
+HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
+"""Function from time [s] to intended position [m] and velocity [m/s]."""
 
 
 class HapticDevice(Protocol):
@@ -37,8 +40,8 @@ class HapticDevice(Protocol):
     @property
     def limits(self) -> DeviceLimits: ...
 
-    def read(self) -> device_packets.DevicePose | None:
-        """Return the next pose; None if none is received for 0.5 s."""
+    def read(self) -> device_packets.DeviceState | None:
+        """Return the next pose, without number and time; None if none is received for 0.5 s."""
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
@@ -98,16 +101,12 @@ class DeviceClient:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send_pose(self, pose: device_packets.DevicePose, now: float, age: float) -> None:
+    def _send_pose(self, pose: device_packets.DeviceState, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
             self.force_ages_s.append(behind)
-        x, y, z = map(float, pose.position)
-        w, i, j, k = map(float, pose.quaternion_wxyz)
-        state = device_packets.DeviceState(
-            self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind
-        )
+        state = pose._replace(number=self._number, t=now, behind=behind)
         try:
             self._socket.send(device_packets.pack_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer
@@ -116,6 +115,50 @@ class DeviceClient:
     def close(self) -> None:
         self._device.close()
         self._socket.close()
+
+
+class VirtualDevice:
+    """Simulated device in a moving hand; `energy`: work against the rendered force [J]."""
+
+    def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
+        held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
+        self._mass, self._k, self._d = _MASS_KG + held.mass, held.stiffness, held.damping
+        self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
+        self.energy, self._t = 0.0, 0.0
+
+    def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
+        """Simulate `seconds` under a constant force (3,) on the hand [N]."""
+        steps = max(math.ceil(seconds * 1e3 * _SIMULATION_STEPS_PER_MS - 1e-9), 1)
+        h = seconds / steps
+        for _ in range(steps):
+            self._t += h
+            at, speed = self._hand(self._t)
+            for i in range(3):
+                x, v = self.position[i], self.velocity[i]
+                elastic, damped = self._k * (at[i] - x), self._d * (speed[i] - v)
+                pull = force[i] - _DAMPING_NS_M * v + elastic + damped
+                v += h * pull / self._mass
+                self.velocity[i], self.position[i] = v, x + h * v
+                self.energy -= force[i] * h * v
+
+
+def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
+    """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""
+    lift, hold = 0.01, 0.6
+
+    def hand_motion(t: float) -> tuple[Sequence[float], Sequence[float]]:
+        phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)
+        if phase < way:
+            s, rate = phase / way, 1.0
+        elif phase < way + hold:
+            s, rate = 1.0, 0.0
+        else:
+            s, rate = (1.0 - phase) / way, -1.0
+        smooth, slope = s * s * (3.0 - 2.0 * s), 6.0 * s * (1.0 - s) * rate * hertz / way
+        far = depth + lift
+        return (0.0, 0.0, lift - far * smooth), (0.0, 0.0, -far * slope)
+
+    return hand_motion
 
 
 class RealTimeVirtualDevice:
@@ -128,7 +171,7 @@ class RealTimeVirtualDevice:
         self._wrench: Sequence[float] = (0.0,) * 6
         self._due = self._simulated_until = time.perf_counter()
 
-    def read(self) -> device_packets.DevicePose:
+    def read(self) -> device_packets.DeviceState:
         self._due += _CLIENT_PERIOD_S
         now = time.perf_counter()
         if self._due > now:
@@ -138,7 +181,8 @@ class RealTimeVirtualDevice:
             self._due = self._simulated_until = now
         self.virtual.simulate_motion(self._wrench[:3], max(now - self._simulated_until, 1e-6))
         self._simulated_until = now
-        return device_packets.DevicePose(self.virtual.position)
+        x, y, z = self.virtual.position
+        return device_packets.DeviceState(0, 0.0, (x, y, z))
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         self._wrench = wrench

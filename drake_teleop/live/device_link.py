@@ -12,11 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    quaternion_logarithm,
-    quaternion_product,
-)
+from drake_teleop.common.vectors import conjugate_quaternion, quaternion_product
 from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
@@ -27,7 +23,7 @@ from drake_teleop.live.device_packets import (
     rejection_reason,
     unpack_state,
 )
-from drake_teleop.live.inputs import INPUT_UNIT_M, INPUT_UNIT_RAD
+from drake_teleop.live.inputs import inputs_at_displacement
 from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_END_TIMEOUT_S = 2.0  # s
@@ -40,6 +36,8 @@ _CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 class DeviceLink:
     """UDP link to one device client on this machine; 50 ms of silence admit another client.
 
+    The address is udp://127.0.0.1:PORT, or haply://HOST:PORT, whose client is a child process.
+
     Attributes:
         refused: number of invalid packets and packets of other senders.
         refusal: reason of the last refusal.
@@ -47,13 +45,17 @@ class DeviceLink:
     """
 
     def __init__(self, address: str) -> None:
-        host, port = host_and_port(address)
+        kind = address.partition("://")[0]
+        if kind not in ("udp", "haply"):
+            what = "is not the address of a haptic device"
+            remedy = "use udp://127.0.0.1:PORT or haply://localhost:10001"
+            raise DrakeTeleopError(what, where=address, remedy=remedy)
+        host, port = host_and_port(address) if kind == "udp" else (LOCALHOST, 0)
         if not _is_loopback(host):
             what = "is not an address of this machine (other senders could move the arm)"
             remedy = "use udp://127.0.0.1:PORT, and run the device's client on this machine"
             raise DrakeTeleopError(what, where=address, remedy=remedy)
         self._socket = open_udp_receiver(host, port)
-        self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
         self.refused = self.lost = 0
         self.refusal = ""
@@ -64,6 +66,11 @@ class DeviceLink:
         # Arrival minus the device's time; the minimum is the clock offset.
         self._latencies: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
         self._force_ages: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
+        self._client: subprocess.Popen[bytes] | None = None
+        if kind == "haply":
+            station = f"udp://{LOCALHOST}:{self.port}"
+            client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
+            self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def receive_state(self, now: float) -> DeviceState | None:
         """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
@@ -118,13 +125,9 @@ class DeviceLink:
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
         first = self._origin
-        turn = quaternion_logarithm(
-            quaternion_product(state.quaternion_wxyz, conjugate_quaternion(first.quaternion_wxyz))
-        )
-        values: dict[str, float] = {"held": 1}
-        for k, name in enumerate("xyz"):
-            values[name] = (state.position[k] - first.position[k]) / INPUT_UNIT_M
-            values["r" + name] = turn[k] / INPUT_UNIT_RAD
+        moved = np.subtract(state.position, first.position)
+        back = conjugate_quaternion(first.quaternion_wxyz)
+        values = inputs_at_displacement(moved, quaternion_product(state.quaternion_wxyz, back))
         if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_AFTER_SILENCE_S:
             values["clutch"] = 0
         return values
@@ -166,6 +169,14 @@ class DeviceLink:
 
     def close(self) -> None:
         self._socket.close()
+        if self._client is None:
+            return
+        self._client.terminate()
+        try:
+            self._client.wait(_CLIENT_END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._client.kill()
+            self._client.wait()
 
 
 def _is_loopback(host: str) -> bool:
@@ -175,34 +186,3 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-class DeviceConnection:
-    """Link to a haptic device at udp://127.0.0.1:PORT or haply://HOST:PORT.
-
-    For a haply:// address it also runs the client process.
-    """
-
-    def __init__(self, address: str) -> None:
-        kind = address.partition("://")[0]
-        if kind not in ("udp", "haply"):
-            what = "is not the address of a haptic device"
-            remedy = "use udp://127.0.0.1:PORT or haply://localhost:10001"
-            raise DrakeTeleopError(what, where=address, remedy=remedy)
-        self.link = DeviceLink(address if kind == "udp" else f"udp://{LOCALHOST}:0")
-        self._client: subprocess.Popen[bytes] | None = None
-        if kind == "haply":
-            station = f"udp://{LOCALHOST}:{self.link.port}"
-            client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
-            self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
-
-    def close(self) -> None:
-        self.link.close()
-        if self._client is None:
-            return
-        self._client.terminate()
-        try:
-            self._client.wait(_CLIENT_END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._client.kill()
-            self._client.wait()

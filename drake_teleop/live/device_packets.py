@@ -40,14 +40,6 @@ class DeviceState(NamedTuple):
     behind: float = 0.0
 
 
-class DevicePose(NamedTuple):
-    """Position p_BE [m], orientation R_BE [w, x, y, z] and flags of a `DeviceState`."""
-
-    position: Sequence[float]
-    quaternion_wxyz: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
-    flags: int = 0
-
-
 class ForceCommand(NamedTuple):
     """Wrench [f; tau] in B [N, N m], with number and time of the answered state."""
 

@@ -1,44 +1,29 @@
-"""Simulated hand of a live session, on a smooth path to the newest target."""
+"""Hand of a live session: simulated, on a smooth path to the newest target, or at a real device."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DependencyTicket,
-    Diagram,
-    DiagramBuilder,
-)
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RollPitchYaw, RotationMatrix
+from pydrake.systems import framework
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 
-from drake_teleop.common.blocks import ONE_DICT
+from drake_teleop.common import vectors
+from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    add_cross_product,
-    conjugate_quaternion,
-    copy_into,
-    cross,
-    plus,
-    quaternion_at,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    scale_vector,
-    vector_at,
-)
 from drake_teleop.live.station_swap import finish_master_side
-from drake_teleop.station.master_side import MakeMasterSide
-from drake_teleop.station.operator.operator import (
-    HandImpedance,
-    Operator,
-    OperatorConfig,
-    hand_wrench_into,
-)
+from drake_teleop.station.master_side import CLUTCH_PERIOD_S, MakeMasterSide
+from drake_teleop.station.operator import operator
+from drake_teleop.station.passivity.packet import limit_group
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.slave.plant import start_pose
+from drake_teleop.station.wiring import export_outputs
 
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
@@ -54,6 +39,16 @@ _HELD_INDEX, _START_TIME_INDEX, _POLE_INDEX, _TARGET_POSE_INDEX, _PATH_SIZE = 0,
 _OFFSET_INDEX, _VELOCITY_INDEX, _ACCELERATION_INDEX = 10, 13, 16
 _ROTATION_INDEX, _RATE_INDEX = 19, 22
 _INTENDED_MOTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
+#: Period of the poses [s], and [ms].
+POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
+# Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
+# largest slew rate [1/s].
+_WRENCH_LIMIT_FADE_S, _LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
+# Path of a device: held flag, start time [s], start pose (7,), displacement, rotation vector (3,).
+_START_POSE_INDEX, _DISPLACEMENT_INDEX, _TURN_INDEX = 2, 9, 12
+# Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
+_FAULT_INDEX, _ALLOWED_SHARE_INDEX, _DISPLAY_STATE_SIZE = 6, 7, 8
+_WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 
 
 @njit(cache=True)
@@ -81,8 +76,10 @@ def _intended_motion_into(path, time, pose, out):
         turning = turn_rate + _ROTATION_POLE_RAD_S * turn
         r[k] = (turn + turning * t) * turning_decay
         rate[k] = (turn_rate - _ROTATION_POLE_RAD_S * turning * t) * turning_decay
-    target = quaternion_at(path, _TARGET_POSE_INDEX)
-    orientation = quaternion_product(quaternion_exponential(vector_at(r, 0)), target)
+    target = vectors.quaternion_at(path, _TARGET_POSE_INDEX)
+    orientation = vectors.quaternion_product(
+        vectors.quaternion_exponential(vectors.vector_at(r, 0)), target
+    )
     for k in range(4):
         out[k] = orientation[k]
     # omega = rate + a r x rate + b r x (r x rate)
@@ -106,18 +103,22 @@ def _rotation_vector_rate(r, omega):
     if square > 1e-4:
         angle = math.sqrt(square)
         c = 1.0 / square - math.sin(angle) / (2.0 * angle * (1.0 - math.cos(angle)))
-    across = cross(r, omega)
-    return add_cross_product(plus(omega, scale_vector(-0.5, across)), scale_vector(c, r), across)
+    across = vectors.cross(r, omega)
+    return vectors.add_cross_product(
+        vectors.plus(omega, vectors.scale_vector(-0.5, across)), vectors.scale_vector(c, r), across
+    )
 
 
 @njit(cache=True)
 def _start_path_into(path, time, now, target, poles):
     path[_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, poles
-    copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
-    rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
-    rate = _rotation_vector_rate(rotation, vector_at(now, 10))
-    copy_into(path, _VELOCITY_INDEX, now, 7, 3)
-    copy_into(path, _ACCELERATION_INDEX, now, 13, 3)
+    vectors.copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
+    rotation = vectors.quaternion_logarithm(
+        vectors.quaternion_product(now, vectors.conjugate_quaternion(target))
+    )
+    rate = _rotation_vector_rate(rotation, vectors.vector_at(now, 10))
+    vectors.copy_into(path, _VELOCITY_INDEX, now, 7, 3)
+    vectors.copy_into(path, _ACCELERATION_INDEX, now, 13, 3)
     for k in range(3):
         path[_OFFSET_INDEX + k] = now[4 + k] - target[4 + k]
         path[_ROTATION_INDEX + k], path[_RATE_INDEX + k] = rotation[k], rate[k]
@@ -128,10 +129,10 @@ def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, 
     _intended_motion_into(path, time, pose, intention)
     for k in range(3):
         intention[4 + k] += mass / impedance[0] * intention[13 + k]
-    hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
+    operator.hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
 
 
-class LiveHand(Operator):
+class LiveHand(operator.Operator):
     """Hand of an operator that follows external targets.
 
     .. pydrake_system::
@@ -147,11 +148,11 @@ class LiveHand(Operator):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, config: OperatorConfig, start: Array) -> None:
+    def __init__(self, config: operator.OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
         self._scratch, self._mass = np.empty(_INTENDED_MOTION_SIZE), config.hand.mass
 
-    def _declare_intended_motion_inputs(self) -> set[DependencyTicket]:
+    def _declare_intended_motion_inputs(self) -> set[framework.DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
         path[_HELD_INDEX], path[_POLE_INDEX] = 1.0, _TRANSLATION_POLE_RAD_S
         path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = self._intent[1]
@@ -166,7 +167,9 @@ class LiveHand(Operator):
             _start_path_into(path, context.get_time(), now, target, _TRANSLATION_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def KeepWrench(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+    def KeepWrench(
+        self, context: Context, before: operator.HandImpedance, after: operator.HandImpedance
+    ) -> None:
         """Shift the intended motion so that the new impedance causes no step of the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD_INDEX] < 0.5:
@@ -174,14 +177,16 @@ class LiveHand(Operator):
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._current_motion(context)
         intended, now = tuple(intention[:4]), tuple(pose[:4])
-        rotation = quaternion_logarithm(quaternion_product(intended, conjugate_quaternion(now)))
+        rotation = vectors.quaternion_logarithm(
+            vectors.quaternion_product(intended, vectors.conjugate_quaternion(now))
+        )
         share = before.rotational_stiffness / after.rotational_stiffness
         displacement = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
         translation_share = before.damping / after.damping
         rotation_share = before.rotational_damping / after.rotational_damping
         damping = np.repeat([translation_share, rotation_share], 3)
-        turn = quaternion_exponential(scale_vector(share, rotation))
-        intention[:4] = quaternion_product(turn, now)
+        turn = vectors.quaternion_exponential(vectors.scale_vector(share, rotation))
+        intention[:4] = vectors.quaternion_product(turn, now)
         intention[4:7] = pose[4:] + displacement
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
@@ -211,3 +216,153 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
     hand = LiveHand(scenario.operator, start)
     side = builder.AddNamedSystem("inner_side", MakeMasterSide(scenario, hand))
     return finish_master_side(builder, side, side, 1 / scenario.rates.hand_hz, cross_fade)
+
+
+@njit(cache=True)
+def _pose_and_twist_on_path_into(path, time, out):
+    share = min(max((time - path[_START_TIME_INDEX]) / POSE_PERIOD_S, 0.0), 1.0)
+    r = vectors.scale_vector(share, vectors.vector_at(path, _TURN_INDEX))
+    rotation = vectors.quaternion_product(
+        vectors.quaternion_exponential(r), vectors.quaternion_at(path, _START_POSE_INDEX)
+    )
+    moves = 1.0 / POSE_PERIOD_S if share < 1.0 else 0.0
+    for k in range(4):
+        out[k] = rotation[k]
+    for k in range(3):
+        out[4 + k] = path[_START_POSE_INDEX + 4 + k] + share * path[_DISPLACEMENT_INDEX + k]
+        out[7 + k] = moves * path[_DISPLACEMENT_INDEX + k]
+        out[10 + k] = moves * path[_TURN_INDEX + k]
+
+
+@njit(cache=True)
+def _update_displayed_wrench(wrench, held, period, limits, last, now):
+    fault = 0.0
+    if not are_finite_and_in_range(wrench):
+        fault = _WRENCH_FAULT_NUMBER
+    enabled = held and fault == 0.0
+    change = _LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S
+    allowed = min(max(last[_ALLOWED_SHARE_INDEX] + period * change, 0.0), 1.0)
+    target, step = np.zeros(6), np.empty(6)
+    if enabled:
+        target[:] = wrench
+    for g in range(2):
+        limit_group(target, g, allowed * limits[g])
+    for i in range(6):
+        step[i] = target[i] - last[i]
+    for g in range(2):
+        limit_group(step, g, _RELATIVE_WRENCH_SLEW_PER_S * period * limits[g])
+    for i in range(6):
+        now[i] = last[i] + step[i]
+    now[_FAULT_INDEX], now[_ALLOWED_SHARE_INDEX] = fault, allowed
+
+
+def _copy_state(part: slice, sign: float = 1.0) -> Callable[[Context, BasicVector], None]:
+    def copy(context: Context, output: BasicVector) -> None:
+        output.SetFromVector(sign * context.get_discrete_state_vector().value()[part])
+
+    return copy
+
+
+class ExternalMaster(framework.LeafSystem):
+    """Real haptic device as a system; `SetTarget` receives its poses.
+
+    The force fades within 50 ms while the hand does not hold the device or after a non-finite
+    command, and returns within 0.25 s.
+
+    .. pydrake_system::
+
+        name: ExternalMaster
+        input_ports:
+        - wrench_command: (6,) F_E_B [N, N m]
+        output_ports:
+        - pose_master: (7,) X_BE of the end effector in the master's base
+        - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
+        - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
+        - force_to_master: (6,) wrench for the device [N, N m]
+        - fault_at_hand: number of a `Fault`; 0: none
+        - displayed_and_fault: (7,) force_to_master and fault_at_hand
+        - hand_wrench_E: (6,) minus the displayed wrench
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, start: Array, period: float, limits: Array) -> None:
+        super().__init__()
+        path = np.array([1.0, -POSE_PERIOD_S, *start, *np.zeros(6)])
+        self._path = self.DeclareNumericParameter(BasicVector(path))
+        self._period, self._limits, self._pose_and_twist = period, limits, np.zeros(13)
+        self._command = self.DeclareVectorInputPort("wrench_command", 6)
+        self.DeclareDiscreteState(np.zeros(_DISPLAY_STATE_SIZE))
+        moves, displayed = {self.all_parameters_ticket(), self.time_ticket()}, {self.xd_ticket()}
+        for name, size, calc, needed in (
+            ("pose_master", 7, weak_callback(self._calc_pose), moves),
+            ("twist_master", 6, weak_callback(self._calc_twist), moves),
+            ("master_state", 12, weak_callback(self._calc_master_state), moves),
+            ("force_to_master", 6, _copy_state(slice(_FAULT_INDEX)), displayed),
+            ("fault_at_hand", 1, _copy_state(slice(_FAULT_INDEX, _ALLOWED_SHARE_INDEX)), displayed),
+            ("displayed_and_fault", 7, _copy_state(slice(_ALLOWED_SHARE_INDEX)), displayed),
+            ("hand_wrench_E", 6, _copy_state(slice(_FAULT_INDEX), sign=-1.0), displayed),
+        ):
+            self.DeclareVectorOutputPort(name, size, calc, needed)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_display)
+
+    def SetTarget(self, context: Context, target: Array | None) -> None:
+        """Interpolate the device's X_BE to `target` (7,) over 2 ms; None: the hand lets go."""
+        now, held, motion = self._current_pose_and_twist(context)[:7], 0.0, np.zeros(6)
+        if target is not None:
+            turn = vectors.quaternion_product(
+                tuple(target[:4]), vectors.conjugate_quaternion(tuple(now[:4]))
+            )
+            held, motion = 1.0, np.append(target[4:] - now[4:], vectors.quaternion_logarithm(turn))
+        path = [held, context.get_time(), *now, *motion]
+        context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
+
+    def KeepWrench(
+        self, context: Context, before: operator.HandImpedance, after: operator.HandImpedance
+    ) -> None:
+        """Do nothing: a real hand has its own impedance."""
+
+    def _current_pose_and_twist(self, context: Context) -> Array:
+        path = context.get_numeric_parameter(self._path).value()
+        _pose_and_twist_on_path_into(path, context.get_time(), self._pose_and_twist)
+        return self._pose_and_twist
+
+    def _calc_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._current_pose_and_twist(context)[:7])
+
+    def _calc_twist(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._current_pose_and_twist(context)[7:])
+
+    def _calc_master_state(self, context: Context, output: BasicVector) -> None:
+        pose = self._current_pose_and_twist(context)
+        rotation = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
+        angles = (rotation.yaw_angle(), rotation.pitch_angle(), rotation.roll_angle())
+        output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])
+
+    def _update_display(self, context: Context, discrete_state: framework.DiscreteValues) -> None:
+        held = context.get_numeric_parameter(self._path).value()[_HELD_INDEX] > 0.5
+        last, now = context.get_discrete_state_vector().value(), discrete_state.get_mutable_value(0)
+        wrench = self._command.Eval(context)
+        _update_displayed_wrench(wrench, held, self._period, self._limits, last, now)
+
+
+def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
+    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
+    parameters = scenario.master.device(0.0, 0.0).parameters
+    start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    limits = np.array([parameters.peak_force, parameters.peak_torque.max()])
+    builder, inner = DiagramBuilder(), DiagramBuilder()
+    scaling = inner.AddNamedSystem(
+        "kinematic_scaling",
+        KinematicScaling(scenario.kinematic_scaling, CLUTCH_PERIOD_S, start_pose(scenario.slave)),
+    )
+    for name in ("pose_master", "clutch"):
+        inner.ExportInput(scaling.GetInputPort(name), name)
+    export_outputs(inner, scaling, "pose_command")
+    inner_side = builder.AddNamedSystem("inner_side", inner.Build())
+    master = builder.AddNamedSystem(
+        "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, limits)
+    )
+    builder.Connect(master.GetOutputPort("pose_master"), inner_side.GetInputPort("pose_master"))
+    export_outputs(builder, inner_side, "pose_command")
+    return finish_master_side(builder, master, inner_side, 1 / scenario.rates.hand_hz, cross_fade)

@@ -8,26 +8,19 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import urlsplit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import DeviceLimits
-from drake_teleop.live.device_packets import CLUTCH_OPEN, DevicePose, DeviceState, valid_state
+from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, valid_state
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
-class DeviceMessage(NamedTuple):
-    """Content of a message: name of the device, and its state in its base frame B."""
-
-    device_name: str
-    state: DeviceState
-
-
-def parse_device_message(text: Any) -> DeviceMessage | None:
-    """Return the content of a message, or None without a plausible device pose."""
+def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
+    """Return the device's name and its state in its base frame B, or None without a valid pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
@@ -45,7 +38,7 @@ def parse_device_message(text: Any) -> DeviceMessage | None:
         return None
     flags = CLUTCH_OPEN if pressed else 0
     state = valid_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
-    return None if state is None else DeviceMessage(name, state)
+    return None if state is None else (name, state)
 
 
 def make_force_message(device: str, wrench: Sequence[float]) -> str:
@@ -88,7 +81,7 @@ class HaplyDevice:
             raise DrakeTeleopError(what, where=address, remedy="start it") from error
         self._device = ""
 
-    def read(self) -> DevicePose | None:
+    def read(self) -> DeviceState | None:
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -101,7 +94,7 @@ class HaplyDevice:
         if message is None:
             return None
         self._device, state = message
-        return DevicePose(state.position, state.quaternion_wxyz, state.flags)
+        return state
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         from websockets.exceptions import ConnectionClosed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,10 @@ def choices_as_in_scenario(scenario: Scenario) -> dict[str, int]:
     }
 
 
+def _integer(default: int, low: int, high: int) -> Any:
+    return dataclasses.field(default=default, metadata={"range": (low, high)})
+
+
 @dataclass(frozen=True)
 class Inputs:
     """Inputs that the driver (the page that moves the hand) may change; integers.
@@ -72,28 +76,28 @@ class Inputs:
         detection: 1 with contact detection.
     """
 
-    x: int = 0
-    y: int = 0
-    z: int = 0
-    rx: int = 0
-    ry: int = 0
-    rz: int = 0
-    held: int = 1
-    clutch: int = 1
-    sigma: int = 0
-    sigma_weight: int = -1
-    sigma_object: int = 0
-    gamma: int = 100
-    force_scale: int = 5714
-    network: int = 0
-    delay: int = 500
-    jitter: int = 20
-    loss: int = 0
-    method: int = 0
-    grip: int = 1
-    object: int = 0
-    detection: int = 0
-    sensor: int = 0
+    x: int = _integer(0, -15_000, 15_000)
+    y: int = _integer(0, -15_000, 15_000)
+    z: int = _integer(0, -15_000, 15_000)
+    rx: int = _integer(0, -10_000, 10_000)
+    ry: int = _integer(0, -10_000, 10_000)
+    rz: int = _integer(0, -10_000, 10_000)
+    held: int = _integer(1, 0, 1)
+    clutch: int = _integer(1, 0, 1)
+    sigma: int = _integer(0, 0, 300)
+    sigma_weight: int = _integer(-1, -1, 300)
+    sigma_object: int = _integer(0, 0, 300)
+    gamma: int = _integer(100, 0, 300)
+    force_scale: int = _integer(5714, 0, 100_000)
+    network: int = _integer(0, 0, len(NETWORKS) - 1)
+    delay: int = _integer(500, 0, 20_000)
+    jitter: int = _integer(20, 0, 100)
+    loss: int = _integer(0, 0, 500)
+    method: int = _integer(0, 0, 0)  # see `input_range`
+    grip: int = _integer(1, 0, len(GRIP_IMPEDANCES) - 1)
+    object: int = _integer(0, 0, 1)
+    detection: int = _integer(0, 0, 1)
+    sensor: int = _integer(0, 0, len(SENSOR_NAMES) - 1)
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Inputs:
@@ -146,10 +150,7 @@ class Inputs:
 
     def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
-        turn = quaternion_logarithm(tuple(pose[:4]))
-        places = zip(("x", "y", "z"), (pose[4:] - start) / INPUT_UNIT_M, strict=True)
-        turns = zip(("rx", "ry", "rz"), (r / INPUT_UNIT_RAD for r in turn), strict=True)
-        return self.with_changes({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
+        return self.with_changes(inputs_at_displacement(pose[4:] - start, tuple(pose[:4])))
 
     @property
     def force_scales(self) -> dict[str, Any]:
@@ -162,34 +163,28 @@ class Inputs:
         }
 
 
-_STATION_INPUT_RANGES = {
-    "network": (0, len(NETWORKS) - 1),
-    "delay": (0, 20_000),
-    "jitter": (0, 100),
-    "loss": (0, 500),
-    "method": (0, 0),  # see `input_range`
-    "grip": (0, len(GRIP_IMPEDANCES) - 1),
-    **dict.fromkeys(("object", "detection"), (0, 1)),
-    "sensor": (0, len(SENSOR_NAMES) - 1),
-}
-#: Inputs whose change requires another station.
-STATION_INPUTS = frozenset(_STATION_INPUT_RANGES)
 #: Range of each input. The end stops of the device are outside the hand's 0.3 m wide box.
-INPUT_RANGES = {
-    **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
-    **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
-    **dict.fromkeys(("held", "clutch"), (0, 1)),
-    "sigma": (0, 300),
-    "sigma_weight": (-1, 300),
-    **dict.fromkeys(("sigma_object", "gamma"), (0, 300)),
-    "force_scale": (0, 100_000),
-    **_STATION_INPUT_RANGES,
-}
+INPUT_RANGES = {entry.name: entry.metadata["range"] for entry in dataclasses.fields(Inputs)}
+#: Inputs whose change requires another station.
+STATION_INPUTS = frozenset(list(INPUT_RANGES)[list(INPUT_RANGES).index("network") :])
 _CSV_COLUMNS = ("ms", *INPUT_RANGES)
 
 
 def input_range(name: str) -> tuple[int, int]:
     return (0, len(METHODS) - 1) if name == "method" else INPUT_RANGES[name]
+
+
+def inputs_at_displacement(
+    displacement: Sequence[float] | Array, rotation: Any
+) -> dict[str, float]:
+    """Return the inputs of a hand that holds the stylus, as floats.
+
+    `displacement` (3,) is in B [m], `rotation` a quaternion [w, x, y, z].
+    """
+    values, turn = {"held": 1.0}, quaternion_logarithm(rotation)
+    for k, name in enumerate("xyz"):
+        values |= {name: displacement[k] / INPUT_UNIT_M, "r" + name: turn[k] / INPUT_UNIT_RAD}
+    return values
 
 
 _WRITER_PACKAGE_AND_VERSION = {"drake_teleop": __version__}
@@ -201,8 +196,7 @@ def csv_header(made_by: Mapping[str, str] = _WRITER_PACKAGE_AND_VERSION) -> str:
 
 
 def csv_row(ms: int, inputs: Inputs) -> str:
-    values = {name: getattr(inputs, name) for name in INPUT_RANGES}
-    values |= {name: words[values[name]] for name, words in choice_names().items()}
+    values = vars(inputs) | {n: words[vars(inputs)[n]] for n, words in choice_names().items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 

@@ -35,7 +35,7 @@ class PageScene:
     """
 
     def __init__(self, name: str, scenario: Scenario, *, forces: bool = True) -> None:
-        self.name, self.objects, self.failure = name, b"{}", ""
+        self.name, self.scenario, self.objects, self.failure = name, scenario, b"{}", ""
         arrows = ("measured_wrench_S", "contact_wrench_S") if forces else ()
         recorded = ("slave_state", "master_state", *arrows)
         try:

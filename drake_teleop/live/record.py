@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from importlib import import_module
@@ -11,8 +10,6 @@ from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
-
-from pydrake.systems.analysis import Simulator
 
 from drake_teleop.common.files import (
     DRIVE_INPUTS_FILE_NAME,
@@ -102,14 +99,8 @@ class SessionRecord:
 class BackgroundLog(LogOnDisk):
     """Log written by a thread; only `wait_until_written` and the next write wait for the disk."""
 
-    def __init__(
-        self,
-        folder: Path,
-        simulator: Simulator,
-        start: float,
-        form: Callable[[SimulationResult], SimulationResult],
-    ) -> None:
-        super().__init__(folder, simulator, start, form)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self._thread = ThreadPoolExecutor(1, "log of a drive")
         self._writing: Future[Any] = self._thread.submit(import_module, "polars")
 

@@ -38,9 +38,8 @@ from drake_teleop.common.html import content_security_policy
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import PageValueCalculator
-from drake_teleop.live.device_link import DeviceConnection
-from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
-from drake_teleop.live.pace import without_garbage_collection
+from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live, without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import (
     SCENE_NAMES,
@@ -59,7 +58,6 @@ _ASYNCIO_ITERATIONS_PER_MESSAGE = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
-_START_TEXT_ENDINGS = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -88,7 +86,8 @@ class LiveDrive:
         self._pages: dict[ServerConnection, int] = {}
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
-        self._device = None if device is None else DeviceConnection(device)
+        self._link = None if device is None else DeviceLink(device)
+        self._start_condition = "" if device is None else " or until the device sends"
         self._failed: BaseException | None = None
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._page_numbers = itertools.count(1)  # of pages
@@ -109,11 +108,10 @@ class LiveDrive:
         with show_progress(True) as stage:
             self._load = _identify_load(scenario, stage)
             progress = stage("Prepare the station and its 3D scenes")
-            self._scene_scenarios: dict[str, Scenario] = {}
             for name in SCENE_NAMES:
                 setup = load_scene(name, scenario)
-                self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
-                self._views[name] = PageScene(name, self._scene_scenarios[name])
+                setup = with_task_space_device(setup) if device else setup
+                self._views[name] = PageScene(name, setup)
                 progress(len(self._views) / (1 + len(SCENE_NAMES)))
             compile_slice_functions(scenario, self._load, device)
             progress(1.0)
@@ -131,8 +129,10 @@ class LiveDrive:
             self._stop_threads_or_exit_process()
         self._raise_failure()
 
-    def wait_for_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`."""
+    def announce_and_wait(self, who: str) -> str:
+        """Print the page's address; wait for Ctrl-C or SIGTERM and return its name, or "stop"."""
+        condition = f"the simulation waits until this page is open{self._start_condition}"
+        print(f"{who} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
         try:
             self.wait()
             return "stop"
@@ -174,15 +174,14 @@ class LiveDrive:
         except (Exception, SystemExit) as error:  # SystemExit is a failed assertion of Drake
             self._failed = error
         finally:
-            if self._device is not None:
-                self._device.close()
+            if self._link is not None:
+                self._link.close()
             self._over.set()
             self._ready.set()
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
         show = self._views[SCENE_NAMES[0]].frame_part
-        link = None if self._device is None else self._device.link
-        live = Live(scenario, self._load, record, show, time.perf_counter(), link)
+        live = Live(scenario, self._load, record, show, time.perf_counter(), self._link)
         self.recorded = live.recorded
         return live
 
@@ -229,8 +228,8 @@ class LiveDrive:
                     pages = [(c, c.transport.get_write_buffer_size()) for c in server.connections]
                     ready = [c for c, unsent in pages if unsent < _MAX_UNSENT_BYTES]
                     broadcast(ready, json.dumps({"frame": frame}))
-                if self._device is not None and self._device.link.refusal != refusal:
-                    refusal = self._device.link.refusal
+                if self._link is not None and self._link.refusal != refusal:
+                    refusal = self._link.refusal
                     _print_to_stderr(f"a packet of the device was refused: it {refusal}")
                 await self._sleep_until_tick()
 
@@ -245,12 +244,11 @@ class LiveDrive:
     async def _change_scene(self) -> None:
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
-        scenario = self._scene_scenarios[live.requested_scene]
-        show = self._views[live.requested_scene].frame_part
+        view = self._views[live.requested_scene]
 
         def identify() -> None:
             try:
-                found.set_result(_identify_load(scenario, self._start_stoppable_stage))
+                found.set_result(_identify_load(view.scenario, self._start_stoppable_stage))
             except Exception as error:
                 found.set_exception(error)
 
@@ -260,7 +258,7 @@ class LiveDrive:
                 return
             await asyncio.sleep(0.05)
         try:
-            live.change_scene(scenario, found.result(), show, time.perf_counter())
+            live.change_scene(view.scenario, found.result(), view.frame_part, time.perf_counter())
         except DrakeTeleopError as error:
             live.reject_scene(str(error), time.perf_counter())
             return
@@ -322,8 +320,7 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                ending = _START_TEXT_ENDINGS[self._device is not None]
-                _print_to_stderr(f"no page is open: the simulation waits{ending}")
+                _print_to_stderr(f"no page is open: the simulation waits{self._start_condition}")
 
 
 def _identify_load(scenario: Scenario, progress: bool | StartStage) -> IdentifiedLoad | None:
@@ -391,17 +388,12 @@ def run_drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
-    print(f"drive it at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it", flush=True)
-    reason = live.wait_for_signal()
+    reason = live.announce_and_wait("drive it")
     print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:
         raise DrakeTeleopError(f"the simulation has stopped: {live.ended}", where="drive")
-
-
-def start_condition_text(device: str | None) -> str:
-    return "the simulation waits until this page is open" + _START_TEXT_ENDINGS[device is not None]
 
 
 def _print_to_stderr(text: str) -> None:

@@ -19,8 +19,7 @@ from drake_teleop.common.files import DRIVE_INPUTS_FILE_NAME
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_cached_load
-from drake_teleop.live.external_master import MakeExternalMasterSide
-from drake_teleop.live.hand import MakeLiveMasterSide
+from drake_teleop.live.hand import MakeExternalMasterSide, MakeLiveMasterSide
 from drake_teleop.live.inputs import SLICE_MS, Inputs, read_inputs
 from drake_teleop.live.record import (
     DEVICE_MARKER_FILE,

@@ -44,12 +44,12 @@ class Address:
             raise DrakeTeleopError(what, where=self.text, remedy="separate them by commas")
         return values
 
-    def parameter_among_words(self, name: str, among: tuple[str, ...]) -> str:
-        """Return a parameter, one of the words `among` (default: the first)."""
-        text = self._parameters.get(name, among[0])
-        if text not in among:
-            what, remedy = f"{name}={text!r} is unknown", f"give {' or '.join(among)}"
-            raise DrakeTeleopError(what, where=self.text, remedy=remedy)
+    def wrench_name(self) -> str:
+        """Return the parameter wrench, "contact" (default) or "scaled"."""
+        text = self._parameters.get("wrench", "contact")
+        if text not in ("contact", "scaled"):
+            what = f"wrench={text!r} is unknown"
+            raise DrakeTeleopError(what, where=self.text, remedy="give contact or scaled")
         return text
 
     def wrench_sign(self) -> float:

@@ -145,15 +145,40 @@ _MIN_MOTION_PERIOD_S, _MAX_TIME_STAMP_S, _MAX_MOTION_VALUE = 1e-4, 1e11, 1e5  # 
 _MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
+class ArmKinematics(Protocol):
+    """Interface of an arm's kinematics, such as `station.slave.arm.ArmModel`."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joint names from the base outwards."""
+
+    def pose(self, q: Array) -> Array:
+        """Return the sensor's pose X_WS (7,) at joint positions q (n,): [w x y z, position]."""
+
+
 class WrenchAndMotionStreams(Source):
-    """Source of wrenches and motions, from one or two sources; `where` names them."""
+    """Source of wrenches and motions, from one or two sources; `where` names that of the motion.
+
+    The kinematics `arm` convert joint positions to poses of the sensor frame S.
+    """
 
     def __init__(
-        self, wrench: Source, motion: Source | None = None, *, where: str = "the source"
+        self,
+        wrench: Source,
+        motion: Source | None = None,
+        *,
+        where: str = "the source",
+        arm: ArmKinematics | None = None,
     ) -> None:
-        self._wrench, self._motion = wrench, motion
+        self._wrench, self._motion, self._arm = wrench, motion, arm
         self.dt, self.two_clocks = wrench.dt, motion is not None
         streams = (wrench if motion is None else motion).streams
+        if arm is not None:
+            if JOINTS not in streams:
+                what = "delivers no joint positions for --model"
+                remedy = "give a source such as zenoh://HOST/TOPIC?joints=/joint_states"
+                raise DrakeTeleopError(what, where=where, remedy=remedy)
+            streams = (POSE,)
         self.motion_stream = next((stream for stream in (POSE, IMU) if stream in streams), "")
         if not self.motion_stream:
             remedy = "give --motion, such as rtde://HOST, or for ROS 2 pose=, tf= or imu= in the"
@@ -170,7 +195,11 @@ class WrenchAndMotionStreams(Source):
         if self._motion is not None:
             readings = [each for each in readings if each.stream == WRENCH]
         found = [each._replace(arrival=moved) for each in motions if each.stream != WRENCH]
-        return found + [each._replace(arrival=now) for each in readings]
+        found += [each._replace(arrival=now) for each in readings]
+        arm = self._arm
+        if arm is None:
+            return found
+        return [_pose_of_joints(each, arm) for each in found if each.stream != POSE]
 
     def close(self) -> None:
         self._wrench.close()
@@ -178,40 +207,13 @@ class WrenchAndMotionStreams(Source):
             self._motion.close()
 
 
-class ArmKinematics(Protocol):
-    """Interface of an arm's kinematics, such as `station.slave.arm.ArmModel`."""
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Joint names from the base outwards."""
-
-    def pose(self, q: Array) -> Array:
-        """Return the sensor's pose X_WS (7,) at joint positions q (n,): [w x y z, position]."""
-
-
-class PoseSourceFromJoints(Source):
-    """Source that converts joint positions to poses of the sensor frame S."""
-
-    def __init__(self, source: Source, arm: ArmKinematics) -> None:
-        self._source, self._arm, self.dt = source, arm, source.dt
-        self.streams = (*(each for each in source.streams if each not in (JOINTS, POSE)), POSE)
-
-    def read(self, timeout_s: float) -> list[Reading] | None:
-        readings = self._source.read(timeout_s)
-        if readings is None:
-            return None
-        return [self._convert_to_pose(each) for each in readings if each.stream != POSE]
-
-    def _convert_to_pose(self, reading: Reading) -> Reading:
-        if reading.stream != JOINTS:
-            return reading
-        values = np.full(7, np.nan)  # an invalid pose, rejected later
-        if reading.values.shape == (len(self._arm.joint_names),):
-            values = self._arm.pose(reading.values)
-        return reading._replace(stream=POSE, values=values)
-
-    def close(self) -> None:
-        self._source.close()
+def _pose_of_joints(reading: Reading, arm: ArmKinematics) -> Reading:
+    if reading.stream != JOINTS:
+        return reading
+    values = np.full(7, np.nan)  # an invalid pose, rejected later
+    if reading.values.shape == (len(arm.joint_names),):
+        values = arm.pose(reading.values)
+    return reading._replace(stream=POSE, values=values)
 
 
 class MotionWindow:

@@ -18,7 +18,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ChangeMonitor
-from drake_teleop.robots.compensator import STALE_AGE_S, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SCALE_NAMES, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -33,7 +33,6 @@ class TareRequestPort:
 
     def __init__(self, port: int) -> None:
         self._socket = open_udp_receiver(LOCALHOST, port)
-        self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
 
     def answer_request(self, tare: Callable[[], str]) -> None:
@@ -100,10 +99,6 @@ def run_compensate_command(
     load: Path,
     sink: str,
     *,
-    sigma: float = 0.0,
-    gamma: float = 1.0,
-    sigma_weight: float | None = None,
-    sigma_inertia: float | None = None,
     cutoff_hz: float | None = 30.0,
     largest: tuple[float, float] | None = None,
     predicted: bool = False,
@@ -112,7 +107,7 @@ def run_compensate_command(
     free: Path | None = None,
     control: int | None = None,
     attach: Callable[[Callable[[Identification], Compensator]], Any] | None = None,
-    **stream: Any,
+    **options: Any,
 ) -> None:
     """Run the command `compensate`; messages go to stderr.
 
@@ -120,10 +115,11 @@ def run_compensate_command(
         largest: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        stream: options of `open_source`.
+        options: scales of a `Compensator`, and options of `open_source`.
     """
     found = Identification.load(load)
-    readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
+    scales = {name: options.pop(name) for name in SCALE_NAMES if name in options}
+    readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:
         dt = readings.dt
@@ -131,10 +127,7 @@ def run_compensate_command(
         return Compensator(
             load,
             dt,
-            sigma=sigma,
-            gamma=gamma,
-            sigma_weight=sigma_weight,
-            sigma_inertia=sigma_inertia,
+            **scales,
             cutoff_hz=cutoff_hz,
             wait=getattr(readings, "wait", 0),
             predicted=predicted,

@@ -36,6 +36,8 @@ RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
+SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
+"""Arguments of `Compensator.set_scales`."""
 _MAX_DRIFTS = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
 MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_DRIFTS, 3)
 """Maximum drift of the offsets [N, N m]."""
@@ -85,11 +87,10 @@ class Compensator:
     """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
-        sigma, gamma: scales of load wrench and contact wrench in the scaled wrench.
-        sigma_weight, sigma_inertia: scales of the load's weight and inertia; None: sigma.
         wait: delay of the motion, in readings, for which the source has corrected.
         predicted: extrapolate over `wait` and the delay of the low-pass.
         largest: (6,) range of the sensor [N, N m].
+        scales: arguments of `set_scales`.
     """
 
     def __init__(
@@ -97,21 +98,18 @@ class Compensator:
         load: Identification,
         dt: float,
         *,
-        sigma: float = 0.0,
-        gamma: float = 1.0,
-        sigma_weight: float | None = None,
-        sigma_inertia: float | None = None,
         cutoff_hz: float | None = 30.0,
         wait: int = 0,
         predicted: bool = False,
         largest: Array | None = None,
         watch: ContactAndLoadMonitor | None = None,
         detector: StreamContactDetector | None = None,
+        **scales: Any,
     ) -> None:
         self._phi, self._zero_phi = processing.phi_with_inertia_replaced(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
         self._scales = np.empty(4)
-        self.set_scales(sigma, gamma, sigma_weight, sigma_inertia)
+        self.set_scales(**scales)
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
@@ -157,8 +155,16 @@ class Compensator:
         }
 
     def set_scales(
-        self, sigma: float, gamma: float, sigma_weight: float | None, sigma_inertia: float | None
+        self,
+        sigma: float = 0.0,
+        gamma: float = 1.0,
+        sigma_weight: float | None = None,
+        sigma_inertia: float | None = None,
     ) -> None:
+        """Set the scales of load wrench and contact wrench in the scaled wrench.
+
+        `sigma_weight`, `sigma_inertia` are those of the load's weight and inertia; None: sigma.
+        """
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:

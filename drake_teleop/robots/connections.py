@@ -17,7 +17,7 @@ from drake_teleop.robots import assembly
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import JOINTS, WRENCH_AND_MOTION, Sink, Source
+from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY_PREFIX = "replay:"
@@ -32,9 +32,7 @@ def open_source(
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     real_time: bool = False,
-    motion: str | None = None,
-    sensor_pose: tuple[float, ...] | None = None,
-    arm: assembly.ArmKinematics | None = None,
+    **motion_options: Any,
 ) -> Source:
     """Return the source of wrench and motion at an address.
 
@@ -43,15 +41,15 @@ def open_source(
         rate_hz: rate of the wrenches, if the source does not deliver its own.
         cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live streams.
         real_time: replay a log in real time.
-        motion: address of a second source, for the motion.
-        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
-        arm: kinematics, for a source of joint positions.
+        motion_options: `motion`, address of a second source, for the motion; `sensor_pose`, x, y, z
+            [m], roll, pitch, yaw [deg] of the sensor in the posed frame; `arm`, kinematics for a
+            source of joint positions.
     """
     if _address_scheme(address) == "replay":
-        _refuse_motion_options(address, motion, sensor_pose, arm)
+        _refuse_motion_options(address, **motion_options)
         path = address.removeprefix(_REPLAY_PREFIX)
         return ReplayLogSource(path, load, cutoff_hz=cutoff_hz, delay=delay, real_time=real_time)
-    source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
+    source = _open_streams(address, rate_hz, **motion_options)
     weight_removed = load is not None and load.weight_removed
     if not isinstance(source, assembly.WrenchAndMotionStreams):
         if weight_removed:
@@ -66,30 +64,24 @@ def open_source(
         cutoff_hz=cutoff_hz,
         delay_s=delay,
         track=track,
-        X_FS=_pose_from_option(sensor_pose),
+        X_FS=_pose_from_option(motion_options.get("sensor_pose")),
         weight_removed=weight_removed,
     )
 
 
 def open_source_and_recorder(
-    address: str,
-    largest: Array | None,
-    *,
-    real_time: bool = False,
-    motion: str | None = None,
-    sensor_pose: tuple[float, ...] | None = None,
-    arm: assembly.ArmKinematics | None = None,
+    address: str, largest: Array | None, *, real_time: bool = False, **motion_options: Any
 ) -> tuple[Source, Recorder]:
     """Return the source that `calibrate` reads, and its recorder."""
     kind = _address_scheme(address)
     if kind == "replay":
-        options: dict[str, Any] = {"motion": motion, "sensor_pose": sensor_pose, "arm": arm}
-        return open_source(address, None, real_time=real_time, **options), Recorder(largest=largest)
+        source = open_source(address, None, real_time=real_time, **motion_options)
+        return source, Recorder(largest=largest)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
-    source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
+    source = _open_streams(address, rate_hz, **motion_options)
     two_clocks = isinstance(source, assembly.WrenchAndMotionStreams) and source.two_clocks
-    X_FS = _pose_from_option(sensor_pose)
+    X_FS = _pose_from_option(motion_options.get("sensor_pose"))
     return source, Recorder(source.streams, largest, X_FS, two_clocks=two_clocks)
 
 
@@ -122,8 +114,8 @@ def _period_s(rate_hz: float | None, address: str) -> float:
     return 1.0 / rate_hz
 
 
-def _refuse_motion_options(address: str, *options: Any) -> None:
-    if any(option is not None for option in options):
+def _refuse_motion_options(address: str, **motion_options: Any) -> None:
+    if any(option is not None for option in motion_options.values()):
         what = "this source already contains the motion of sensor frame S"
         remedy = "remove --motion, --model and --sensor-pose"
         raise DrakeTeleopError(what, where=address, remedy=remedy)
@@ -132,15 +124,16 @@ def _refuse_motion_options(address: str, *options: Any) -> None:
 def _open_streams(
     address: str,
     rate_hz: float | None,
-    motion: str | None,
-    sensor_pose: tuple[float, ...] | None,
-    arm: assembly.ArmKinematics | None,
+    *,
+    motion: str | None = None,
+    sensor_pose: tuple[float, ...] | None = None,
+    arm: assembly.ArmKinematics | None = None,
 ) -> Source:
     joints = () if arm is None else arm.joint_names
     opened = [_open_registered_source(address, rate_hz, joints)]
     try:
         if WRENCH_AND_MOTION in opened[0].streams:
-            _refuse_motion_options(address, motion, sensor_pose, arm)
+            _refuse_motion_options(address, motion=motion, pose=sensor_pose, arm=arm)
             return opened[0]
         if motion is not None:
             opened.append(_open_registered_source(motion, 1.0 / opened[0].dt, joints))
@@ -148,13 +141,7 @@ def _open_streams(
                 what = "delivers no motion apart from its wrench"
                 remedy = "give a source such as rtde://HOST"
                 raise DrakeTeleopError(what, where=motion, remedy=remedy)
-        if arm is not None:
-            if JOINTS not in opened[-1].streams:
-                what = "delivers no joint positions for --model"
-                remedy = "give a source such as zenoh://HOST/TOPIC?joints=/joint_states"
-                raise DrakeTeleopError(what, where=motion or address, remedy=remedy)
-            opened[-1] = assembly.PoseSourceFromJoints(opened[-1], arm)
-        return assembly.WrenchAndMotionStreams(*opened, where=motion or address)
+        return assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)
     except BaseException:
         for each in opened:
             each.close()

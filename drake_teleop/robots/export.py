@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import to_yaml_text
+from drake_teleop.common.texts import format_yaml_value
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
@@ -122,148 +120,51 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
     return [*warnings, format.note] if format.note else warnings
 
 
-def _format_number(value: float) -> str:
-    return repr(float(value) + 0.0)
+def _from_template(name: str) -> Callable[[ExportedLoad], str]:
+    """Return the function that writes a load by the template `formats/NAME.j2`."""
 
+    def numbers(values: Iterable[float], separator: str = ", ") -> str:
+        return separator.join(repr(float(value) + 0.0) for value in values)
 
-def _format_row(values: Any) -> str:
-    return ", ".join(map(_format_number, values))
+    def yaml(values: Iterable[float]) -> str:
+        return format_yaml_value([float(value) + 0.0 for value in values])[1:-1]
 
+    def write(load: ExportedLoad) -> str:
+        names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        entries = dict(zip(names, load.inertia_entries, strict=True))
+        values = {**vars(load), "entries": entries, "numbers": numbers, "yaml": yaml}
+        values["weight"] = load.mass * STANDARD_GRAVITY_M_S2
+        return render_page("drake_teleop.robots", f"formats/{name}.j2", **values) + "\n"
 
-def _ur_script(load: ExportedLoad) -> str:
-    com, inertia = _format_row(load.com), _format_row(load.inertia_entries)
-    return f"set_target_payload({_format_number(load.mass)}, [{com}], [{inertia}])\n"
-
-
-def _franka_json(load: ExportedLoad) -> str:
-    inertia, identity = load.inertia.T.ravel().tolist(), np.eye(4).ravel().tolist()
-    values = {"mass": load.mass, "centerOfMass": load.com.tolist(), "inertia": inertia}
-    return _json_text(values | {"transformation": identity})
-
-
-def _xarm_call(load: ExportedLoad) -> str:
-    return f"arm.set_tcp_load({_format_number(load.mass)}, [{_format_row(1e3 * load.com)}])\n"
-
-
-def _kth_yaml(load: ExportedLoad) -> str:
-    return to_yaml_text(
-        {
-            "bias": _float_list(load.offsets),
-            "gripper_com_frame_id": "ft_sensor",
-            "gripper_com_pose": [*_float_list(load.com), 0.0, 0.0, 0.0],
-            "gripper_mass": float(load.mass),
-        }
-    )
-
-
-def _ft_tools_yaml(load: ExportedLoad) -> str:
-    force, torque = (_float_list(part) for part in np.split(load.offsets, 2))
-    values = {"mass": float(load.mass), "sensor_frame_to_com": _float_list(load.com)}
-    return to_yaml_text(values | {"force_offset": force, "torque_offset": torque})
-
-
-def _admittance_yaml(load: ExportedLoad) -> str:
-    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY_M_S2)}
-    compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
-    parameters = {"gravity_compensation": compensation}
-    return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
-
-
-def _bota_json(load: ExportedLoad) -> str:
-    names = (name.capitalize() for name in _INERTIA_NAMES)
-    inertia = {name: float(x) for name, x in zip(names, load.inertia_entries, strict=True)}
-    bias = dict(zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), load.offsets.tolist(), strict=True))
-    properties = {
-        "mass": load.mass,
-        "com": dict(zip("xyz", load.com.tolist(), strict=True)),
-        "inertia": inertia,
-        "bias": bias,
-    }
-    config = {"enable_dynamic_compensation": True, "payload_properties": properties}
-    return _json_text({"payload_compensator_config": config})
-
-
-_INERTIA_NAMES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-
-
-def _urdf_xml(load: ExportedLoad) -> str:
-    root = Element("robot", name="load")
-    inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
-    SubElement(inertial, "origin", xyz=_space_separated(load.com), rpy="0 0 0")
-    SubElement(inertial, "mass", value=_format_number(load.mass))
-    inertia = zip(_INERTIA_NAMES, map(_format_number, load.inertia_entries), strict=True)
-    SubElement(inertial, "inertia", dict(inertia))
-    return indented_xml(root)
-
-
-def _sdf_xml(load: ExportedLoad) -> str:
-    root = Element("sdf", version="1.9")
-    link = SubElement(SubElement(root, "model", name="load"), "link", name="load")
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "pose").text = f"{_space_separated(load.com)} 0 0 0"
-    SubElement(inertial, "mass").text = _format_number(load.mass)
-    inertia = SubElement(inertial, "inertia")
-    for name, value in zip(_INERTIA_NAMES, load.inertia_entries, strict=True):
-        SubElement(inertia, name).text = _format_number(value)
-    return indented_xml(root)
-
-
-def _mjcf_xml(load: ExportedLoad) -> str:
-    root = Element("mujoco", model="load")
-    body = SubElement(SubElement(root, "worldbody"), "body", name="load")
-    SubElement(body, "freejoint")
-    inertial = SubElement(body, "inertial", pos=_space_separated(load.com))
-    inertial.set("mass", _format_number(load.mass))
-    inertial.set("fullinertia", _space_separated(load.inertia_entries))
-    return indented_xml(root)
-
-
-def indented_xml(root: Element) -> str:
-    indent(root)
-    return tostring(root, encoding="unicode") + "\n"
-
-
-def _float_list(values: Array) -> list[float]:
-    return [float(value) + 0.0 for value in values]
-
-
-def _space_separated(values: Any) -> str:
-    return " ".join(map(_format_number, values))
-
-
-def _json_text(document: dict[str, Any]) -> str:
-    return json.dumps(document, indent=2) + "\n"
+    return write
 
 
 _SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
-_format_of_sensor = partial(Format, of_sensor=True, inertia=False, comment="#")
-
+_OF_SENSOR: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
+_SHIPPED_FORMATS: dict[str, dict[str, Any]] = {
+    "ur": {"comment": "#"},
+    "franka": {"note": "transformation is the identity: use that of your end effector"},
+    "xarm": {"inertia": False, "comment": "#"},
+    "kth": {
+        **_OF_SENSOR,
+        "offsets": True,
+        "note": f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+        " compensated force is twice the weight, change the sign of the mass",
+    },
+    "ft_tools": _OF_SENSOR | {"offsets": True},
+    "ros2-admittance": _OF_SENSOR | {"note": _SENSOR_FRAME_NOTE},
+    "bota": {
+        "of_sensor": True,
+        "offsets": True,
+        "note": "the inertia is about the centre of mass; Bota does not document the point",
+    },
+    "urdf": {"body": True},
+    "sdf": {"body": True},
+    "mjcf": {"body": True},
+}
 FORMATS = Registry(
     "export format",
-    {
-        "ur": Format(_ur_script, comment="#"),
-        "franka": Format(
-            _franka_json, note="transformation is the identity: use that of your end effector"
-        ),
-        "xarm": Format(_xarm_call, inertia=False, comment="#"),
-        "kth": _format_of_sensor(
-            _kth_yaml,
-            offsets=True,
-            note=f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
-            " compensated force is twice the weight, change the sign of the mass",
-        ),
-        "ft_tools": _format_of_sensor(_ft_tools_yaml, offsets=True),
-        "ros2-admittance": _format_of_sensor(_admittance_yaml, note=_SENSOR_FRAME_NOTE),
-        "bota": Format(
-            _bota_json,
-            of_sensor=True,
-            offsets=True,
-            note="the inertia is about the centre of mass; Bota does not document the point",
-        ),
-        "urdf": Format(_urdf_xml, body=True),
-        "sdf": Format(_sdf_xml, body=True),
-        "mjcf": Format(_mjcf_xml, body=True),
-    },
+    {name: Format(_from_template(name), **each) for name, each in _SHIPPED_FORMATS.items()},
     Format,
 )
 """Export formats by name."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,47 +16,34 @@ from drake_teleop.robots.udp import host_and_port
 
 DEFAULT_SERVER_PORT = 8765
 WRENCH_TOPIC = "/wrench"
-_WRENCH_SCHEMA = {"type": "object", "properties": {c: {"type": "number"} for c in WRENCH_COLUMNS}}
-_OUTPUT_SCHEMA = {
-    "title": "drake_teleop.Wrench",
-    "type": "object",
-    "properties": {
-        "number": {"type": "integer"},
-        "t": {"type": "number"},
-        "contact": _WRENCH_SCHEMA,
-        "scaled": _WRENCH_SCHEMA,
-        "flags": {"type": "array", "items": {"type": "string"}},
-    },
-}
 
 
-class _WrenchChannel:
+class _FoxgloveSink:
     def __init__(self, where: str) -> None:
         require_library("foxglove", "foxglove-sdk", "robots", where)
         import foxglove
 
-        self.context = foxglove.Context()
-        self._channel = foxglove.Channel(WRENCH_TOPIC, schema=_OUTPUT_SCHEMA, context=self.context)
+        text = resources.files("drake_teleop.robots").joinpath("foxglove_schema.json").read_text()
+        self._context = foxglove.Context()
+        options = {"schema": json.loads(text), "context": self._context}
+        self._channel = foxglove.Channel(WRENCH_TOPIC, **options)
 
-    def log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
+    def _log(self, out: CompensatedWrench, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
         self._channel.log(json.dumps(data).encode(), log_time=ns)
 
-    def close(self) -> None:
-        self._channel.close()
 
-
-class FoxgloveSink:
+class FoxgloveSink(_FoxgloveSink):
     """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
         host, port = host_and_port(address, DEFAULT_SERVER_PORT)
-        self._channel = _WrenchChannel(address)
+        super().__init__(address)
         import foxglove
 
-        options: dict[str, Any] = {"name": "drake_teleop", "context": self._channel.context}
+        options: dict[str, Any] = {"name": "drake_teleop", "context": self._context}
         try:
             self._server = foxglove.start_server(host=host, port=port, **options)
         except (OSError, RuntimeError) as error:
@@ -64,27 +52,26 @@ class FoxgloveSink:
         self.port = self._server.port
 
     def write(self, out: CompensatedWrench) -> None:
-        self._channel.log_wrench(out, None)
+        self._log(out, None)
 
     def close(self) -> None:
         self._channel.close()
         self._server.stop()
 
 
-class McapSink:
+class McapSink(_FoxgloveSink):
     """Sink that writes an MCAP file continuously; messages have the times of the readings."""
 
     def __init__(self, path: Path) -> None:
-        self._channel = _WrenchChannel(str(path))
+        super().__init__(str(path))
         import foxglove
 
         make_folder(path.parent)
-        context = self._channel.context
         with wrap_write_errors(path):
-            self._file = foxglove.open_mcap(path, allow_overwrite=True, context=context)
+            self._file = foxglove.open_mcap(path, allow_overwrite=True, context=self._context)
 
     def write(self, out: CompensatedWrench) -> None:
-        self._channel.log_wrench(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
+        self._log(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
 
     def close(self) -> None:
         self._file.close()

@@ -1,4 +1,4 @@
-"""Source and sink for ROS 2 by rclpy, in one node of this process."""
+"""Source and sink for ROS 2 by rclpy, in one node of this process; conversion of its messages."""
 
 from __future__ import annotations
 
@@ -10,16 +10,147 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.interruption import delayed_signals
-from drake_teleop.robots import ros2_messages, streams
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.vectors import quaternion_product, rotate_vector
+from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.lines import flag_names
+from drake_teleop.robots.streams import DAMAGED_WRENCH_READING, IMU, JOINTS, POSE, WRENCH, Reading
 
 _NODE_NAME = "drake_teleop"
 _MAX_DIAGNOSTICS_PERIOD_S = 1.0
 _MAX_QUEUED_MESSAGES = 256  # of each stream
 _MAX_SERVICE_SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+MESSAGE_TYPE_OF_TOPIC = {
+    WRENCH: WRENCH_STAMPED,
+    "tf": "tf2_msgs/msg/TFMessage",
+    POSE: "geometry_msgs/msg/PoseStamped",
+    IMU: "sensor_msgs/msg/Imu",
+    JOINTS: "sensor_msgs/msg/JointState",
+}
+_STREAM_OF_TOPIC = {"tf": POSE}
+_MAX_TRANSFORM_CHAIN_FRAMES = 64
+SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
+"""Parameters of a source's address."""
+
+
+def domain_of_address(address: Address) -> int:
+    text = address.optional_parameter("domain") or "0"
+    if not (text.isdecimal() and text.isascii() and int(text) <= 232):
+        what, remedy = f"domain={text!r} is not a ROS domain", "give a whole number from 0 to 232"
+        raise DrakeTeleopError(what, where=address.text, remedy=remedy)
+    return int(text)
+
+
+def checked_topic_name(address: Address, name: str) -> str:
+    topic = name.strip("/")
+    if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
+        what = f"{name!r} is not the name of a ROS topic"
+        remedy = "give one such as /ft_sensor/wrench"
+        raise DrakeTeleopError(what, where=address.text, remedy=remedy)
+    return topic
+
+
+def topics_frames_and_streams(
+    address: Address, joints: tuple[str, ...]
+) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
+    """Return the topics in an address by stream, the two frames of `tf`, and the streams."""
+    topics = {WRENCH: checked_topic_name(address, address.path)}
+    for stream in (POSE, IMU, JOINTS):
+        if (text := address.optional_parameter(stream)) is not None:
+            topics[stream] = checked_topic_name(address, text)
+    frames: tuple[str, ...] = ()
+    if (text := address.optional_parameter("tf")) is not None:
+        frames, topics["tf"] = tuple(text.split(",")), "tf"
+        if len(frames) != 2 or not all(frames):
+            what = f"tf={text!r} does not name two frames"
+            raise DrakeTeleopError(what, where=address.text, remedy="give tf=PARENT,CHILD")
+    if JOINTS in topics and not joints:
+        what = "joint positions need the model of the arm"
+        raise DrakeTeleopError(what, where=address.text, remedy="give --model and --sensor-frame")
+    return topics, frames, tuple(_STREAM_OF_TOPIC.get(name, name) for name in topics)
+
+
+def damaged_reading_of_topic(name: str) -> Reading:
+    return DAMAGED_WRENCH_READING._replace(stream=_STREAM_OF_TOPIC.get(name, name))
+
+
+class MessageConverter:
+    """Converter of ROS 2 messages; `frames` are parent and child of the pose in `/tf`."""
+
+    def __init__(
+        self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
+    ) -> None:
+        self._sign, self._frames, self._joints = sign, frames, joints
+        self._links: dict[str, tuple[str, Array]] = {}
+
+    def readings_of_message(self, name: str, data: Any, number: int) -> list[Reading]:
+        """Return the readings of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
+        if name == "tf":
+            samples = self._pose_from_transforms(data)
+        else:
+            values = self._message_values(name, data)
+            samples = [] if values is None else [(data.header.stamp, values)]
+        stream = _STREAM_OF_TOPIC.get(name, name)
+        return [
+            Reading(number, stamp.sec + 1e-9 * stamp.nanosec, values, stream=stream)
+            for stamp, values in samples
+        ]
+
+    def add_transforms(self, data: Any) -> None:
+        """Store the transforms of a TFMessage; those of `/tf_static` yield no pose."""
+        for each in data.transforms:
+            link = _pose_array(each.transform.translation, each.transform.rotation)
+            self._links[each.child_frame_id] = each.header.frame_id, link
+
+    def _message_values(self, name: str, data: Any) -> Array | None:
+        if name == WRENCH:
+            return self._sign * _six_numbers(data.wrench.force, data.wrench.torque)
+        if name == POSE:
+            return _pose_array(data.pose.position, data.pose.orientation)
+        if name == JOINTS:
+            positions = dict(zip(data.name, data.position, strict=False))
+            if not self._joints or not all(joint in positions for joint in self._joints):
+                return None
+            return np.array([positions[joint] for joint in self._joints], float)
+        return _six_numbers(data.linear_acceleration, data.angular_velocity)
+
+    def _pose_from_transforms(self, data: Any) -> list[tuple[Any, Array]]:
+        newest = {each.child_frame_id: each for each in data.transforms}
+        self.add_transforms(data)
+        if not self._frames:
+            return []
+        parent, frame = self._frames
+        pose, stamp = np.array([1.0, 0, 0, 0, 0, 0, 0]), None
+        for _ in range(_MAX_TRANSFORM_CHAIN_FRAMES):
+            if frame == parent:
+                return [] if stamp is None else [(stamp, pose)]
+            if frame not in self._links:
+                break
+            if frame in newest:
+                stamp = newest[frame].header.stamp
+            frame, link = self._links[frame]
+            pose = _compose_poses(link, pose)
+        return []
+
+
+def _six_numbers(v: Any, w: Any) -> Array:
+    return np.array([v.x, v.y, v.z, w.x, w.y, w.z])
+
+
+def _pose_array(p: Any, q: Any) -> Array:
+    return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
+
+
+def _compose_poses(a: Array, b: Array) -> Array:
+    q = tuple(a[:4].tolist())
+    p = rotate_vector(q, tuple(b[4:].tolist()))
+    return np.array([*quaternion_product(q, tuple(b[:4].tolist())), *(a[4:] + p)])
 
 
 class RosNode:
@@ -82,15 +213,12 @@ class Ros2Source(streams.Source):
 
     @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = parse_ros2_address(address, ros2_messages.SOURCE_PARAMETERS)
-        self.dt, sign, domain = dt, parsed.wrench_sign(), ros2_messages.domain_of_address(parsed)
-        topics, frames, self.streams = ros2_messages.topics_frames_and_streams(parsed, joints)
-        classes = {
-            name: message_class(ros2_messages.MESSAGE_TYPE_OF_TOPIC[name], address)
-            for name in topics
-        }
-        self._converter = ros2_messages.MessageConverter(sign, frames, joints)
-        self._found: list[streams.Reading] = []
+        parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
+        self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
+        topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
+        classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
+        self._converter = MessageConverter(sign, frames, joints)
+        self._found: list[Reading] = []
         self._counts: Counter[str] = Counter()
         self._node, self._next_spin = shared_node(domain), 0.0
         self._subscriptions = [
@@ -99,7 +227,7 @@ class Ros2Source(streams.Source):
         ]
 
     @delayed_signals()
-    def read(self, timeout_s: float) -> list[streams.Reading] | None:
+    def read(self, timeout_s: float) -> list[Reading] | None:
         self._take_messages()
         if not self._found:
             self._node.spin(timeout_s)
@@ -135,7 +263,7 @@ class Ros2Source(streams.Source):
             try:
                 data = deserialize_message(message, kind)
             except Exception:  # of rmw, without a common type
-                self._found.append(ros2_messages.damaged_reading_of_topic(name))
+                self._found.append(damaged_reading_of_topic(name))
                 return
             self._found += self._converter.readings_of_message(name, data, number)
 
@@ -156,13 +284,10 @@ class Ros2Sink:
         parsed = parse_ros2_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
 
-        topic, domain = (
-            ros2_messages.checked_topic_name(parsed, parsed.path),
-            ros2_messages.domain_of_address(parsed),
-        )
-        self._which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
+        topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
+        self._which = parsed.wrench_name()
         names = "DiagnosticArray", "DiagnosticStatus", "KeyValue"
-        types = (ros2_messages.WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
+        types = (WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in types}
         self._kinds = SimpleNamespace(**classes)
         self._message = self._kinds.WrenchStamped()

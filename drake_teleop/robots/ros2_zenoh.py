@@ -14,7 +14,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.ros2_messages import (
+from drake_teleop.robots.ros2 import (
     MESSAGE_TYPE_OF_TOPIC,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
@@ -178,9 +178,9 @@ class ZenohSink:
     def __init__(self, address: str) -> None:
         parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=("frame", "wrench", "domain"))
         domain, topic = domain_of_address(parsed), checked_topic_name(parsed, parsed.path)
-        which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
+        self._which = parsed.wrench_name()
         require_libraries(address)
-        self._types, self._which = message_types(), which
+        self._types = message_types()
         self._frame = parsed.optional_parameter("frame") or ""
         hashed = self._types.hash_rihs01(WRENCH_STAMPED)
         self._session = open_session(parsed)

@@ -90,6 +90,7 @@ def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
 
 def open_udp_receiver(host: str, port: int) -> socket.socket:
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    receiver.setblocking(False)
     try:
         receiver.bind((host, port))
     except OSError as error:
@@ -103,7 +104,6 @@ class _PacketReceiver(Source):
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
         self._socket = open_udp_receiver(*host_and_port(address))
-        self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)

@@ -56,8 +56,6 @@ class Participant:
         self.guided = GuidedExperiment(
             self.procedure,
             {(0, 0): make_apparatus(task, condition, scenario, load)},
-            [scenario],
-            self.store,
             [lambda rows: {}],
             self.now,
         )

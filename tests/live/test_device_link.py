@@ -15,12 +15,11 @@ from websockets.sync.server import serve
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
-from drake_teleop.live.device_client import DeviceClient
+from drake_teleop.live.device_client import DeviceClient, VirtualDevice, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
-from drake_teleop.live.device_link import DeviceConnection, DeviceLink
+from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
-    DevicePose,
     DeviceState,
     ForceCommand,
     pack_force,
@@ -33,7 +32,6 @@ from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.live.session import Session, read_drive
-from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.result import SimulationResult
 
 MS = 1e-3
@@ -108,7 +106,7 @@ def test_invalid_packets_only_change_a_counter(link):
                 else 0.0
             )
     assert link.refused > 40
-    assert parse_device_message(said).state.position == (-2.0, 1.0, 3.0)
+    assert parse_device_message(said)[1].position == (-2.0, 1.0, 3.0)
     texts = ["", "[]", "{}", "null", "[" * 9000, '{"inverse3":[]}', said[:-1], "1e999", 7, None]
     texts += [said.replace(*pair) for pair in (("1,", "NaN,"), ("2", '"2"'), ("3}", "1e400}"))]
     for text in texts:
@@ -120,7 +118,7 @@ def test_invalid_packets_only_change_a_counter(link):
         for place, value in zip(places, values, strict=True):
             letters[place] = chr(value)
         heard = parse_device_message("".join(letters))
-        assert heard is None or np.isfinite(heard.state.position).all()
+        assert heard is None or np.isfinite(heard[1].position).all()
 
 
 def test_force_and_position_of_haply_use_the_same_axes():
@@ -129,7 +127,7 @@ def test_force_and_position_of_haply_use_the_same_axes():
     assert said["inverse3"][0]["commands"]["set_cursor_force"]["values"] == {
         "x": 2.0, "y": -1.0, "z": 3.0,
     }  # fmt: skip
-    assert parse_device_message(json.dumps({"inverse3": [device]})).state.position == (
+    assert parse_device_message(json.dumps({"inverse3": [device]}))[1].position == (
         1.0,
         2.0,
         3.0,
@@ -303,7 +301,7 @@ class RestingDevice:
         self.was_set = []
 
     def read(self):
-        return DevicePose((0.0, 0.0, 0.0))
+        return DeviceState(0, 0.0, (0.0, 0.0, 0.0))
 
     def set_wrench(self, wrench):
         self.was_set.append(wrench)
@@ -354,8 +352,8 @@ def test_inverse3_answers_every_message_of_its_service():
         server.shutdown()
     assert places == [
         None,
-        DevicePose((-0.2, 0.1, 0.3)),
-        DevicePose((-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
+        DeviceState(0, 0.0, (-0.2, 0.1, 0.3)),
+        DeviceState(0, 0.0, (-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
     ]
     values = [said["inverse3"][0]["commands"]["set_cursor_force"]["values"] for said in heard[1:]]
     assert values == [{"x": 0.0, "y": -1.0, "z": 0.0}, {"x": 0.0, "y": -2.0, "z": 0.0}]
@@ -365,7 +363,7 @@ def test_inverse3_answers_every_message_of_its_service():
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
 def test_device_address_of_another_machine_or_kind_is_an_error(address):
     with pytest.raises(DrakeTeleopError, match=re.escape(address)):
-        DeviceConnection(address)
+        DeviceLink(address)
 
 
 def test_device_drives_without_a_page_and_releases_after_silence(scenario, load, link):

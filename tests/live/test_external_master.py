@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
 
-from drake_teleop.live.external_master import (
+from drake_teleop.live.hand import (
     _ALLOWED_SHARE_INDEX,
     _DISPLAY_STATE_SIZE,
     _FAULT_INDEX,

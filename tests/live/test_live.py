@@ -13,8 +13,7 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.progress import show_no_progress
-from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, parse_message
-from drake_teleop.live.pace import Pace
+from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, Pace, parse_message
 from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from known_motion import motion_at
 
-from drake_teleop.cli.logs import identify_command
-from drake_teleop.cli.printing import print_identification
+from drake_teleop.cli.logs import identify_command, print_identification
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETER_NAMES
 from drake_teleop.load.inertia import phi_from_mass_com_inertia

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_translator import C_HELPER_FUNCTIONS, TEMPLATE, Translator, with_translation
 from shown import type_in
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.compiled import njit
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensation_step import TARE_EXCEEDS_DRIFT, TARE_WRENCH_VARIES
-from drake_teleop.robots.controller.c99 import CFLAGS, kernel_files
-from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
+from drake_teleop.robots.controller.export import CFLAGS, kernel_files
 from drake_teleop.robots.streams import Reading, ReadingFlag
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -91,6 +91,11 @@ def test_output_has_the_bits_of_compensate_within_the_size_limit(tmp_path):
     assert size <= 4096
     undefined = ["nm", "-u", str(tmp_path / "wrench_compensator.o")]
     assert not subprocess.run(undefined, check=True, capture_output=True).stdout
+
+
+def test_shipped_code_is_the_translation_of_the_python_functions():
+    text = TEMPLATE.read_text()
+    assert text == with_translation(text), "run: python tests/robots/c_translator.py"
 
 
 TARE = """

@@ -26,7 +26,6 @@ from drake_teleop.load.tolerance import (
     tolerances_in_display_units,
 )
 from drake_teleop.robots.assembly import (
-    PoseSourceFromJoints,
     ReadingAssembler,
     WrenchAndMotionStreams,
 )
@@ -125,11 +124,11 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     t, *joints = moved(0.4)
     bad = Reading(0, 0.0, np.zeros(7), stream=POSE), Reading(0, 0.0, np.full(3, 0.1), stream=JOINTS)
     parts = [Reading(k, float(t[k]), q, stream=JOINTS) for k, q in enumerate(joints[0])]
-    source = PoseSourceFromJoints(JointSource([*bad, *parts]), arm)
+    source = WrenchAndMotionStreams(JointSource([*bad, *parts]), arm=arm)
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
-    assembly, found = ReadingAssembler(WrenchAndMotionStreams(source)), []
+    assembly, found = ReadingAssembler(source), []
     for k, part in enumerate(sent[1:]):
         wrench = Reading(k, part.t, np.zeros(6), stream=WRENCH, arrival=part.t)
         for each in (part._replace(arrival=part.t), wrench):

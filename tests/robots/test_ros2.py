@@ -26,7 +26,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.ros2_messages import MessageConverter
+from drake_teleop.robots.ros2 import MessageConverter
 from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, POSE, CompensatedWrench, ReadingFlag
 
 PEER = Path(__file__).with_name("ros2_peer.py")

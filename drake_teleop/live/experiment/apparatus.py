@@ -34,7 +34,8 @@ def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
 class Apparatus:
     """Station of a task and condition.
 
-    `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1.
+    `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1,
+    `base` the scenario of the task.
     """
 
     task: design.Task
@@ -42,6 +43,7 @@ class Apparatus:
     scenario: Scenario
     load: IdentifiedLoad | None
     load_mass_at_hand: float
+    base: Scenario
 
     def stimulus_scales(self, level: float, contact_force: float) -> dict[str, int]:
         """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
@@ -104,7 +106,7 @@ def make_apparatus(
     if condition.eta is not None:
         mass = setup.slave.payload.mass
     at_hand = setup.force_scaling.force_scale * setup.kinematic_scaling.translation_scale
-    return Apparatus(task, condition, setup, load, float(mass) * at_hand)
+    return Apparatus(task, condition, setup, load, float(mass) * at_hand, scenario)
 
 
 class IntervalLog:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import NoReturn, TypeAlias
 
 from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -120,35 +120,33 @@ class Experiment:
     simulated: SimulatedParticipant = field(default_factory=SimulatedParticipant)
 
     def check(self, where: str) -> None:
+        def fail(place: str, what: str, remedy: str) -> NoReturn:
+            raise DrakeTeleopError(what, where=f"{where}:{place}", remedy=remedy)
+
         check_all_field_values(self, where)
         for name in ("tasks", "conditions"):
             if not getattr(self, name):
-                remedy = "add at least one"
-                raise DrakeTeleopError("is empty", where=f"{where}:{name}", remedy=remedy)
+                fail(name, "is empty", "add at least one")
         kinds = [type(task).__name__ for task in self.tasks]
         for kind in kinds:
             if kinds.count(kind) > 1:
-                what = f"the task !{kind} is listed twice"
-                raise DrakeTeleopError(what, where=f"{where}:tasks", remedy="remove one")
+                fail("tasks", f"the task !{kind} is listed twice", "remove one")
         for index, task in enumerate(self.tasks):
             if not isinstance(task, PegInSlot) and not 2.0 * task.low <= task.high:
                 what = f"{task.high:g} is less than twice low, {task.low:g}: the range is too small"
                 remedy = "increase high, so that the range contains the threshold"
-                raise DrakeTeleopError(what, where=f"{where}:tasks[{index}].high", remedy=remedy)
+                fail(f"tasks[{index}].high", what, remedy)
         names = [condition.name for condition in self.conditions]
         for index, condition in enumerate(self.conditions):
-            place = f"{where}:conditions[{index}]"
+            place = f"conditions[{index}]"
             if not condition.name or condition.name in names[:index]:
                 what = f"{condition.name!r} is empty, or the name of an earlier condition"
-                remedy = "give each condition its own name"
-                raise DrakeTeleopError(what, where=f"{place}.name", remedy=remedy)
+                fail(f"{place}.name", what, "give each condition its own name")
             if condition.eta is not None and condition.sigma != 0.0:
-                what = "cannot be combined with sigma > 0"
-                raise DrakeTeleopError(what, where=f"{place}.eta", remedy="set sigma: 0")
+                fail(f"{place}.eta", "cannot be combined with sigma > 0", "set sigma: 0")
             if condition.delay is not None and condition.network != AS_IN_SCENARIO:
                 what = f"cannot be combined with network {condition.network!r}"
-                remedy = "remove delay or network"
-                raise DrakeTeleopError(what, where=f"{place}.delay", remedy=remedy)
+                fail(f"{place}.delay", what, "remove delay or network")
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:

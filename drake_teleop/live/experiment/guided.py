@@ -1,24 +1,31 @@
-"""Event handler that replaces `Live` for the experiment of one participant."""
+"""Event handler that replaces `Live` for the experiment of one participant, and its server."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import time
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
 from drake_teleop.live.experiment.procedure import GAP_PHASE, INTERVAL_PHASE, Procedure
-from drake_teleop.live.experiment.simulated import with_interval_seed
-from drake_teleop.live.experiment.store import TrialStore
-from drake_teleop.live.inputs import INPUT_RANGES, Inputs
+from drake_teleop.live.experiment.simulated import make_apparatuses, with_interval_seed
+from drake_teleop.live.inputs import Inputs
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
+from drake_teleop.live.page_scene import PageScene
+from drake_teleop.live.scenarios import with_task_space_device
+from drake_teleop.live.server import LiveDrive, compile_slice_functions
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -44,15 +51,13 @@ class GuidedExperiment:
         self,
         procedure: Procedure,
         stations: dict[tuple[int, int], Apparatus],
-        scenarios: list[Scenario],
-        store: TrialStore,
         shows: Sequence[SceneFunction],
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
         self.refused, self.requested_scene = 0, ""
-        self._procedure, self._stations, self._scenarios = procedure, stations, scenarios
-        self._drives, self._shows, self._link = store.folder / "drives", shows, link
+        self._procedure, self._stations, self._shows, self._link = procedure, stations, shows, link
+        self._drives = procedure.store.folder / "drives" / f"{procedure.participant:02}"
         self._driver: int | None = None
         self._write_error = ""
         self._intervals, self._since, self._frame_due = 0, now, now
@@ -63,7 +68,7 @@ class GuidedExperiment:
         trial, self._prepared = procedure.trial, procedure.prepared_intervals
         self._apparatus = self._stations[trial.task, trial.condition]
         self._show = self._shows[trial.task]
-        insert = self._scenarios[trial.task].operator.task
+        insert = self._apparatus.base.operator.task
         insert = insert if isinstance(insert, Insert) else None
         self._rows = IntervalLog(self._apparatus.scenario, insert)
         self._stimulus = self._apparatus.stimulus_scales(
@@ -73,7 +78,7 @@ class GuidedExperiment:
         self._live = Live(
             with_interval_seed(self._apparatus.scenario, procedure),
             self._apparatus.load,
-            self._drives / f"{procedure.participant:02}" / name,
+            self._drives / name,
             self._log_and_show_rows,
             now,
             self._link,
@@ -209,8 +214,7 @@ class GuidedExperiment:
         task = self._procedure.task
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
-        inputs = {name: getattr(Inputs(), name) for name in INPUT_RANGES}
-        inputs |= {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
+        inputs = vars(Inputs()) | {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
@@ -240,3 +244,54 @@ def parse_experiment_message(text: Any) -> dict[str, Any] | None:
             name: value for name, value in message[kind].items() if name in PARTICIPANT_INPUTS
         }
     return found or None
+
+
+class ExperimentDrive(LiveDrive):
+    """Live session of one participant, with its server."""
+
+    def __init__(
+        self, procedure: Procedure, scenarios: list[Scenario], port: int, device: str | None
+    ) -> None:
+        if device is not None:
+            scenarios = [with_task_space_device(scenario) for scenario in scenarios]
+        self._procedure = procedure
+        self._stations = make_apparatuses(procedure.experiment, scenarios)
+        super().__init__(scenarios[0], None, port, device)
+
+    def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
+        for task in range(len(self._procedure.experiment.tasks)):
+            setup = self._stations[task, 0].scenario
+            self._views[str(task)] = PageScene(str(task), setup, forces=False)
+        first = self._stations[0, 0]
+        compile_slice_functions(first.scenario, first.load, device)
+
+    def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
+        shows = [view.frame_part for view in self._views.values()]
+        setup = (self._procedure, self._stations, shows)
+        return GuidedExperiment(*setup, time.perf_counter(), self._link)
+
+    def _page_html(self) -> str:
+        panel = resources.files("drake_teleop.live.experiment") / "page.html"
+        return super()._page_html().replace("</body>", panel.read_text("utf-8") + "</body>")
+
+
+def serve_experiment(
+    procedure: Procedure,
+    scenarios: list[Scenario],
+    *,
+    port: int,
+    browser: bool,
+    device: str | None,
+) -> None:
+    live, who = ExperimentDrive(procedure, scenarios, port, device), procedure.participant
+    if browser:
+        webbrowser.open(live.url)
+    reason = live.announce_and_wait(f"participant {who}")
+    done, trials = procedure.trial_number, len(procedure.trials)
+    what = f"participant {who} has done {done} of {trials} trials"
+    if live.ended:
+        what = f"the simulation has stopped: {live.ended}; {what}"
+        raise DrakeTeleopError(what, where="drive", remedy="run the same command again to continue")
+    if done < trials:
+        raise KeyboardInterrupt(f"{reason}: {what}; run the same command again to continue")
+    print(f"\nended by {reason}: {what}")

@@ -75,7 +75,7 @@ class Procedure:
     """
 
     def __init__(self, experiment: Experiment, participant: int, store: TrialStore) -> None:
-        self.experiment, self.participant, self._store = experiment, participant, store
+        self.experiment, self.participant, self.store = experiment, participant, store
         self.trials = plan_trials(experiment, participant)
         self._rows = store.read_rows(participant)
         self._psi = {
@@ -176,7 +176,7 @@ class Procedure:
             force_N=max(f.force_N for f in results),
             lost_s=sum(f.lost_s for f in results),
         )
-        self._store.write_rows(self.participant, [*self._rows, row])
+        self.store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
         self._update_estimates(trial, row)
         self.is_answer_right = bool(correct)

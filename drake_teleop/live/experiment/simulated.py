@@ -27,7 +27,6 @@ from drake_teleop.live.experiment.procedure import (
     IntervalResult,
     Procedure,
 )
-from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.inputs import INPUT_UNIT_M, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
@@ -59,24 +58,20 @@ def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
 
 
 def simulate_participant(
-    experiment: Experiment,
-    scenarios: list[Scenario],
+    procedure: Procedure,
     stations: dict[tuple[int, int], Apparatus],
-    store: TrialStore,
-    participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
     """Run the remaining trials; `progress` receives the numbers of finished and all trials.
 
     Keys of `stations`: indices of task and condition.
     """
-    procedure = Procedure(experiment, participant, store)
-    observer, responses = experiment.simulated, [0.0, 0.0]
+    experiment, responses = procedure.experiment, [0.0, 0.0]
     while procedure.phase != END_PHASE:
         if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                result = _insert_peg(apparatus, scenarios[procedure.trial.task], procedure)
+                result = _insert_peg(apparatus, procedure)
             else:
                 result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
@@ -84,8 +79,10 @@ def simulate_participant(
         elif procedure.phase == GAP_PHASE:
             procedure.start_second_interval()
         elif procedure.phase == ANSWER_PHASE:
-            rng = np.random.default_rng([experiment.seed, participant, procedure.trial_number, 3])
-            procedure.store_answer(answer_by_larger_response(observer, responses, rng), 0.5)
+            key = [experiment.seed, procedure.participant, procedure.trial_number, 3]
+            rng = np.random.default_rng(key)
+            answer = answer_by_larger_response(experiment.simulated, responses, rng)
+            procedure.store_answer(answer, 0.5)
             progress(procedure.trial_number, len(procedure.trials))
         else:
             procedure.advance_phase()
@@ -129,8 +126,8 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     return result, rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _insert_peg(apparatus: Apparatus, base: Scenario, procedure: Procedure) -> IntervalResult:
-    task, condition = apparatus.task, apparatus.condition
+def _insert_peg(apparatus: Apparatus, procedure: Procedure) -> IntervalResult:
+    task, condition, base = apparatus.task, apparatus.condition, apparatus.base
     assert isinstance(task, PegInSlot) and isinstance(base.operator.task, Insert)
     scenario = replace(
         with_interval_seed(apparatus.scenario, procedure),

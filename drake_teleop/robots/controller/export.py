@@ -1,25 +1,243 @@
-"""Export of an identified load with code that compensates it."""
+"""Export of an identified load with code that compensates it: C99, FMU, or filter of ros2_control.
+
+FMUs are functional mock-up units for co-simulation, FMI 2.0 and 3.0.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import io
+import platform
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
+from markupsafe import Markup
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, replace_file_on_success
+from drake_teleop.common.html import render_page
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.version import __version__
 from drake_teleop.load.identification import Identification
+from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import notes_on_undetermined_load
-from drake_teleop.robots.controller import c99
-from drake_teleop.robots.controller.fmu import fmu_files
+from drake_teleop.robots.compensator import STALE_AGE_S, Compensator
 from drake_teleop.robots.export import refuse_removed_weight, unused_sensor_pose_error
+from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 
+TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
+CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
+"""Options of a C compiler for the bits of Python."""
+_TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
+_NUM_TEST_READINGS = 1000
+_TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
+_MODEL_NAME = "wrench_compensator"
+_WRENCH_COMPONENT_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+_PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
 _FILTER_NAME = "wrench_compensator_filter"
 _FILTER_TEMPLATE_FOLDER = "ros2_filter"
 
+Files = Mapping[str, str | bytes]
 
-def ros2_filter_files(target: c99.ControllerTarget) -> c99.Files:
+
+class ControllerTarget(NamedTuple):
+    """Load, rate, low-pass and sensor of an export.
+
+    Attributes:
+        dt: period of the readings [s].
+        sign: -1 if the sensor reports the wrench of the load on the sensor, else 1.
+        notes: warnings for the user.
+    """
+
+    load: Identification
+    dt: float
+    cutoff_hz: float | None
+    sensor_range: Array | None
+    sign: int
+    notes: list[str]
+
+    def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
+        """Return the C initializer of `wrench_compensator_settings`, in the order of its fields."""
+        others = self.make_compensator(largest, **scales).c_settings
+        values = {name: others.pop(name) for name in ("phi", "offsets")}
+        values |= {"sigma_weight": 0.0, "sigma_inertia": 0.0, "gamma": 1.0, **scales, **others}
+        return "".join(f"    {_c_literal(each)}, /* {name} */\n" for name, each in values.items())
+
+    def make_compensator(self, largest: Array | None = None, **scales: Any) -> Compensator:
+        largest = self.sensor_range if largest is None else largest
+        return Compensator(self.load, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
+
+
+def c99_files(target: ControllerTarget) -> Files:
+    return {
+        **kernel_files(target),
+        "test_vector.h": _test_vector_header(target),
+        "test_wrench_compensator.c": read_template("test_wrench_compensator.c"),
+        "CMakeLists.txt": read_template("CMakeLists.txt"),
+        "README.md": render_template(
+            "README.c99.md",
+            rate=f"{1.0 / target.dt:g}",
+            period=f"{target.dt:g}",
+            notes=target.notes,
+            count=_NUM_TEST_READINGS,
+        ),
+    }
+
+
+def kernel_files(target: ControllerTarget) -> Files:
+    settings, dt = target.settings_initializer(), repr(target.dt)
+    return {
+        "wrench_compensator.h": read_template("wrench_compensator.h"),
+        "wrench_compensator.c": render_template("wrench_compensator.c"),
+        "load.h": render_template("load.h", dt=dt, settings=settings, notes=target.notes),
+    }
+
+
+def read_template(name: str) -> str:
+    return resources.files(TEMPLATE_PACKAGE).joinpath(f"templates/{name}").read_text("utf-8")
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Return a shipped template with inserted values; nothing is escaped."""
+
+    def keep_unescaped(value: Any) -> Any:
+        if isinstance(value, (list, tuple)):
+            return [keep_unescaped(each) for each in value]
+        return Markup(value) if isinstance(value, str) else value
+
+    values = {key: keep_unescaped(value) for key, value in values.items()}
+    values.setdefault("version", __version__)
+    return render_page(TEMPLATE_PACKAGE, f"templates/{name}.j2", **values) + "\n"
+
+
+def _test_vector_header(target: ControllerTarget) -> str:
+    inputs, largest = _simulated_readings_and_sensor_range(target)
+    python = target.make_compensator(largest, **_TEST_SCALES)
+    outputs = [
+        python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
+        for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
+    ]
+    return render_template(
+        "test_vector.h",
+        settings=target.settings_initializer(largest, **_TEST_SCALES),
+        inputs=[_c_literal(row) for row in inputs],
+        outputs=[_c_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
+        flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
+    )
+
+
+def _simulated_readings_and_sensor_range(target: ControllerTarget) -> tuple[Array, Array]:
+    phase = 2.0 * np.pi * np.arange(_NUM_TEST_READINGS)[:, None] / _NUM_TEST_READINGS
+    omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
+    alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
+    down = np.array([3.0, -4.0, -8.0]) + omega
+    motion = 5.0 * alpha - down, omega, alpha
+    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TEST_WRENCH_AMPLITUDES
+    wrench = non_contact_wrench(*motion, target.load.phi) + target.load.offsets + contact
+    readings = np.round(np.hstack([wrench, *motion, down]), 6)
+    largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)
+    readings[100:103, 7], readings[200, 0], readings[201, 12] = np.nan, np.inf, 1e7
+    first = _NUM_TEST_READINGS // 2
+    readings[first : first + round(2.0 * STALE_AGE_S / target.dt) + 2, 5] = np.nan
+    return readings, largest
+
+
+def _c_literal(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        text = ", ".join(repr(float(x)) for x in value)
+        return "{" + text.replace("nan", "NAN").replace("inf", "INFINITY") + "}"
+    return repr(value)
+
+
+def fmu_files(target: ControllerTarget) -> Files:
+    """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
+    is_linux64 = platform.system() == "Linux" and platform.machine() == "x86_64"
+    compiler = shutil.which("cc") if is_linux64 else None
+    if compiler is None:
+        target.notes.append("the FMUs contain sources only: there is no C compiler for linux64")
+    kernel = dict(kernel_files(target))
+    token = str(uuid5(NAMESPACE_URL, "".join(map(str, kernel.values()))))
+    kernel["token.h"] = f'#define TOKEN "{token}"\n'
+    kernel["fmu.h"] = read_template("fmu.h")
+    return {
+        f"{_MODEL_NAME}_fmi{version[0]}.fmu": _fmu_archive(target, kernel, version, token, compiler)
+        for version in ("2.0", "3.0")
+    }
+
+
+def _fmu_archive(
+    target: ControllerTarget, kernel: Files, version: str, token: str, cc: str | None
+) -> bytes:
+    sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
+    files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
+    c_files = [name for name in sources if name.endswith(".c")]
+    files["modelDescription.xml"] = _model_description(target, version, token)
+    if version == "3.0":
+        files["sources/buildDescription.xml"] = read_template("buildDescription.xml")
+    if cc is not None:
+        binary = f"binaries/{_PLATFORM_OF_FMI_VERSION[version]}/{_MODEL_NAME}.so"
+        files[binary] = _compile_library(cc, sources, c_files)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)  # without the time
+    return content.getvalue()
+
+
+def _compile_library(compiler: str, sources: Files, c_files: list[str]) -> bytes:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in sources.items():
+            (folder / file).write_text(str(text), encoding="utf-8")
+        options = [*CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
+        subprocess.run([compiler, *options, *c_files, "-o", "library.so"], cwd=folder, check=True)
+        return (folder / "library.so").read_bytes()
+
+
+def _model_description(target: ControllerTarget, version: str, token: str) -> str:
+    number, integer = ("Float64", "Int32") if version == "3.0" else ("Real", "Integer")
+    variables = []
+    for name, causality, unit, start in _model_variables(target):
+        values = "" if start is None else f' start="{start!r}"'
+        values += f' unit="{unit}"' if unit else ""
+        variability = "tunable" if causality == "parameter" else "discrete"
+        kind = integer if name == "flags" else number
+        variables.append((name, causality, variability, kind, values))
+    outputs = [k for k, variable in enumerate(variables) if variable[1] == "output"]
+    names = {"token": token, "dt": repr(target.dt), "variables": variables, "outputs": outputs}
+    return render_template(f"modelDescription{version[0]}.xml", **names)
+
+
+def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, float | None]]:
+    wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_COMPONENT_NAMES]
+    vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
+    motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
+    found = target.make_compensator().c_settings
+    phi_units = ["kg", *["kg.m"] * 3, *["kg.m2"] * 6]
+    phi_names = ("m", "mc_x", "mc_y", "mc_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
+    phi = zip(phi_names, phi_units, found["phi"], strict=True)
+    offsets = zip(wrench, found["offsets"], strict=True)
+    return [
+        *((name, "input", unit, 0.0) for name, unit in (*wrench, *motion)),
+        *((f"contact_{name}", "output", unit, None) for name, unit in wrench),
+        *((f"scaled_{name}", "output", unit, None) for name, unit in wrench),
+        ("flags", "output", "", None),
+        ("sigma_weight", "parameter", "", 0.0),
+        ("sigma_inertia", "parameter", "", 0.0),
+        ("gamma", "parameter", "", 1.0),
+        *((name, "parameter", unit, float(value)) for name, unit, value in phi),
+        *((f"offset_{name}", "parameter", unit, float(x)) for (name, unit), x in offsets),
+    ]
+
+
+def ros2_filter_files(target: ControllerTarget) -> Files:
     """Return the files of a ROS 2 package with a filter of wrenches."""
     shipped = {
         f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
@@ -27,20 +245,20 @@ def ros2_filter_files(target: c99.ControllerTarget) -> c99.Files:
         "CMakeLists.txt": "CMakeLists.txt",
         f"src/{_FILTER_NAME}.cpp": f"{_FILTER_NAME}.cpp",
     }
-    kernel = dict(c99.kernel_files(target))
+    kernel = dict(kernel_files(target))
     sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
     folder = _FILTER_TEMPLATE_FOLDER
     return {
-        **{name: c99.read_template(f"{folder}/{file}") for name, file in shipped.items()},
+        **{name: read_template(f"{folder}/{file}") for name, file in shipped.items()},
         **{f"src/{name}": text for name, text in kernel.items()},
-        "README.md": c99.render_template(f"{folder}/README.md", **values),
+        "README.md": render_template(f"{folder}/README.md", **values),
     }
 
 
-CONTROLLER_FORMATS: dict[str, Callable[[c99.ControllerTarget], c99.Files]] = {
-    "c99": c99.c99_files,
+CONTROLLER_FORMATS: dict[str, Callable[[ControllerTarget], Files]] = {
+    "c99": c99_files,
     "fmu": fmu_files,
     "ros2_filter": ros2_filter_files,
 }
@@ -72,7 +290,7 @@ def export_controller(
     if largest is None:
         notes.append("no range of the sensor was given: saturation is not detected; give --range")
     whole = None if largest is None else np.repeat(np.array(largest, float), 3)
-    target = c99.ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
+    target = ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
     for name, content in CONTROLLER_FORMATS[to](target).items():
         path = out / name
         make_folder(path.parent)

@@ -1,6 +1,7 @@
 """Translation of compiled functions to C99, with the same operations in the same order.
 
 A numba function of `njit` becomes a C function; one of `register_jitable` is expanded at its call.
+Run this file after a change of these functions: it updates the shipped `wrench_compensator.c.j2`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,15 @@ import math
 import operator
 import textwrap
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+
+from drake_teleop.logs.causal import design_low_pass
+from drake_teleop.robots import compensation_step as step
+from drake_teleop.robots.controller import export
+from drake_teleop.robots.streams import NUM_READING_VALUES
+
+TEMPLATE = Path(export.__file__).parent / "templates" / "wrench_compensator.c.j2"
 
 C_HELPER_FUNCTIONS = """\
 static int isfinite_(double x) { return x - x == 0.0; }
@@ -384,3 +393,33 @@ def _remove_outer_parentheses(text: str) -> str:
         if depth == 0 and k < len(text) - 1:
             return text
     return text[1:-1] if text.startswith("(") else text
+
+
+def kernel_translation() -> str:
+    """Return the part of the template `wrench_compensator.c.j2` that is translated from Python."""
+    c = Translator()
+    values, row, out = (NUM_READING_VALUES,), (NUM_READING_VALUES + 6,), (12,)
+    c.translate_function(step.reading_problem, values=values, largest=values, limits=(6,))
+    factors = dict.fromkeys(("sigma_weight", "sigma_inertia", "gamma"), "double")
+    c.translate_function(step.set_scale_factors_into, **factors, scales=(4,))
+    arrays: dict[str, Any] = {"values": values, "gravity": (3,), "offsets": (6,), "phi": (10,)}
+    arrays |= {"no_load": (10,), "scales": (4,), "low_pass": ("low_pass_count",)}
+    arrays |= {"memory": (2, *out), "rest": (1, *row), "at": "int", "out": out}
+    c.translate_function(step.contact_and_scaled_wrench_into, **arrays)
+    c.translate_function(step.clip_wrenches, wrenches=out, limits=(6,))
+    moments: dict[str, Any] = {"count": "double", "mean": row, "squares": row}
+    c.translate_function(step.add_to_statistics, row=row, **moments)
+    c.translate_function(step.update_tare_offsets, **moments, noise_limits=(6,), offsets=(6,))
+    numbers = dict.fromkeys(("dt", "tangent", "ahead_s"), "double")
+    c.translate_function(design_low_pass, **numbers, low_pass=(7,))
+    return f"{C_HELPER_FUNCTIONS}\n{c.text}\n"
+
+
+def with_translation(template: str) -> str:
+    """Return the template with the present translation in place of its translated part."""
+    head, tail = template.index("static int isfinite_"), template.index("static const double zero")
+    return template[:head] + kernel_translation() + template[tail:]
+
+
+if __name__ == "__main__":
+    TEMPLATE.write_text(with_translation(TEMPLATE.read_text()))
