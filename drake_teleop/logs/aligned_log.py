@@ -20,7 +20,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification, is_precise_enough, mark_undetermined
 from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_unit_or_frame_finding
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
@@ -198,21 +198,23 @@ def replace_specific_force_by_acceleration(log: Log) -> Log:
 
 
 @dataclass(frozen=True)
-class LoadFitOfPosedLog:
-    """Load identified from a log with poses; `log` are the used samples, with spline motion.
+class LoadFitOfLog:
+    """Load identified from a log; `log` are the used samples, without the delay.
 
-    `delay_source` is "given", "estimated", or "undetermined" (0 was used).
+    `delay_source` is "static", "given", "estimated", or "undetermined" (0 was used). `motion` is
+    from splines, or None.
     """
 
     log: Log
     fit: BatchResult
+    delay_s: float
     delay_source: str
-    motion: PoseEstimate
+    motion: PoseEstimate | None = None
 
 
 def fit_load_to_posed_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
-) -> tuple[LoadFitOfPosedLog | None, tuple[Finding, ...]]:
+) -> tuple[LoadFitOfLog | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
 
     The load is None for a method without splines, a log without usable poses, or an IMU that
@@ -238,7 +240,8 @@ def fit_load_to_posed_log(
     if finding is not None:
         text = f"{finding.message}{note_that_table_needs_description(log.source)}"
         fit, finding = replace(fit, note=""), replace(finding, message=text)
-    return LoadFitOfPosedLog(shown, fit, source, found), () if finding is None else (finding,)
+    fitted = LoadFitOfLog(shown, fit, found.delay_s, source, found)
+    return fitted, () if finding is None else (finding,)
 
 
 def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:

@@ -15,11 +15,10 @@ from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import has_negative_mass
-from drake_teleop.logs.causes.cause import Cause
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.causes.explain import MisfitExplanation, explain_misfit
 from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
-from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
 from drake_teleop.logs.read.alignment import remove_delay
@@ -45,7 +44,9 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 }
 
 
-def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
+def add_description_lines(
+    causes: Sequence[Finding], log: Log, *, by_pose: bool
+) -> tuple[Finding, ...]:
     """Add the corrected lines of the log description to the messages of causes."""
     _, texts, corrected = _corrected_fields_and_texts_by_cause(causes, log, by_pose)
     return tuple(
@@ -54,7 +55,7 @@ def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -
     )
 
 
-def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
+def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
     """Return a message on wrong units for a mass of at least 1000 kg.
 
     None for a smaller one, or for a log without a description of its wrench.
@@ -75,7 +76,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
 
 
 def _corrected_fields_and_texts_by_cause(
-    causes: Sequence[Cause], log: Log, by_pose: bool
+    causes: Sequence[Finding], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
@@ -295,11 +296,11 @@ def _load_with_causes_or_wider_intervals(
     )
 
 
-def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Cause, ...]:
+def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
     """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
-        return (Cause(finding.name, finding.message), *kept)
+        return (Finding(finding.name, finding.message), *kept)
     return why.causes
 
 
@@ -313,10 +314,10 @@ def unexplained_finding(why: MisfitExplanation) -> Finding:
 
 
 def removed_weight_note(why: MisfitExplanation) -> str:
-    if "weight" not in why.always_fitted or why.removed_weight is None:
+    if "weight" not in why.always_fitted:
         return ""
-    mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
-    deviation = float(np.sqrt(why.state.parameters_of_extension("weight")[1][0, 0]))
+    (mass, *moment), covariance = why.state.parameters_of_extension("weight")
+    deviation = float(np.sqrt(covariance[0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (
         f"the weight that is removed from the wrench is that of {mass:.4g} kg"

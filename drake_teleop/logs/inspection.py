@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
 from drake_teleop.common.numeric import Array, find_runs_of_true
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.conventions import check_conventions
-from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise_deviations

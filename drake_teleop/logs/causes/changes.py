@@ -133,10 +133,16 @@ def remove_small_steps(state: FittedModel) -> FittedModel:
         if not small:
             return state
         least = min(small, key=lambda i: _squared_step_over_variance(state, i))
-        steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
-        model = replace(state.model, steps=steps)
-        x = model.start_parameters(state.x, Model())
-        state = FittedModel.fit_record(state.data, model, x, state.contact_spans)
+        state = _refit_without_steps(state, [least], state.contact_spans)
+
+
+def _refit_without_steps(
+    state: FittedModel, removed: Sequence[int], spans: TimeSpans
+) -> FittedModel:
+    kept = tuple(x for i, x in enumerate(state.model.steps) if i not in removed)
+    model = replace(state.model, steps=kept)
+    x = model.start_parameters(state.x, Model())
+    return FittedModel.fit_record(state.data, model, x, spans)
 
 
 def _squared_step_over_variance(state: FittedModel, i: int) -> float:
@@ -369,13 +375,12 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
         ends = [k for k in (i, j) if k >= 0]
         if not ends or all(state.model.steps[k].kind == "load" for k in ends):
             continue
-        kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
-        model, dt = replace(state.model, steps=kept), state.data.dt
-        x, span = model.start_parameters(state.x, Model()), (start - dt, stop + dt)
+        span = start - state.data.dt, stop + state.data.dt
+        spans = (*state.contact_spans, span)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
-            return FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
+            return _refit_without_steps(state, ends, spans)
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
-            calm = FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
+            calm = _refit_without_steps(state, ends, spans)
             limit = min(_CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM)
             if calm.residual_ratio < limit:
                 return shrink_contacts(calm)

@@ -16,8 +16,8 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import corrections
-from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
     MAX_SEARCHED_DELAY_S,
@@ -170,8 +170,7 @@ def check_wrench_and_estimate_delay(
         return lag_finding(description, delay), delay
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
-    first = Finding(finding.name, message, finding.fields)
-    return [first, *lag_finding(description, delay)], delay
+    return [replace(finding, message=message), *lag_finding(description, delay)], delay
 
 
 def _edits_with_far_better_fit(

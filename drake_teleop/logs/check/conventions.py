@@ -12,9 +12,9 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import against_load, corrections
 from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, LoadFitQuality
-from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
 from drake_teleop.logs.check.log_data import LogData, dead_or_repeated_channel_findings
 from drake_teleop.logs.check.pose_checks import position_unit_or_origin_findings

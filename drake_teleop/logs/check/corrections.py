@@ -1,9 +1,9 @@
-"""Findings about a log, and edits of its description, each for one suspected error."""
+"""Edits of a log description, each for one suspected error."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import EULER_AXES, right_angled_rotations
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
@@ -21,21 +22,6 @@ MOTION_FINDINGS = (
 )
 """Errors of the described motion, which resemble causes."""
 MIN_LAG_OF_WRONG_CLOCK_S = 0.05  # filters lag less
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Suspicious property of a log.
-
-    Args:
-        name: category for programs: "sign", "units" ...
-        message: observation and remedy.
-        fields: corrected values of fields of the log description, as in YAML.
-    """
-
-    name: str
-    message: str
-    fields: dict[str, Any] = field(default_factory=dict)
 
 
 Edit = tuple[Finding, Description]  # a finding, and the corrected description
@@ -56,7 +42,7 @@ def _make_edit(
     lines = " and ".join(f"{path}: {value}" for path, value in shown.items())
     for path, value in fields.items():
         description = edit_field(description, path, _lists_to_tuples(value))
-    return Finding(name, f"{text}; set {lines}{note}", fields), description
+    return Finding(name, f"{text}; set {lines}{note}", fields=fields), description
 
 
 def _lists_to_tuples(value: Any) -> Any:
@@ -126,7 +112,7 @@ def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
     changed = edit_field(description, path, sign)
-    return Finding(finding.name, text, finding.fields | {path: sign}), changed
+    return replace(finding, message=text, fields=finding.fields | {path: sign}), changed
 
 
 def call_or_none_if_unreadable(function: Callable[[Description], Any], edited: Description) -> Any:

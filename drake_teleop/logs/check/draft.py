@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_teleop.common.texts import to_yaml_text
-from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table

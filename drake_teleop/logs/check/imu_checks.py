@@ -6,6 +6,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import axis_names_of_rows, rotation_matrices, signed_permutations
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
     MIN_REDUCTION_BY_EDIT,
@@ -14,7 +15,6 @@ from drake_teleop.logs.check.against_load import (
 from drake_teleop.logs.check.corrections import (
     MIN_LAG_OF_WRONG_CLOCK_S,
     Edit,
-    Finding,
     call_or_none_if_unreadable,
     edit_field,
     orientation_and_gravity_sign_edits,

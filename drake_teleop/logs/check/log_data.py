@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.check.corrections import Finding, edit_field
+from drake_teleop.logs.causes.cause import Finding
+from drake_teleop.logs.check.corrections import edit_field
 from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.alignment import low_pass, resample
