@@ -21,7 +21,7 @@ from drake_teleop.load.identification import Identification, is_precise_enough, 
 from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.cause import Finding
-from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_unit_or_frame_finding
+from drake_teleop.logs.check.motion_checks import has_usable_poses, pose_unit_or_frame_finding
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     PoseMotion,

@@ -37,7 +37,7 @@ from drake_teleop.logs.check.conventions import (
     findings_if_load_is_suspicious,
     motion_findings,
 )
-from drake_teleop.logs.check.corrections import FINDINGS_CAUSED_BY_MISFIT
+from drake_teleop.logs.check.edits import FINDINGS_CAUSED_BY_MISFIT
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
