@@ -51,11 +51,16 @@ def add_description_lines(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
     """Add the corrected lines of the log description to the messages of causes."""
-    _, texts, corrected = _corrected_fields_and_texts_by_cause(causes, log, by_pose)
-    return tuple(
-        replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
-        for cause, text, fields in zip(causes, texts, corrected, strict=True)
-    )
+    fields, touched = _corrected_and_touched_fields(causes, log, by_pose)
+    note, out = note_that_table_needs_description(log.source), []
+    for cause, names in zip(causes, touched, strict=True):
+        lines = {name: _yaml_value(name, fields[name]) for name in names}
+        text = f"set {' and '.join(f'{k}: {x}' for k, x in lines.items())}{note}"
+        text = text if lines else _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
+        message = f"{cause.message}; {text}" if text else cause.message
+        corrected = {name: parse_yaml(line, name) for name, line in lines.items()}
+        out.append(replace(cause, message=message, fields=corrected))
+    return tuple(out)
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
@@ -65,7 +70,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     """
     if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected_fields_and_texts_by_cause(causes, log, by_pose=True)[0]
+    fields = _corrected_and_touched_fields(causes, log, by_pose=True)[0]
     ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
     text = _yaml_value("wrench.torque.scale", ratio)
     return (
@@ -78,9 +83,9 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     )
 
 
-def _corrected_fields_and_texts_by_cause(
+def _corrected_and_touched_fields(
     causes: Sequence[Finding], log: Log, by_pose: bool
-) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
+) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
     column = _column_of_each_axis(fields["wrench.frame"])
@@ -89,13 +94,7 @@ def _corrected_fields_and_texts_by_cause(
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         _correct_fields_by_cause(fields, cause.name, cause.values, column)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
-    texts, corrected, note = [], [], note_that_table_needs_description(log.source)
-    for cause, names in zip(causes, touched, strict=True):
-        corrected.append({k: parse_yaml(_yaml_value(k, fields[k]), k) for k in names})
-        lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
-        otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{note}" if lines else otherwise)
-    return fields, texts, corrected
+    return fields, touched
 
 
 def _correctable_fields(description: Description, by_pose: bool) -> DescriptionFields:
@@ -277,8 +276,7 @@ def _load_with_causes_or_wider_intervals(
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
         known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)
         return replace(load, covariance=wide, identifiable=known)
-    deviations = np.sqrt(np.diag(why.covariance))
-    identifiable = is_precise_enough(deviations, why.theta[6:])
+    identifiable = is_precise_enough(np.sqrt(np.diag(why.covariance)), why.theta[6:])
     no_load = bool(why.causes) and why.causes[0].name == "no load"
     if no_load or has_negative_mass(why.state):
         identifiable = np.repeat([True, False], [6, 10])

@@ -139,8 +139,7 @@ def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) 
     except DrakeTeleopError as error:
         lacking.append(str(error).removeprefix(f"{path}: "))
     if not lacking:
-        draft = _correct_draft_by_data(draft, path, summary)
-        write_text(path, _with_checksum(draft.text()))
+        _correct_draft_by_data(draft, path, summary)
         return
     text = draft.text()
     for message in lacking:
@@ -159,7 +158,7 @@ def _places_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
     return out
 
 
-def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
+def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     tables: dict[Path, Table] = {}
     for _ in range(_MAX_DRAFT_CORRECTIONS):
         found = _inspect_described_log(load_description(path), str(path), dict(tables), summary)
@@ -168,7 +167,6 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
             break
         draft = draft.with_finding_corrected(finding)
         write_text(path, _with_checksum(draft.text()))
-    return draft
 
 
 def _inspect_described_log(
@@ -180,7 +178,7 @@ def _inspect_described_log(
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
         table = tables[stream.source].rows_with_any_number(stream.columns)
-        figures, more, rows = _inspect_stream(name, stream, table, description, source)
+        figures, more, rows = _inspect_stream(name, stream, table, source)
         summary["streams"][name] = figures
         findings += more
         bad.setdefault(stream.source, []).append(rows)
@@ -203,7 +201,7 @@ def _inspect_described_log(
 
 
 def _inspect_stream(
-    name: str, stream: Any, table: Table, description: Description, source: str
+    name: str, stream: Any, table: Table, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)

@@ -61,8 +61,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
     title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
     with plot_style():
         figure = Picture(figsize=(10, 7))
-        shaded = found.rejected & (not log.static)
-        _draw_channels(figure, log.t, curves, titles, shaded, log.static)
+        _draw_channels(figure, log.t, curves, titles, found.rejected & (not log.static), log.static)
         _add_legend_and_title(figure, title, log, result.delay_s)
     return figure
 

@@ -252,8 +252,7 @@ def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
     still = by_splines and not log.specific_force.any()
-    weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    return still or 5.0 < weight < 20.0
+    return still or 5.0 < np.median(np.linalg.norm(log.specific_force, axis=1)) < 20.0
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
@@ -449,8 +448,7 @@ def _read_and_eliminate_log(
         motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            rows = _rows_of_contact_free_start(log, causal_tare_s)
-            causal_offsets = untouched[rows].mean(axis=0)
+            causal_offsets = untouched[_rows_of_contact_free_start(log, causal_tare_s)].mean(axis=0)
         both = contact_and_scaled(causal_offsets, motion)
         options: dict[str, Any] = {"delay_s": aligned.delay_s, "mode": causal}
         late = compute_causal_wrench(*both, log.dt, cutoff_hz=cutoff_hz, **options)

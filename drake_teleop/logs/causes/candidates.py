@@ -232,8 +232,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     usual = min(best.residual_ratio, state.residual_ratio)
     by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * usual
     if by_residual:
-        low = (x for x in fits if x.residual_ratio < 2.0 * least)
-        best = max(low, key=lambda x: x.likelihood)
+        best = max((x for x in fits if x.residual_ratio < 2.0 * least), key=lambda x: x.likelihood)
     if best is fits[0]:
         return
     options = {"iterations": _TORQUE_FACTOR_ITERATIONS} if by_residual else {}

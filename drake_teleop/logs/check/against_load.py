@@ -114,12 +114,6 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-def min_unexplained_reduction_by_edit(fit: LoadFitQuality) -> float:
-    """Return the factor by which a correction must reduce the unexplained share of a fit."""
-    n = max(1.0, fit.independent_samples)
-    return max(MIN_REDUCTION_BY_EDIT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
-
-
 UNDETERMINED_UNEXPLAINED_SHARE = 0.9  # of the variance; above it a load is undetermined
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
@@ -192,7 +186,9 @@ def _edits_with_far_better_fit(
             negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid = given.max_unexplained_including_noise(VALID_UNEXPLAINED)
-    decisive = given.unexplained / min_unexplained_reduction_by_edit(given)
+    n = max(1.0, given.independent_samples)
+    least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
+    decisive = given.unexplained / max(MIN_REDUCTION_BY_EDIT, least_factor)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -333,8 +329,7 @@ def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     t, delays = np.array(found).T
     slope, late = np.polyfit(t, delays, 1)
     change = abs(slope) * span
-    deviation = float(np.std(delays - late - slope * t))
-    uneven = deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
+    uneven = np.std(delays - late - slope * t) > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
     if change < _MIN_DELAY_DRIFT_S or uneven or abs(slope) > 0.2:
         return None
     return float(late + slope * log.t[0]), float(slope)

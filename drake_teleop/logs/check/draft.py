@@ -143,8 +143,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
-    none = [_FILL_IN_TEXT] * 3
-    pair = {x: found.get(x, none) for x in ("force", "torque")}
+    pair = {x: found.get(x, [_FILL_IN_TEXT] * 3) for x in ("force", "torque")}
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
