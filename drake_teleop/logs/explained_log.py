@@ -251,31 +251,29 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 
 def explained_load(load: Identification, why: MisfitExplanation) -> Identification:
     """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
-    load = _load_with_causes_or_wider_intervals(load, why)
+    if why.causes or why.always_fitted:
+        load = _load_with_causes(load, why)
+    elif not why.explained and load.identifiable.any():
+        stated = np.sqrt(np.diag(load.covariance))
+        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
+        ratio = np.where(load.identifiable, ratio, 1.0)
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_WIDENING_STD_RATIO:
+            factors = np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
+            load = _less_certain_load(load, load.covariance * factors)
     if why.state.data.gravity_W is not None:
         return load
     extra = load_bias_by_alpha_noise(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
-    covariance = load.covariance + np.diag(extra**2)
+    return _less_certain_load(load, load.covariance + np.diag(extra**2))
+
+
+def _less_certain_load(load: Identification, covariance: Array) -> Identification:
     known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _load_with_causes_or_wider_intervals(
-    load: Identification, why: MisfitExplanation
-) -> Identification:
-    if not why.causes and not why.always_fitted:
-        if why.explained or not load.identifiable.any():
-            return load
-        stated = np.sqrt(np.diag(load.covariance))
-        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
-        ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_STD_RATIO:
-            return load
-        wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
-        known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)
-        return replace(load, covariance=wide, identifiable=known)
+def _load_with_causes(load: Identification, why: MisfitExplanation) -> Identification:
     identifiable = is_precise_enough(np.sqrt(np.diag(why.covariance)), why.theta[6:])
     no_load = bool(why.causes) and why.causes[0].name == "no load"
     if no_load or has_negative_mass(why.state):

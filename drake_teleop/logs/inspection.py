@@ -100,15 +100,14 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     summary["kind"] = "unknown"
     table = read_table(path)
-    header = not _are_column_names_numbers(list(table.columns))
+    header = not all(map(_is_number, table.columns))
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
 
-def _are_column_names_numbers(names: Sequence[str]) -> bool:
+def _is_number(name: str) -> bool:
     with suppress(ValueError):
-        for name in names:  # polars adds a suffix to repeated names
-            float(name.partition("_duplicated_")[0])
+        float(name.partition("_duplicated_")[0])  # polars adds this suffix to repeated names
         return True
     return False
 

@@ -119,7 +119,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     rows = np.arange(16)
     colours = [VERDICT_COLOURS[verdict] for verdict in result.verdicts]
     left, right = figure.subplots(1, 2, sharey=True)
-    left.set_yticks(rows, [_PARAMETER_SYMBOLS[i] for i in rows])
+    left.set_yticks(rows, _PARAMETER_SYMBOLS)
     left.invert_yaxis()
     shown = np.abs(theta[np.isfinite(deviations) & result.identifiable])
     limit = 1.25 * max(1.0, float(shown.max()) if len(shown) else 1.0)

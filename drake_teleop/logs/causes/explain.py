@@ -126,7 +126,10 @@ def _search_causes_from(
         ):
             winner = calmest
         if winner is None:
-            explained = _explain_contact_by_steps(state, rejected)
+            limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
+            contacts = (x.state for x in rejected if x.name == "contact")
+            calm = next((x for x in contacts if x.residual_ratio < limit), None)
+            explained = None if calm is None else changes.replace_contacts_by_steps(calm)
             if explained is None:
                 break
             state, delay_s = _apply_fitted_delay(explained, delay_s, with_delay)
@@ -173,13 +176,6 @@ def _candidate_with_much_smaller_residual(
     least = min([x.state.residual_ratio for x in small], default=0.0)
     near = [x for x in small if x.state.residual_ratio < 2.0 * least]
     return min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name), default=None)
-
-
-def _explain_contact_by_steps(state: FittedModel, found: list[Candidate]) -> FittedModel | None:
-    limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
-    contacts = (x.state for x in found if x.name == "contact")
-    calm = next((x for x in contacts if x.residual_ratio < limit), None)
-    return None if calm is None else changes.replace_contacts_by_steps(calm)
 
 
 def _is_misfit_reduced(candidate: Candidate, state: FittedModel) -> bool:

@@ -147,20 +147,17 @@ class Model:
         out[:, 3:] *= factor[:, None, None]
         for c in self.gain_channels:
             out[:, c] *= 1.0 + x[:, parts[f"gain {c}"]]
-        self._add_offsets_delay_and_drift(out, x)
-        return out
-
-    def _add_offsets_delay_and_drift(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
         out[:, :, instants.CONSTANT_COLUMN] += x[:, :6]
         out[:, channels, instants.WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _columns_of_step(i).start] += x[:, self.parameter_slices[f"step {i}"]]
+                out[:, :, _columns_of_step(i).start] += x[:, parts[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
-            if name in self.parameter_slices:
-                rows = x[:, self.parameter_slices[name]].reshape(-1, 6, degree)
+            if name in parts:
+                rows = x[:, parts[name]].reshape(-1, 6, degree)
                 out[:, :, TIME_POLYNOMIALS.start : TIME_POLYNOMIALS.start + degree] += rows
+        return out
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.parameter_slices

@@ -136,7 +136,9 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
     found |= _find_vectors_in_array_columns(table, plain)
-    _reinterpret_lone_torque_as_position(found, plain)
+    ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
+    if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
+        found["position"] = found.pop("torque")
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
@@ -260,12 +262,6 @@ def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
     return {}
 
 
-def _reinterpret_lone_torque_as_position(found: _Columns, plain: _NamesAndUnits) -> None:
-    ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
-    if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
-        found["position"] = found.pop("torque")
-
-
 def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
     groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in (7, 8)):
@@ -337,8 +333,11 @@ def _draft_quantity(
     group: dict[str, Any] = {"columns": list(columns)}
     if _FILL_IN_TEXT in columns:
         return group
-    if kind in ("force", "torque") and _are_raw_counts(table, columns[0]):
-        group["scale"] = _FILL_IN_TEXT
+    if kind in ("force", "torque"):
+        x = table.numbers_with_nan(columns[0], columns[0])
+        is_integer = (np.nan_to_num(x) % 1.0 == 0.0).all()
+        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT:
+            group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
         unit = _known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
@@ -353,12 +352,6 @@ def _draft_quantity(
         "position": ("m", "mm", 20),
     }.get(kind, ("rad", "deg", 15))
     return group | {"unit": other if np.nanmax(size) > limit else usual}
-
-
-def _are_raw_counts(table: Table, column: str) -> bool:
-    x = table.numbers_with_nan(column, column)
-    large = np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT
-    return bool(large and (np.nan_to_num(x) % 1.0 == 0.0).all())
 
 
 def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
@@ -397,7 +390,9 @@ def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, A
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
     if unit not in _ALLOWED_UNITS["time"]:
-        unit = _guess_time_unit(table, named[0])
+        step = float(np.nanmedian(np.abs(np.diff(table.single_column(named[0], named[0])))))
+        units = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6)
+        unit = next((unit for unit, scale in units if step * scale <= 0.3), "ns")
     return {"column": named[0], "unit": unit}
 
 
@@ -412,9 +407,3 @@ def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
         return bool((steps > 0.0).all() and even and not is_counter)
 
     return [name for name in plain if is_clock(name)]
-
-
-def _guess_time_unit(table: Table, column: str) -> str:
-    step = float(np.nanmedian(np.abs(np.diff(table.single_column(column, column)))))
-    units = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6)
-    return next((unit for unit, scale in units if step * scale <= 0.3), "ns")

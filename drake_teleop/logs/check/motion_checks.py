@@ -267,7 +267,6 @@ _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
-MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
 _TORQUE_UNIT_VALUES = [SI_VALUE_OF_UNIT[unit] for unit in ("N m", "N mm", "lbf in")]
 _WRONG_TORQUE_UNIT_RATIOS = (
@@ -359,12 +358,6 @@ def _fit_centred_signals(
     x = inverse @ ((A / size).T @ b)
     variance = float(np.sum((b - (A / size) @ x) ** 2)) / (target.shape[1] * max(1.0, independent))
     return x / size, np.sqrt(variance * np.diag(inverse)) / size
-
-
-def has_usable_poses(log: Log) -> bool:
-    """Return whether a log of motion has poses over at least 4 s, as splines require."""
-    duration_s = float(log.t[-1] - log.t[0])
-    return log.posed is not None and not log.static and duration_s >= MIN_POSES_DURATION_S
 
 
 def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
