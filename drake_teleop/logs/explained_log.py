@@ -16,12 +16,9 @@ from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import has_negative_mass
 from drake_teleop.logs.causes.cause import Finding
-from drake_teleop.logs.causes.explain import (
-    MisfitExplanation,
-    explain_misfit,
-    load_bias_by_alpha_noise,
-)
+from drake_teleop.logs.causes.explain import MisfitExplanation, explain_misfit
 from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
+from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
 from drake_teleop.logs.read.alignment import remove_delay
