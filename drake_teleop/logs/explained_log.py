@@ -296,7 +296,7 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Find
     """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
-        return (Finding(finding.name, finding.message), *kept)
+        return (finding, *kept)
     return why.causes
 
 

@@ -371,8 +371,7 @@ def _print_summary(summary: dict[str, Any]) -> None:
     if summary["topics"]:
         grid = Grid("topic", "type", "messages", "rate [Hz]")
         for name, topic in summary["topics"].items():
-            rate = f"{topic['rate_hz']:.4g}"
-            grid.add_row(name, topic["type"], str(topic["messages"]), rate)
+            grid.add_row(name, topic["type"], str(topic["messages"]), f"{topic['rate_hz']:.4g}")
         console.print(grid)
     if summary["draft"]:
         console.print(f"a draft description is in {escape(summary['draft'])}")

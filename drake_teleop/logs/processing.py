@@ -338,8 +338,9 @@ def eliminate_log(
     if causal_tare_s is not None:
         causal_tare_s = to_float("causal_tare_s", causal_tare_s)
     identification = load if isinstance(load, Identification) else Identification.load(load)
-    separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _checked_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
+    given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma}
+    given |= {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
+    scales = _checked_scales(given, eta, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -542,30 +543,24 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
 
 
 def _checked_scales(
-    sigma: float,
-    sigma_object: float | None,
-    gamma: float,
-    eta: float | None,
-    separate: dict[str, float | None],
-    split: bool,
+    given: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
-    given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_FORCE_SCALE:
             what = f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}"
             raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
-    if sigma_object is not None and not split:
+    sigma, kept, gamma, *separate = given.values()
+    if kept is not None and not has_gripper:
         what = "sigma_object requires a gripper"
         remedy = "give the gripper's identification.json as well, or use sigma"
         raise DrakeTeleopError(what, where="sigma_object", remedy=remedy)
-    kept = sigma if sigma_object is None else sigma_object
     if eta is not None:
-        others = [sigma_object, *separate.values()]
-        if sigma != 0 or gamma != 1 or any(other is not None for other in others):
+        if sigma != 0 or gamma != 1 or any(other is not None for other in (kept, *separate)):
             what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
             raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
         sigma, kept, gamma = compensation.scales_from_eta(eta)
-    return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
+    names = "sigma_gripper", "sigma_object", "gamma", "sigma_weight", "sigma_inertia"
+    return dict(zip(names, (sigma, sigma if kept is None else kept, gamma, *separate), strict=True))
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,6 @@ def is_plausible(state: FittedModel) -> bool:
 
 
 def max_cable_stiffness_n_m(state: FittedModel) -> float:
-    """Return the largest stiffness of a cable in any direction [N/m]."""
     K = state.parameters_of_extension("cable")[0][3:9][SYMMETRIC_MATRIX_INDICES]
     return float(np.abs(np.linalg.eigvalsh(K)).max())
 

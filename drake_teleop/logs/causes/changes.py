@@ -382,23 +382,18 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
 
 def shrink_contacts(state: FittedModel) -> FittedModel:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
-    dt = state.data.dt
-    shrunk = (_shrunk_contact_span(state, span) for span in state.contact_spans)
-    spans = tuple((a - dt, b + dt) for a, b in shrunk)
-    return FittedModel.fit_record(state.data, state.model, state.x, spans)
-
-
-def _shrunk_contact_span(state: FittedModel, span: tuple[float, float]) -> tuple[float, float]:
-    data = state.data
-    inside = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
+    data, spans = state.data, []
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
     usual = np.maximum(data.wrench_noise, state.rows.residual_rms(state.residual)).clip(1e-12)
-    large = (np.abs(y[inside] @ state.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
-    first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
-    if not len(first):
-        return span
-    start, stop = data.t[inside[[first[0], first[-1] + 1]]]
-    return float(start) - 0.5 * data.dt, float(stop) + 0.5 * data.dt
+    for start, stop in state.contact_spans:
+        inside = np.flatnonzero(data.used & is_in_time_spans(data, ((start, stop),)))
+        large = (np.abs(y[inside] @ state.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
+        first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
+        if len(first):
+            start = float(data.t[inside[first[0]]]) - 0.5 * data.dt
+            stop = float(data.t[inside[first[-1] + 1]]) + 0.5 * data.dt
+        spans.append((start - data.dt, stop + data.dt))
+    return FittedModel.fit_record(data, state.model, state.x, tuple(spans))
 
 
 def _median_residual_over_noise(state: FittedModel, span: tuple[float, float]) -> float:

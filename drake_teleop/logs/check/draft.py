@@ -168,8 +168,10 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
-    if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
-        draft = _streams_of_static_poses(draft)
+    without_time = _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time"))
+    if without_time and table.rows <= _MAX_STATIC_ROWS and pose and not _is_template(wrench):
+        kept = {name: value for name, value in wrench.items() if name != "time"}
+        draft = {"static": {**kept, "orientation": pose["orientation"]}}
     times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
     used |= times - {None}
     arrays = _names_of_array_columns(table)
@@ -186,14 +188,6 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return Draft(draft, head)
-
-
-def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
-    pose, wrench = draft.get("pose"), draft.get("wrench")
-    if pose is None or wrench is None or _is_template(wrench):
-        return draft
-    kept = {name: value for name, value in wrench.items() if name != "time"}
-    return {"static": {**kept, "orientation": pose["orientation"]}}
 
 
 def _split_name_and_unit(name: str) -> tuple[str, str]:

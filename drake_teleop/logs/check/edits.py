@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +62,10 @@ def correct_accelerometer_unit(
     description: Description, log: Log
 ) -> tuple[list[Finding], Description]:
     """Return a finding for an accelerometer in a wrong unit, and the corrected description."""
-    sensors: dict[str, Any] = {
-        f"{stream}.{name}": getattr(getattr(description, stream), name, None)
-        for stream in ("imu", "static")
-        for name in ("specific_force", "gravity")
-    }
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     ratio = median / float(np.linalg.norm(description.gravity_W))
-    for path, sensor in sensors.items():
+    for stream, name in product(("imu", "static"), ("specific_force", "gravity")):
+        path, sensor = f"{stream}.{name}", getattr(getattr(description, stream), name, None)
         if sensor is None:
             continue
         read = ratio / description.unit_in_si(sensor.unit)
