@@ -413,12 +413,12 @@ def _read_and_eliminate_log(
     def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    def contact_and_scaled(offsets: Array, motion: tuple[Array, Array, Array]) -> list[Array]:
+    def contact_and_scaled(
+        offsets: Array, motion: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array]:
         reading = log.wrench, offsets, *motion
-        return [
-            contact_wrench(*reading, phi),
-            compensation.scaled_wrench(*reading, *parts, **scales),
-        ]
+        scaled = compensation.scaled_wrench(*reading, *parts, **scales)
+        return contact_wrench(*reading, phi), scaled
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
