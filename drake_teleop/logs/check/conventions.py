@@ -222,10 +222,8 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     return [Finding("static poses", text)]
 
 
-_CHECKED_FIELDS_OF_STREAM = {
-    "wrench": ("force", "torque"),
-    "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
-}
+_WRENCH_FIELDS = ("force", "torque")
+_IMU_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration")
 _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 
 
@@ -236,7 +234,7 @@ def _dead_or_repeated_channel_findings(
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}
-    for field in _CHECKED_FIELDS_OF_STREAM[stream]:
+    for field in _WRENCH_FIELDS if stream == "wrench" else _IMU_FIELDS:
         quantity = getattr(described, field, None)
         if quantity is None:
             continue
