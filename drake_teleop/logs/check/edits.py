@@ -169,8 +169,7 @@ class LogData:
     """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
-        self._source = source
-        self.tables = tables
+        self._source, self.tables = source, tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
         for stream in description.streams.values():
