@@ -46,9 +46,9 @@ class UsedRows:
     @cached_property
     def _lagged_signals_of_edge_rows(self) -> Array:
         padded = np.pad(self.used, instants.MAX_NOISE_LAG)
-        near = sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).any(axis=1)
-        near[self.rows_with_predecessors] = False
-        at = np.flatnonzero(near)[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
+        near = np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).any(axis=1))
+        edge = np.setdiff1d(near, self.rows_with_predecessors)
+        at = edge[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
         y = np.vstack([self.y, np.zeros((2 * instants.MAX_NOISE_LAG, self.y.shape[1]))])
         return np.asarray(y[at])
 
