@@ -20,8 +20,8 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification, is_precise_enough, mark_undetermined
 from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_unit_or_frame_finding
+from drake_teleop.logs.causes.cause import Finding
+from drake_teleop.logs.check.motion_checks import pose_unit_or_frame_finding
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     PoseMotion,
@@ -39,28 +39,12 @@ _MAX_KNOWN_DELAY_STD_S, _EDGE_MARGIN_OVER_KNOT_SPACING = 0.005, 2.0
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9
+_MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies for splines
 # Fewest kept samples, and largest cut-off of the low-pass over their rate; kept samples per chunk,
 # and neighbours for smoothing.
 _MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
 _CHUNK_SAMPLES, _FILTER_NEIGHBOURS = 2**14, 2**8
 _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
-
-
-def fit_motion_to_known_load(
-    log: Log, delay: str | float, coefficients: Array, fallback_delay_s: float
-) -> tuple[PoseMotion, str] | None:
-    """Return the motion from poses that fits an identified load best, and the delay's source.
-
-    `coefficients` (6, 16) are the load's, Eq. (T73). The delay is `fallback_delay_s` if the record
-    does not determine it. Return None for a short log, static or no poses, or a contradicting IMU.
-    """
-    if log.posed is None or log.static:
-        return None
-    fit = partial(fit_motion_to_load, coefficients=coefficients)
-    with suppress(DrakeTeleopError):  # too short
-        found, source = _fit_with_fallback_delay(log, delay, fit, fallback_delay_s, "load")
-        return (found, source) if found.is_imu_consistent_with_poses else None
-    return None
 
 
 def _fit_with_fallback_delay(
@@ -86,8 +70,7 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
-    gravity = splines.gravity(t, gravity_W)
-    moved = moved.with_motion(*splines.motion(t, gravity_W), gravity=gravity)
+    moved = moved.with_motion(*splines.motion(t, gravity_W), gravity=splines.gravity(t, gravity_W))
     stamps, margin = splines.poses.t, _EDGE_MARGIN_OVER_KNOT_SPACING * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
@@ -146,12 +129,14 @@ def read_aligned_log(
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated
-    candidates = []
-    coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
-    with one_blas_thread():
-        found = fit_motion_to_known_load(log, delay, coefficients, fallback_delay_s)
-    if found is not None:
-        motion, source = found
+    candidates: list[AlignedLog] = []
+    motion = None
+    if log.posed is not None and not log.static:
+        coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
+        fit = partial(fit_motion_to_load, coefficients=coefficients)
+        with one_blas_thread(), suppress(DrakeTeleopError):  # too short
+            motion, source = _fit_with_fallback_delay(log, delay, fit, fallback_delay_s, "load")
+    if motion is not None and motion.is_imu_consistent_with_poses:
         moved, one_sided = use_spline_motion_and_flag_edges(log, motion)
         plain = alignment.remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
@@ -198,27 +183,30 @@ def replace_specific_force_by_acceleration(log: Log) -> Log:
 
 
 @dataclass(frozen=True)
-class LoadFitOfPosedLog:
-    """Load identified from a log with poses; `log` are the used samples, with spline motion.
+class LoadFitOfLog:
+    """Load identified from a log; `log` are the used samples, without the delay.
 
-    `delay_source` is "given", "estimated", or "undetermined" (0 was used).
+    `delay_source` is "static", "given", "estimated", or "undetermined" (0 was used). `motion` is
+    from splines, or None.
     """
 
     log: Log
     fit: BatchResult
+    delay_s: float
     delay_source: str
-    motion: PoseEstimate
+    motion: PoseEstimate | None = None
 
 
 def fit_load_to_posed_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
-) -> tuple[LoadFitOfPosedLog | None, tuple[Finding, ...]]:
+) -> tuple[LoadFitOfLog | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
 
     The load is None for a method without splines, a log without usable poses, or an IMU that
     contradicts the poses.
     """
-    if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
+    is_long = log.t[-1] - log.t[0] >= _MIN_POSES_DURATION_S
+    if log.posed is None or log.static or method not in METHODS_WITH_SPLINES or not is_long:
         return None, ()
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)
     found, source = _fit_with_fallback_delay(log, delay, estimate, 0.0, "undetermined")
@@ -238,7 +226,8 @@ def fit_load_to_posed_log(
     if finding is not None:
         text = f"{finding.message}{note_that_table_needs_description(log.source)}"
         fit, finding = replace(fit, note=""), replace(finding, message=text)
-    return LoadFitOfPosedLog(shown, fit, source, found), () if finding is None else (finding,)
+    fitted = LoadFitOfLog(shown, fit, found.delay_s, source, found)
+    return fitted, () if finding is None else (finding,)
 
 
 def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:

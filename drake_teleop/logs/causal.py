@@ -101,8 +101,7 @@ def compute_causal_wrench(
 
     def filter_and_delay(wrench: Array) -> Array:
         filtered = causal_low_pass(wrench, dt, cutoff_hz, ahead)
-        rows = np.maximum(np.arange(len(filtered)) - wait, 0)
-        return filtered[rows]
+        return filtered[np.maximum(np.arange(len(filtered)) - wait, 0)]
 
     contact, scaled = filter_and_delay(contact), filter_and_delay(scaled)
     return CausalContactAndScaledWrench(mode, lag, contact, scaled)

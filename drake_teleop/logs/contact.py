@@ -151,9 +151,12 @@ def _fit_floor_and_threshold_to_log(
     quiet = _find_quiet_samples(rows.contact, noise_floor(rows.contact))
     if (quiet & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
         quiet = selected = np.ones(n, bool)
+    block_of_row = np.minimum(np.arange(n) // block, n // block - 1)
     for _ in range(_QUIET_HALF_ITERATIONS if n >= _MIN_FLOOR_BLOCKS * block else 0):
         floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
-        half = _quieter_half_of_blocks(detection.statistics_of_log(floor, *rows)[:, 0], block)
+        level = detection.statistics_of_log(floor, *rows)[:, 0]
+        power = np.bincount(block_of_row, level**2) / np.bincount(block_of_row)
+        half = (power <= np.median(power))[block_of_row]
         if (half & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
             break
         quiet = half
@@ -173,12 +176,6 @@ def _fit_floor_and_threshold_to_log(
             break
         quiet = without_contact
     return floor, _FINAL_THRESHOLD_OVER_EXPECTED_MAX * reached, rows.select_rows(quiet)
-
-
-def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
-    of = np.minimum(np.arange(len(level)) // block, len(level) // block - 1)
-    power = np.bincount(of, level**2) / np.bincount(of)
-    return np.asarray((power <= np.median(power))[of])
 
 
 def _expected_maximum_in_free_motion(values: Array, block: int, samples: int) -> float:

@@ -15,11 +15,10 @@ from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import has_negative_mass
-from drake_teleop.logs.causes.cause import Cause
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.causes.explain import MisfitExplanation, explain_misfit
 from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
-from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
 from drake_teleop.logs.read.alignment import remove_delay
@@ -45,23 +44,30 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 }
 
 
-def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
+def add_description_lines(
+    causes: Sequence[Finding], log: Log, *, by_pose: bool
+) -> tuple[Finding, ...]:
     """Add the corrected lines of the log description to the messages of causes."""
-    _, texts, corrected = _corrected_fields_and_texts_by_cause(causes, log, by_pose)
-    return tuple(
-        replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
-        for cause, text, fields in zip(causes, texts, corrected, strict=True)
-    )
+    fields, touched = _corrected_and_touched_fields(causes, log, by_pose)
+    note, out = note_that_table_needs_description(log.source), []
+    for cause, names in zip(causes, touched, strict=True):
+        lines = {name: _yaml_value(name, fields[name]) for name in names}
+        text = f"set {' and '.join(f'{k}: {x}' for k, x in lines.items())}{note}"
+        text = text if lines else _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
+        message = f"{cause.message}; {text}" if text else cause.message
+        corrected = {name: parse_yaml(line, name) for name, line in lines.items()}
+        out.append(replace(cause, message=message, fields=corrected))
+    return tuple(out)
 
 
-def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
+def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
     """Return a message on wrong units for a mass of at least 1000 kg.
 
     None for a smaller one, or for a log without a description of its wrench.
     """
     if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected_fields_and_texts_by_cause(causes, log, by_pose=True)[0]
+    fields = _corrected_and_touched_fields(causes, log, by_pose=True)[0]
     ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
     text = _yaml_value("wrench.torque.scale", ratio)
     return (
@@ -74,9 +80,9 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     )
 
 
-def _corrected_fields_and_texts_by_cause(
-    causes: Sequence[Cause], log: Log, by_pose: bool
-) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
+def _corrected_and_touched_fields(
+    causes: Sequence[Finding], log: Log, by_pose: bool
+) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
     column = _column_of_each_axis(fields["wrench.frame"])
@@ -85,13 +91,7 @@ def _corrected_fields_and_texts_by_cause(
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         _correct_fields_by_cause(fields, cause.name, cause.values, column)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
-    texts, corrected, note = [], [], note_that_table_needs_description(log.source)
-    for cause, names in zip(causes, touched, strict=True):
-        corrected.append({k: parse_yaml(_yaml_value(k, fields[k]), k) for k in names})
-        lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
-        otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{note}" if lines else otherwise)
-    return fields, texts, corrected
+    return fields, touched
 
 
 def _correctable_fields(description: Description, by_pose: bool) -> DescriptionFields:
@@ -248,33 +248,30 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 
 def explained_load(load: Identification, why: MisfitExplanation) -> Identification:
     """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
-    load = _load_with_causes_or_wider_intervals(load, why)
+    if why.causes or why.always_fitted:
+        load = _load_with_causes(load, why)
+    elif not why.explained and load.identifiable.any():
+        stated = np.sqrt(np.diag(load.covariance))
+        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
+        ratio = np.where(load.identifiable, ratio, 1.0)
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_WIDENING_STD_RATIO:
+            factors = np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
+            load = _less_certain_load(load, load.covariance * factors)
     if why.state.data.gravity_W is not None:
         return load
     extra = load_bias_by_alpha_noise(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
-    covariance = load.covariance + np.diag(extra**2)
+    return _less_certain_load(load, load.covariance + np.diag(extra**2))
+
+
+def _less_certain_load(load: Identification, covariance: Array) -> Identification:
     known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _load_with_causes_or_wider_intervals(
-    load: Identification, why: MisfitExplanation
-) -> Identification:
-    if not why.causes and not why.always_fitted:
-        if why.explained or not load.identifiable.any():
-            return load
-        stated = np.sqrt(np.diag(load.covariance))
-        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
-        ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_STD_RATIO:
-            return load
-        wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
-        known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)
-        return replace(load, covariance=wide, identifiable=known)
-    deviations = np.sqrt(np.diag(why.covariance))
-    identifiable = is_precise_enough(deviations, why.theta[6:])
+def _load_with_causes(load: Identification, why: MisfitExplanation) -> Identification:
+    identifiable = is_precise_enough(np.sqrt(np.diag(why.covariance)), why.theta[6:])
     no_load = bool(why.causes) and why.causes[0].name == "no load"
     if no_load or has_negative_mass(why.state):
         identifiable = np.repeat([True, False], [6, 10])
@@ -295,11 +292,11 @@ def _load_with_causes_or_wider_intervals(
     )
 
 
-def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Cause, ...]:
+def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
     """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
-        return (Cause(finding.name, finding.message), *kept)
+        return (finding, *kept)
     return why.causes
 
 
@@ -313,10 +310,10 @@ def unexplained_finding(why: MisfitExplanation) -> Finding:
 
 
 def removed_weight_note(why: MisfitExplanation) -> str:
-    if "weight" not in why.always_fitted or why.removed_weight is None:
+    if "weight" not in why.always_fitted:
         return ""
-    mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
-    deviation = float(np.sqrt(why.state.parameters_of_extension("weight")[1][0, 0]))
+    (mass, *moment), covariance = why.state.parameters_of_extension("weight")
+    deviation = float(np.sqrt(covariance[0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (
         f"the weight that is removed from the wrench is that of {mass:.4g} kg"

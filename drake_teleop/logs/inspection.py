@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
 from drake_teleop.common.numeric import Array, find_runs_of_true
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.conventions import check_conventions
-from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise_deviations
@@ -100,15 +100,14 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     summary["kind"] = "unknown"
     table = read_table(path)
-    header = not _are_column_names_numbers(list(table.columns))
+    header = not all(map(_is_number, table.columns))
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
 
-def _are_column_names_numbers(names: Sequence[str]) -> bool:
+def _is_number(name: str) -> bool:
     with suppress(ValueError):
-        for name in names:  # polars adds a suffix to repeated names
-            float(name.partition("_duplicated_")[0])
+        float(name.partition("_duplicated_")[0])  # polars adds this suffix to repeated names
         return True
     return False
 
@@ -139,8 +138,7 @@ def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) 
     except DrakeTeleopError as error:
         lacking.append(str(error).removeprefix(f"{path}: "))
     if not lacking:
-        draft = _correct_draft_by_data(draft, path, summary)
-        write_text(path, _with_checksum(draft.text()))
+        _correct_draft_by_data(draft, path, summary)
         return
     text = draft.text()
     for message in lacking:
@@ -159,7 +157,7 @@ def _places_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
     return out
 
 
-def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
+def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     tables: dict[Path, Table] = {}
     for _ in range(_MAX_DRAFT_CORRECTIONS):
         found = _inspect_described_log(load_description(path), str(path), dict(tables), summary)
@@ -168,7 +166,6 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
             break
         draft = draft.with_finding_corrected(finding)
         write_text(path, _with_checksum(draft.text()))
-    return draft
 
 
 def _inspect_described_log(
@@ -180,7 +177,7 @@ def _inspect_described_log(
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
         table = tables[stream.source].rows_with_any_number(stream.columns)
-        figures, more, rows = _inspect_stream(name, stream, table, description, source)
+        figures, more, rows = _inspect_stream(name, stream, table, source)
         summary["streams"][name] = figures
         findings += more
         bad.setdefault(stream.source, []).append(rows)
@@ -203,7 +200,7 @@ def _inspect_described_log(
 
 
 def _inspect_stream(
-    name: str, stream: Any, table: Table, description: Description, source: str
+    name: str, stream: Any, table: Table, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)
@@ -374,8 +371,7 @@ def _print_summary(summary: dict[str, Any]) -> None:
     if summary["topics"]:
         grid = Grid("topic", "type", "messages", "rate [Hz]")
         for name, topic in summary["topics"].items():
-            rate = f"{topic['rate_hz']:.4g}"
-            grid.add_row(name, topic["type"], str(topic["messages"]), rate)
+            grid.add_row(name, topic["type"], str(topic["messages"]), f"{topic['rate_hz']:.4g}")
         console.print(grid)
     if summary["draft"]:
         console.print(f"a draft description is in {escape(summary['draft'])}")

@@ -44,29 +44,25 @@ VERDICT_WORDS = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
 _MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
 _MEASURED_COLOUR = "#A3AAB5"
+_Curves = list[tuple[str, Array, str]]  # name, values and colour
 
 
 def draw_fit(found: IdentifiedLog) -> Figure:
     """Draw measured wrench, load's wrench and residual without offsets; shade rejected samples."""
+    log, result = found.log, found.identification
+    curves = [
+        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
+        (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
+        ("residual", log.wrench - found.predicted, VERMILION),
+    ]
+    rms = zip(_CHANNEL_SYMBOLS, result.residual_rms, ["N"] * 3 + ["N m"] * 3, strict=True)
+    titles = [f"{symbol}: residual {x:.3g} {unit} rms" for symbol, x, unit in rms]
+    com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
+    title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
     with plot_style():
         figure = Picture(figsize=(10, 7))
-        log, result = found.log, found.identification
-        curves = [
-            ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
-            (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
-            ("residual", log.wrench - found.predicted, VERMILION),
-        ]
-        rms = np.asarray(result.residual_rms)
-        com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
-        title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
-        axes = _channel_axes(figure)
-        for i, axis in enumerate(axes):
-            _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
-            unit = "N" if i < 3 else "N m"
-            axis.set_title(f"{_CHANNEL_SYMBOLS[i]}: residual {rms[i]:.3g} {unit} rms")
-            if not log.static:
-                shade_contact(axis, log.t, found.rejected)
-        _add_labels_and_title(figure, axes, title, log, result.delay_s)
+        _draw_channels(figure, log.t, curves, titles, found.rejected & (not log.static), log.static)
+        _add_legend_and_title(figure, title, log, result.delay_s)
     return figure
 
 
@@ -83,15 +79,12 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
         spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
         left, right = spectra.subplots(1, 2)
         for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
-            symbols, colours = _CHANNEL_SYMBOLS[columns], (BLUE, VERMILION, GREEN)
-            for name, colour, values in zip(symbols, colours, shown[:, columns].T, strict=True):
-                if log.static:
-                    axis.plot(rate, values, "o", color=colour, label=name)
-                else:
-                    axis.loglog(rate, values, color=colour, label=name)
+            axis.set_prop_cycle(color=(BLUE, VERMILION, GREEN))
             if log.static:
+                axis.plot(rate, shown[:, columns], "o", label=_CHANNEL_SYMBOLS[columns])
                 axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
             else:
+                axis.loglog(rate, shown[:, columns], label=_CHANNEL_SYMBOLS[columns])
                 axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
                 # Frequencies above the cut-off do not show sensor noise.
                 top = axis.get_ylim()[1]
@@ -126,7 +119,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     rows = np.arange(16)
     colours = [VERDICT_COLOURS[verdict] for verdict in result.verdicts]
     left, right = figure.subplots(1, 2, sharey=True)
-    left.set_yticks(rows, [_PARAMETER_SYMBOLS[i] for i in rows])
+    left.set_yticks(rows, _PARAMETER_SYMBOLS)
     left.invert_yaxis()
     shown = np.abs(theta[np.isfinite(deviations) & result.identifiable])
     limit = 1.25 * max(1.0, float(shown.max()) if len(shown) else 1.0)
@@ -158,8 +151,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
 def draw_elimination(found: EliminatedLog) -> Figure:
     """Draw force magnitude and the six channels of each wrench; shade contacts."""
     curves = [("measured, offsets removed", found.measured, _MEASURED_COLOUR)]
-    if found.gravity_only is not None:
-        curves.append(("static weight removed", found.gravity_only, ORANGE))
+    curves += _weightless_curve(found)
     if found.causal is not None:
         curves.append((f"contact, causal ({found.causal.mode})", found.causal.contact, PURPLE))
     curves.append(("contact wrench", found.contact, BLUE))
@@ -180,13 +172,14 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         magnitude.set_title(title, fontsize=8.5)
         magnitude.set_ylabel("force [N]")
         shade_contact(magnitude, t, touched)
-        axes = _channel_axes(below)
-        for i, axis in enumerate(axes):
-            _draw_curves(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
-            axis.set_title(_CHANNEL_SYMBOLS[i])
-            shade_contact(axis, t, touched)
-        _add_labels_and_title(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
+        _draw_channels(below, t, curves, _CHANNEL_SYMBOLS, touched, static)
+        _add_legend_and_title(figure, Path(found.log.source).name, found.log, found.delay_s)
     return figure
+
+
+def _weightless_curve(found: EliminatedLog) -> _Curves:
+    weightless = found.gravity_only
+    return [] if weightless is None else [("static weight removed", weightless, ORANGE)]
 
 
 def draw_detection(found: DetectedLog) -> Any:
@@ -197,22 +190,20 @@ def draw_detection(found: DetectedLog) -> Any:
     with plot_style():
         figure = Picture(figsize=(10, 6))
         top, below = figure.subplots(2, 1, sharex=True)
-        raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[inner, :3], axis=1)
-        top.plot(t, raw, color=_MEASURED_COLOUR, label="measured, tared at the start")
-        if eliminated.gravity_only is not None:
-            weightless = np.linalg.norm(eliminated.gravity_only[inner, :3], axis=1)
-            top.plot(t, weightless, color=ORANGE, label="static weight removed")
-        contact = np.linalg.norm(eliminated.contact[inner, :3], axis=1)
-        top.plot(t, contact, color=BLUE, label="contact")
+        raw = eliminated.measured - eliminated.measured[0]
+        for name, wrench, colour in (
+            ("measured, tared at the start", raw, _MEASURED_COLOUR),
+            *_weightless_curve(eliminated),
+            ("contact", eliminated.contact, BLUE),
+        ):
+            top.plot(t, np.linalg.norm(wrench[inner, :3], axis=1), color=colour, label=name)
         top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
         top.set_yscale("symlog", linthresh=1.0)
         top.set_ylim(bottom=0.0)
-        top.set_ylabel("$|F|$ [N]")
-        top.set_title("dotted: the same threshold for all motions")
+        top.set(ylabel="$|F|$ [N]", title="dotted: the same threshold for all motions")
         below.plot(t, found.statistics[inner, STATISTIC_NAMES.index(found.statistic)], color=BLUE)
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
-        below.set_ylabel(f"{found.statistic} [standard deviations]")
-        below.set_xlabel("time [s]")
+        below.set(xlabel="time [s]", ylabel=f"{found.statistic} [standard deviations]")
         share = 100 * found.is_above_threshold.mean()
         below.set_title(f"above the threshold {share:.2g} % of the time")
         for axis in (top, below):
@@ -222,20 +213,25 @@ def draw_detection(found: DetectedLog) -> Any:
     return figure
 
 
-def _rms_text(norms: Sequence[tuple[str, Array, str]]) -> str:
+def _rms_text(norms: _Curves) -> str:
     return ", ".join(f"{name} {np.sqrt(np.mean(values**2)):.3g}" for name, values, _ in norms)
 
 
-def _channel_axes(figure: Any) -> list[Axes]:
+def _draw_channels(
+    figure: Any, t: Array, curves: _Curves, titles: Sequence[str], shaded: Any, static: bool
+) -> None:
     grid = figure.subplots(3, 2, sharex=True, sharey="col")
     grid[1, 0].set_ylabel("force [N]")
     grid[1, 1].set_ylabel("torque [N m]")
-    return list(grid.T.ravel())
+    for i, (axis, title) in enumerate(zip(grid.T.ravel(), titles, strict=True)):
+        _draw_curves(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
+        axis.set_title(title)
+        shade_contact(axis, t, shaded)
+    for bottom in grid[2]:
+        bottom.set_xlabel("pose" if static else "time [s]")
 
 
-def _draw_curves(
-    axes: Axes, t: Array, curves: Sequence[tuple[str, Array, str]], static: bool
-) -> None:
+def _draw_curves(axes: Axes, t: Array, curves: _Curves, static: bool) -> None:
     # More points than pixels only make the drawing slow.
     every = max(1, len(t) // _MAX_CURVE_POINTS)
     for order, (name, values, colour) in enumerate(curves):
@@ -247,13 +243,9 @@ def _draw_curves(
             axes.plot(t[::every], values[::every], color=colour, linewidth=width, label=name)
 
 
-def _add_labels_and_title(
-    figure: Any, axes: Sequence[Axes], title: str, log: Log, delay_s: float
-) -> None:
-    for bottom in (axes[2], axes[5]):
-        bottom.set_xlabel("pose" if log.static else "time [s]")
+def _add_legend_and_title(figure: Any, title: str, log: Log, delay_s: float) -> None:
     if not log.static:
         title += f", motion {1e3 * delay_s:.1f} ms behind the wrench"
-    handles, labels = axes[0].get_legend_handles_labels()
+    handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)

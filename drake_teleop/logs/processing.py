@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread, to_float
 from drake_teleop.load import compensation
-from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, BatchResult, identify_batch
+from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales, statistic_index
@@ -24,11 +24,12 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import explained_log
 from drake_teleop.logs.aligned_log import (
     METHODS_WITH_SPLINES,
+    LoadFitOfLog,
     fit_load_to_posed_log,
     read_aligned_log,
 )
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
-from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Cause, RecordPartWithLoad
+from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Finding, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     ConventionCheckResult,
@@ -36,7 +37,7 @@ from drake_teleop.logs.check.conventions import (
     findings_if_load_is_suspicious,
     motion_findings,
 )
-from drake_teleop.logs.check.corrections import FINDINGS_CAUSED_BY_MISFIT, Finding
+from drake_teleop.logs.check.edits import FINDINGS_CAUSED_BY_MISFIT
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
@@ -87,7 +88,7 @@ class IdentifiedLog:
     rejected: NDArray[np.bool_]
     base_parameters: BaseParameters
     findings: tuple[Finding, ...] = ()
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[Finding, ...] = ()
     loads: tuple[RecordPartWithLoad, ...] = ()
     delay_std_s: float = float("nan")
 
@@ -168,47 +169,40 @@ def identify_log(
     _check_log_arguments(path, cutoff_hz)
     check = partial(check_conventions_of_file, Path(path)) if checks is None else lambda: checks
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
-    posed, other = fit_load_to_posed_log(log, method, cutoff_hz, delay)
-    if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
+    fitted, other = fit_load_to_posed_log(log, method, cutoff_hz, delay)
+    if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
-    raw = log
-    motion = None if posed is None else posed.motion
-    if posed is not None:
-        log, fit, delay_s, source = posed.log, posed.fit, posed.motion.delay_s, posed.delay_source
-    else:
-        log, fit, delay_s, source = _fit_load_to_motion(raw, method, cutoff_hz, delay)
-    possible = _is_explanation_possible(raw, posed is not None)
+    raw, fitted = log, fitted or _fit_load_to_motion(log, method, cutoff_hz, delay)
+    motion, delay_s, source = fitted.motion, fitted.delay_s, fitted.delay_source
+    possible = _is_explanation_possible(raw, motion is not None)
     why = explained_log.explain_log(raw, delay_s, motion) if possible else None
-    names = {x.name for x in why.causes} if why is not None else set()
+    names = {cause.name for cause in why.causes} if why is not None else set()
     if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
-    is_delay_disturbed = why is not None and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S
-    if why is not None and why.causes and source == "estimated" and is_delay_disturbed:
-        if posed is None:
-            log, fit = _fit_load_to_motion(raw, method, cutoff_hz, delay_s + why.delay_s)[:2]
-        else:
-            posed, other = fit_load_to_posed_log(raw, method, cutoff_hz, delay_s + why.delay_s)
-            log, fit = (log, fit) if posed is None else (posed.log, posed.fit)
-    result = fit.identification
-    causes: tuple[Cause, ...] = ()
+    more = 0.0 if why is None or not why.causes or source != "estimated" else why.delay_s
+    if abs(more) > _MIN_CORRECTED_DELAY_S and motion is None:
+        fitted = _fit_load_to_motion(raw, method, cutoff_hz, delay_s + more)
+    elif abs(more) > _MIN_CORRECTED_DELAY_S:
+        again, other = fit_load_to_posed_log(raw, method, cutoff_hz, delay_s + more)
+        fitted = again or fitted
+    log, result = fitted.log, fitted.fit.identification
+    causes: tuple[Finding, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
         errors = motion_findings(check)
     if errors:
         why, result = None, result.with_unidentified_load()
+    note = fitted.fit.note
     if why is not None:
         result = explained_log.explained_load(result, why)
         causes = explained_log.replace_frame_causes(why, other[0]) if other else why.causes
-    note = fit.note if not causes or (why is not None and why.has_several_gains) else ""
-    if raw.estimated and why is not None:
-        note = explained_log.removed_weight_note(why)
+        note = "" if causes and not why.has_several_gains else note
+        note = explained_log.removed_weight_note(why) if raw.estimated else note
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
-    known_delay = None if source == "undetermined" else delay_s
-    findings = _findings_of_causes(causes)
-    if errors:
-        findings = errors
-    elif not causes and not raw.estimated:
+    findings = errors or causes
+    if not findings and not raw.estimated:
+        known_delay = None if source == "undetermined" else delay_s
         findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
         findings = findings or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
@@ -219,8 +213,9 @@ def identify_log(
     if any(finding.name == "payload" for finding in findings):
         result = result.with_unidentified_load()
     return IdentifiedLog(
-        *(log, result, predicted, source, fit.rejected, base_parameters(fit.equations)),
-        *(findings, causes, () if why is None else why.loads),
+        *(log, result, predicted, source, fitted.fit.rejected),
+        *(base_parameters(fitted.fit.equations), findings, causes),
+        () if why is None else why.loads,
         delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
 
@@ -234,7 +229,7 @@ def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
 
 def _fit_load_to_motion(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
-) -> tuple[Log, BatchResult, float, str]:
+) -> LoadFitOfLog:
     delay_s, source = choose_delay(log, cutoff_hz, delay)
     log = remove_delay(log, delay_s)
     log = low_pass_log(log, cutoff_hz).select_rows(is_far_from_gaps(log, cutoff_hz))
@@ -247,11 +242,7 @@ def _fit_load_to_motion(
         delay_s=delay_s,
         gain_std=log.gain_std,
     )
-    return log, fit, delay_s, source
-
-
-def _findings_of_causes(causes: tuple[Cause, ...]) -> tuple[Finding, ...]:
-    return tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
+    return LoadFitOfLog(log, fit, delay_s, source)
 
 
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
@@ -261,8 +252,7 @@ def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
     still = by_splines and not log.specific_force.any()
-    weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    return still or 5.0 < weight < 20.0
+    return still or 5.0 < np.median(np.linalg.norm(log.specific_force, axis=1)) < 20.0
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
@@ -280,7 +270,7 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
         delay = own_delay if np.isfinite(deviation) else delay
-        return replace(checks, findings=_findings_of_causes(identified.causes), delay_s=delay)
+        return replace(checks, findings=identified.causes, delay_s=delay)
     if all(finding.name == "lag" for finding in findings):
         findings = (*findings, *identified.findings)
     description = identified.log.described
@@ -348,8 +338,9 @@ def eliminate_log(
     if causal_tare_s is not None:
         causal_tare_s = to_float("causal_tare_s", causal_tare_s)
     identification = load if isinstance(load, Identification) else Identification.load(load)
-    separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _checked_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
+    given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma}
+    given |= {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
+    scales = _checked_scales(given, eta, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -362,16 +353,16 @@ def eliminate_log(
         what = "a contact-free span excludes the load's offsets (--offsets load, tare=False)"
         raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
     found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
-    free_motion = None if free is None else _read_and_eliminate_log(free, *common)
-    if free_motion is not None and (found.log.static or free_motion.log.static):
-        raise _no_contact_in_static_log_error(free_motion if free_motion.log.static else found)
+    reference = None
+    if free is not None:
+        free_motion = _read_and_eliminate_log(free, *common)
+        _require_motion(free_motion)
+        _require_motion(found)
+        free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
+        reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
     if found.log.static:
         return found
     samples = samples_for_detector(found.log, found.contact, cutoff_hz)
-    reference = None
-    if free_motion is not None:
-        free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
-        reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
     covariance = limit_covariance_to_scales(found.phi, identification.covariance, tared=tare)
     detection = detect_contact(
         *(samples, found.log.dt, cutoff_hz, covariance, identification.residual_rms),
@@ -379,15 +370,16 @@ def eliminate_log(
         free=reference,
         statistic=statistic,
     )
-    if free_motion is not None and tare and detection is not None:
+    if free is not None and tare and detection is not None:
         notes = note_on_drift_or_much_contact(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
 
-def _no_contact_in_static_log_error(found: EliminatedLog) -> DrakeTeleopError:
-    what = "contains only poses at rest (`static`), in which no contact can be detected"
-    return DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
+def _require_motion(found: EliminatedLog) -> None:
+    if found.log.static:
+        what = "contains only poses at rest (`static`), in which no contact can be detected"
+        raise DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
 
 
 def _read_and_eliminate_log(
@@ -409,17 +401,24 @@ def _read_and_eliminate_log(
     phi = phi_with_inertia_replaced(identification)[0]
     removed, late_s = identification.weight_removed, identification.delay_s
     aligned = read_aligned_log(path, phi, late_s, cutoff_hz, delay, causal is not None, removed)
-    log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
+    log = aligned.log
     if log.static and causal is not None:
         what = "poses at rest have no times for a causal filter"
         raise DrakeTeleopError(what, where="causal", remedy="leave it out")
     known = is_far_from_gaps(log, cutoff_hz)
-    edge = aligned.edge[known]
+    shown, edge = log.select_rows(known), aligned.edge[known]
+    parts = phi_gripper, phi - phi_gripper
+    scales = scales | {"gravity": log.gravity}
 
     def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    shown = log.select_rows(known)
+    def contact_and_scaled(
+        offsets: Array, motion: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array]:
+        reading = log.wrench, offsets, *motion
+        scaled = compensation.scaled_wrench(*reading, *parts, **scales)
+        return contact_wrench(*reading, phi), scaled
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
@@ -428,10 +427,9 @@ def _read_and_eliminate_log(
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
     offsets, fraction = choose_offsets(low_pass_wrench(residual))
-    motion = log.motion
     gravity_only = None
     removed = removed or "weight" in log.estimated
-    sigmas = {name: value for name, value in scales.items() if name != "gamma"}
+    sigmas = {name: scales[name] for name in scales if name not in ("gamma", "gravity")}
     weights, inertias = compensation.weight_scales_and_inertia_scales(**sigmas)
     if weights != inertias and removed:
         raise weight_scale_without_effect_error(log.source)
@@ -444,26 +442,19 @@ def _read_and_eliminate_log(
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
         weightless = low_pass_wrench(weightless)
         gravity_only = weightless - choose_offsets(weightless)[0]
-    parts = phi_gripper, phi - phi_gripper
-    scales = scales | {"gravity": log.gravity}
-    scaled = compensation.scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
+    contact, scaled = map(low_pass_wrench, contact_and_scaled(offsets, log.motion))
     causal_wrench = None
     if causal is not None and aligned.log_with_differentiated_motion is not None:
         causal_offsets = identification.offsets
         motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            rows = _rows_of_contact_free_start(log, causal_tare_s)
-            causal_offsets = untouched[rows].mean(axis=0)
-        both = (
-            contact_wrench(log.wrench, causal_offsets, *motion, phi),
-            compensation.scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
-        )
-        options: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay_s": delay_s, "mode": causal}
-        late = compute_causal_wrench(*both, log.dt, **options)
+            causal_offsets = untouched[_rows_of_contact_free_start(log, causal_tare_s)].mean(axis=0)
+        both = contact_and_scaled(causal_offsets, motion)
+        options: dict[str, Any] = {"delay_s": aligned.delay_s, "mode": causal}
+        late = compute_causal_wrench(*both, log.dt, cutoff_hz=cutoff_hz, **options)
         inner: dict[str, Any] = {"contact": late.contact[known], "scaled": late.scaled[known]}
         causal_wrench = replace(late, offsets=causal_offsets, **inner)
-    contact = low_pass_wrench(contact_wrench(log.wrench, offsets, *log.motion, phi))
     measured = log.wrench - offsets
     findings = _findings_if_contact_is_large(Path(path), measured, contact, identification)
     notes = (*log.notes, *notes_on_undetermined_load(identification))
@@ -474,12 +465,12 @@ def _read_and_eliminate_log(
         phi=phi,
         offsets=offsets,
         tare_fraction=fraction,
-        delay_s=delay_s,
-        delay_source=source,
+        delay_s=aligned.delay_s,
+        delay_source=aligned.delay_source,
         measured=low_pass_wrench(measured),
         non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
         contact=contact,
-        scaled=low_pass_wrench(scaled),
+        scaled=scaled,
         gravity_only=gravity_only,
         noise_floor=noise_floor(contact[~edge]),
         causal=causal_wrench,
@@ -492,12 +483,12 @@ def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
         found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
-        what = (
-            f"the span from {start_s:g} to {stop_s:g} s has {found} ({_MIN_TARE_SAMPLES} required)"
+        raise DrakeTeleopError(
+            f"the span from {start_s:g} to {stop_s:g} s has {found} ({_MIN_TARE_SAMPLES} required)",
+            where="untouched",
+            remedy="give a longer span without contact, in seconds after the first sample; the"
+            f" record has {log.t[-1] - log.t[0]:.4g} s",
         )
-        remedy = "give a longer span without contact, in seconds after the first sample; the record"
-        remedy += f" has {log.t[-1] - log.t[0]:.4g} s"
-        raise DrakeTeleopError(what, where="untouched", remedy=remedy)
     return rows
 
 
@@ -552,30 +543,24 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
 
 
 def _checked_scales(
-    sigma: float,
-    sigma_object: float | None,
-    gamma: float,
-    eta: float | None,
-    separate: dict[str, float | None],
-    split: bool,
+    given: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
-    given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_FORCE_SCALE:
             what = f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}"
             raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
-    if sigma_object is not None and not split:
+    sigma, kept, gamma, *separate = given.values()
+    if kept is not None and not has_gripper:
         what = "sigma_object requires a gripper"
         remedy = "give the gripper's identification.json as well, or use sigma"
         raise DrakeTeleopError(what, where="sigma_object", remedy=remedy)
-    kept = sigma if sigma_object is None else sigma_object
     if eta is not None:
-        others = [sigma_object, *separate.values()]
-        if sigma != 0 or gamma != 1 or any(other is not None for other in others):
+        if sigma != 0 or gamma != 1 or any(other is not None for other in (kept, *separate)):
             what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
             raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
         sigma, kept, gamma = compensation.scales_from_eta(eta)
-    return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
+    names = "sigma_gripper", "sigma_object", "gamma", "sigma_weight", "sigma_inertia"
+    return dict(zip(names, (sigma, sigma if kept is None else kept, gamma, *separate), strict=True))
 
 
 @dataclass(frozen=True)
@@ -610,8 +595,7 @@ def detect_log(
     found = eliminate_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
-    if found.log.static:
-        raise _no_contact_in_static_log_error(found)
+    _require_motion(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
         remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"

@@ -16,14 +16,14 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
 
-# Eq. (7): symbol, index, printed unit, and its factor from SI.
-_PARAMETER_LABELS = (
+PARAMETER_FORMATS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
     ("m", "", "kg", 1.0),
     *(("m c", axis, "g m", 1e3) for axis in "xyz"),
     *(("I", axes, "g m²", 1e3) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
+"""Symbol, index, printed unit and its factor from SI of the parameters of Eq. (7)."""
 _STYLE_OF_VERDICT = {"identified": "agrees", "not": "differs"}
 
 
@@ -47,7 +47,7 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
     columns = np.stack([theta, load.standard_deviations, *confidence_intervals(load)], axis=1)
     rows = []
     for (symbol, index, unit, scale), values, verdict in zip(
-        _PARAMETER_LABELS, columns, load.verdicts, strict=True
+        PARAMETER_FORMATS, columns, load.verdicts, strict=True
     ):
         words, pill = VERDICT_WORDS[verdict], _STYLE_OF_VERDICT.get(verdict, "")
         texts = ("–", "", "")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.files import output_folder, write_json, write_table, write_text
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.texts import to_yaml_text
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -77,30 +77,29 @@ FINGERTIP_PUSHES = (
 )
 """A tap, a push and a light tap, smaller than the wrench of weight and inertia."""
 
-_FIELD_COMMENTS = {
-    "wrench.file": "500 Hz",
-    "wrench.sign": "the sensor reports what the load exerts on it, as most do",
-    "pose": "of the sensor",
-    "pose.file": "125 Hz",
-    "pose.time": "s; the arm's clock is ahead by that much",
-}
-
-
-def _description_of_record(name: str) -> dict[str, Any]:
-    wrench = {
-        "file": f"{name}_wrench.csv",
-        "time": {"column": "time", "unit": "ms"},
-        "force": {"columns": ["Fx", "Fy", "Fz"], "unit": "lbf"},
-        "torque": {"columns": ["Tx", "Ty", "Tz"], "unit": "lbf in"},
-        "sign": -1,
-    }
-    pose = {
-        "file": f"{name}_pose.csv",
-        "time": {"column": "uptime", "offset": -CLOCK_START_S},
-        "orientation": {"columns": ["rx", "ry", "rz"], "form": "rotation_vector", "unit": "deg"},
-        "position": {"columns": ["x", "y", "z"], "unit": "mm"},
-    }
-    return {"wrench": wrench, "pose": pose}
+_DESCRIPTION = """\
+# A gripper on a lab arm, {what}: made by drake-teleop sample-log.
+wrench:
+  file: {name}_wrench.csv  # 500 Hz
+  time: {{column: time, unit: ms}}
+  force:
+    columns: [Fx, Fy, Fz]
+    unit: lbf
+  torque:
+    columns: [Tx, Ty, Tz]
+    unit: lbf in
+  sign: -1  # the sensor reports what the load exerts on it, as most do
+pose:  # of the sensor
+  file: {name}_pose.csv  # 125 Hz
+  time: {{column: uptime, offset: {offset}}}  # s; the arm's clock is ahead by that much
+  orientation:
+    columns: [rx, ry, rz]
+    form: rotation_vector
+    unit: deg
+  position:
+    columns: [x, y, z]
+    unit: mm
+"""
 
 
 def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict[str, Any]:
@@ -110,8 +109,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     files = []
     with output_folder(out):
         for row, (name, (touches, what)) in enumerate(records.items()):
-            head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
-            text = to_yaml_text(_description_of_record(name), head=head, comments=_FIELD_COMMENTS)
+            text = _DESCRIPTION.format(name=name, what=what, offset=-CLOCK_START_S)
             write_text(out / f"{name}.yaml", text)
             _write_record(out, name, row, touches, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
@@ -130,8 +128,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
 
 
 def _true_contact(touch: FingertipPush) -> dict[str, Any]:
-    middle = np.array([(touch.start_s + touch.stop_s) / 2])
-    R_WS = _motion_of_record(1)(middle)[3][0]
+    R_WS = _motion_of_record(1)(np.array([(touch.start_s + touch.stop_s) / 2]))[3][0]
     peak = np.linalg.norm(touch.push_W)
     push = R_WS.T @ touch.push_W / peak
     return {"start_s": touch.start_s, "stop_s": touch.stop_s, "peak_N": peak, "push": push}
@@ -186,21 +183,11 @@ def sensor_motion(q: Array, qd: Array, qdd: Array) -> _Motion:
         z, rate = R[:, :, 2], qd[:, j, np.newaxis]
         alpha = alpha + qdd[:, j, np.newaxis] * z + np.cross(omega, rate * z)
         omega = omega + rate * z
-        turned = R @ _axis_rotations(q[:, j], 2)
+        turned = R @ rotation_matrices(np.outer(q[:, j], [0.0, 0.0, 1.0]), "rotation_vector")
         r = turned @ [a, 0.0, d]
         p, s = p + r, s + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
-        R = turned @ _axis_rotations(np.array([twist]), 0)
-    in_S = (np.einsum("nji,nj->ni", R, x) for x in (s, omega, alpha))
-    return *in_S, R, p
-
-
-def _axis_rotations(angle: Array, axis: int) -> Array:
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    R = np.tile(np.eye(3), (len(angle), 1, 1))
-    R[:, first, first] = R[:, second, second] = np.cos(angle)
-    R[:, second, first] = np.sin(angle)
-    R[:, first, second] = -R[:, second, first]
-    return R
+        R = turned @ rotation_matrices(np.array([[twist, 0.0, 0.0]]), "rotation_vector")
+    return *(np.einsum("nji,nj->ni", R, x) for x in (s, omega, alpha)), R, p
 
 
 def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:

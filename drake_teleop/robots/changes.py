@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Cause, causes_of_fit
+from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Finding, causes_of_fit
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
@@ -142,7 +142,7 @@ def _is_change_kind_certain(state: FittedModel, time: float) -> bool:
     return 2.0 * (state.likelihood - state.refit(model, start).likelihood) > _KIND_LIKELIHOOD_RATIO
 
 
-def _text_of_zero_or_load_change(cause: Cause) -> str:
+def _text_of_zero_or_load_change(cause: Finding) -> str:
     if cause.name == "zero change":
         change = " ".join(f"{x:+.3g}" for x in np.array(cause.values["change"]))
         return (

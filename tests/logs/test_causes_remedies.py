@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
-from drake_teleop.logs.causes.cause import Cause
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.explained_log import _correct_unit_or_torque_scale, add_description_lines
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
@@ -130,7 +130,7 @@ class Record:
         return path
 
 
-def follow(path: Path, causes: Sequence[Cause]) -> int:
+def follow(path: Path, causes: Sequence[Finding]) -> int:
     """Write the lines that causes state into the description; return how many."""
     description = yaml.safe_load(path.read_text())
     lines = []
@@ -259,9 +259,11 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     rng = np.random.default_rng(seed)
     record = Record.simulate(seconds=1.0, noise=0.0)
     right = record.wrench.copy()
-    causes = [Cause("torque factor", "k", values={"factor": float(rng.choice([-1.0, 10.0, -0.1]))})]
+    causes = [
+        Finding("torque factor", "k", values={"factor": float(rng.choice([-1.0, 10.0, -0.1]))})
+    ]
     Q = PERMUTATIONS[rng.integers(48)]
-    causes += [Cause("axes", "Q", values={"matrix": Q.tolist()})]
+    causes += [Finding("axes", "Q", values={"matrix": Q.tolist()})]
     factor = np.repeat([1.0, causes[0].values["factor"]], 3)
     record.wrench = record.wrench @ np.kron(np.eye(2), Q).T * factor
     frame = OBLIQUE
@@ -271,7 +273,7 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
         channel = int(rng.integers(6))
         record.wrench[:, channel] *= 1.02
         values = {"channel": CHANNEL_NAMES[channel], "gain": 1.02}
-        causes.append(Cause("gain", "g", values=values))
+        causes.append(Finding("gain", "g", values=values))
     scales = rng.choice([-2.0, 1e-4, 1.0], (2, 3))
     record.described(int(rng.choice([-1, 1])), frame, *scales)
     path = record.write(tmp_path)
@@ -311,7 +313,7 @@ def test_remedy_adds_the_weight_and_composes_the_pose_frame(seed: int, tmp_path:
     record.posed_at(shift + known)
     record.wrench_lines = {"weight": weight.tolist()}
     record.pose_lines = {"position_in_sensor": known.tolist()}
-    causes = [Cause("pose frame", "r", values={"position_in_sensor": shift.tolist()})]
+    causes = [Finding("pose frame", "r", values={"position_in_sensor": shift.tolist()})]
     path = record.write(tmp_path)
     follow(path, add_description_lines(causes, read_log(path), by_pose=True))
     log = read_log(path)
@@ -322,14 +324,14 @@ def test_remedy_adds_the_weight_and_composes_the_pose_frame(seed: int, tmp_path:
 
 def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> None:
     record = Record.simulate(seconds=1.0)
-    cause = Cause("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})
+    cause = Finding("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})
     log = read_log(record.write(tmp_path))
     [of_table] = add_description_lines([cause], replace(log, source="log.csv"), by_pose=True)
     assert "in a log description of this table" in of_table.message
     record.wrench_lines = {"frame": "base"}
     [of_base] = add_description_lines([cause], read_log(record.write(tmp_path)), by_pose=True)
     assert of_base.message == "D; correct the columns of wrench.force and wrench.torque"
-    inverted = Cause("axes", "D", values={"matrix": (-np.eye(3)).tolist()})
+    inverted = Finding("axes", "D", values={"matrix": (-np.eye(3)).tolist()})
     [of_sign] = add_description_lines([inverted], read_log(record.write(tmp_path)), by_pose=True)
     assert of_sign.message == "D; set wrench.sign: -1"
 

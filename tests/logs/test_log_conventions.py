@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import conventions
-from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.check.edits import LogData
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log

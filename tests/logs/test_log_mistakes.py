@@ -17,14 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.corrections import edit_field
-from drake_teleop.logs.check.imu_checks import (
+from drake_teleop.logs.check.edits import LogData, edit_field
+from drake_teleop.logs.check.motion_checks import (
     _correct_imu_clock,
     check_imu_against_pose,
     check_imu_signals,
+    position_unit_or_origin_findings,
 )
-from drake_teleop.logs.check.log_data import LogData
-from drake_teleop.logs.check.pose_checks import position_unit_or_origin_findings
 from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS, Log
 from drake_teleop.logs.read.description import Description

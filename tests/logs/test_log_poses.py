@@ -14,7 +14,7 @@ from posed_record import GRAVITY_W, LATE, PHI, SHIFT, TURN, Kind, record
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.logs.check.pose_checks import pose_frame_finding
+from drake_teleop.logs.check.motion_checks import pose_frame_finding
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.poses import PosesOfLog

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import EULER_AXES, rotation_matrices
-from drake_teleop.logs.check.corrections import (
+from drake_teleop.logs.check.draft import draft_description
+from drake_teleop.logs.check.edits import (
     edit_with_opposite_wrench_sign,
     orientation_and_gravity_sign_edits,
 )
-from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.clocks import join_episodes

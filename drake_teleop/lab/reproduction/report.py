@@ -15,15 +15,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.html import write_report_page_and_pictures
+from drake_teleop.logs.report import PARAMETER_FORMATS
 
-# Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
-_PARAMETER_FORMATS = (
-    *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
-    *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
-    ("m", "", "kg", 1.0),
-    *(("m c", axis, "g m", 1e3) for axis in "xyz"),
-    *(("I", axes, "g m²", 1e3) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
-)
 _FIGURE_TITLES = {
     "fig6": "Fig. 6: scaling and elimination of non-contact forces",
     "fig7": "Fig. 7: scaling and elimination of non-contact torques",
@@ -175,7 +168,7 @@ def parameter_rows(
     """Return the rows of the identification table from offsets and phi (16,), SI."""
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
-    for (symbol, index, unit, scale), values in zip(_PARAMETER_FORMATS, columns, strict=True):
+    for (symbol, index, unit, scale), values in zip(PARAMETER_FORMATS, columns, strict=True):
         truth, found, sigma = scale * values
         # Two digits of the uncertainty determine the decimals of the value.
         decimals = 3 if sigma <= 0 else int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))

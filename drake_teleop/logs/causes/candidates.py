@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,45 +63,36 @@ def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candida
     model, data = state.model, state.data
     if is_first_round:
         yield from _axis_permutation_candidates(state)
-    if data.gravity_W is not None:
-        if "gravity" not in model.extensions:
-            yield from _fit_extension(
-                state, "gravity", [start_parameters_of_tilt_fit(state), None], _is_tilt_significant
-            )
-        if "weight" not in model.extensions and data.accelerates_enough:
-            yield from _fit_extension(state, "weight", [None], _is_removed_weight_large)
-    if "torque factor" not in model.extensions and data.accelerates_enough:
+    drifts = bool({"linear drift", "drift"} & set(model.extensions))
+    possible = {
+        "gravity": data.gravity_W is not None,
+        "weight": data.gravity_W is not None and data.accelerates_enough,
+        "linear drift": not drifts,
+        "frame": data.accelerates_enough,
+        "rotation": is_first_round and not model.extensions,
+        "cable": data.has_positions and data.accelerates_enough,
+        "drift": not drifts,
+    }
+    for name, is_possible in possible.items():
+        if is_possible and name not in model.extensions:
+            yield from _fit_extension(state, name)
+    if data.accelerates_enough:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
         found = add_step(state, kind)
         if found is not None:
             yield _scored_candidate(kind, state, found, num_times=1)
-    if not {"linear drift", "drift"} & set(model.extensions):
-        yield from _fit_extension(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
         if c not in model.gain_channels:
             larger = state.refit(replace(model, gain_channels=(*model.gain_channels, c)))
             error = abs(larger.parameters_of_extension(f"gain {c}")[0][0])
             if _MIN_CHANNEL_GAIN_ERROR < error < _MAX_CHANNEL_GAIN_ERROR:
                 yield _scored_candidate("gain", state, larger)
-    if "frame" not in model.extensions and data.accelerates_enough:
-        yield from _fit_extension(
-            state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _MIN_POSE_SHIFT_M
-        )
-    if is_first_round and not model.extensions:
-        angle = np.radians(_MIN_SENSOR_ROTATION_DEG)
-        yield from _fit_extension(
-            state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
-        )
     spans = find_contact_spans(state)
     if spans and spans != state.contact_spans:
         larger = FittedModel.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, num_extra=6 + 2 * ends)
-    if data.has_positions and "cable" not in model.extensions and data.accelerates_enough:
-        yield from _fit_extension(state, "cable", [None], lambda _: True)
-    if "drift" not in model.extensions and "linear drift" not in model.extensions:
-        yield from _fit_extension(state, "drift", [None], _is_drift_significant)
 
 
 def _scored_candidate(
@@ -115,16 +106,36 @@ def _scored_candidate(
     return Candidate(name, larger, float(score))
 
 
-def _fit_extension(
-    state: FittedModel,
-    name: str,
-    starts: list[Array | None],
-    is_significant: Callable[[FittedModel], bool],
-) -> Iterator[Candidate]:
+def _fit_extension(state: FittedModel, name: str) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
+    starts = [start_parameters_of_tilt_fit(state), None] if name == "gravity" else [None]
     best = max((state.refit(model, start) for start in starts), key=lambda x: x.likelihood)
-    if is_significant(best):
+    if _is_effect_large(best, name):
         yield _scored_candidate(name, state, best)
+
+
+def _is_effect_large(state: FittedModel, name: str) -> bool:
+    x, _ = state.parameters_of_extension(name)
+    match name:
+        case "gravity":
+            _, angle, ratio = estimated_gravity_tilt_deg_and_size_ratio(state)
+            error = abs(ratio - 1.0)
+            # Noise of the accelerations changes only the magnitude.
+            turned = np.radians(angle) > error
+            share = _MAX_GRAVITY_ERROR_TILTED if turned else _MAX_GRAVITY_ERROR_UPRIGHT
+            return bool(angle > _MIN_GRAVITY_TILT_DEG and error < share)
+        case "weight":
+            mass = abs(state.x[6])
+            arm = np.linalg.norm(x[1:]) / max(mass, 1e-9)
+            return bool(x[0] > _MIN_REMOVED_MASS_SHARE * mass or arm > _MIN_REMOVED_MOMENT_ARM_M)
+        case "frame":
+            return bool(np.linalg.norm(x) > _MIN_POSE_SHIFT_M)
+        case "rotation":
+            return bool(np.linalg.norm(x) > np.radians(_MIN_SENSOR_ROTATION_DEG))
+        case "linear drift" | "drift":
+            least = _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise
+            return bool((drift_amplitudes(state) > least).any())
+    return True
 
 
 def has_negative_mass(state: FittedModel) -> bool:
@@ -149,31 +160,21 @@ def has_negative_inertia(state: FittedModel) -> bool:
 def is_plausible(state: FittedModel) -> bool:
     if has_negative_inertia(state):
         return False
-    parts, mass = set(state.model.extensions), state.x[6]
+    parts, mass = state.model.parameter_slices, state.x[6]
     # A removed weight or a cable requires an inertia to compare with.
     required = _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6])
-    if {"weight", "cable"} & parts and mass < required:
+    if {"weight", "cable"} & parts.keys() and mass < required:
         return False
-    if "weight" in parts and state.parameters_of_extension("weight")[0][0] < -0.01 * mass:
+    if "weight" in parts and state.x[parts["weight"]][0] < -0.01 * mass:
         return False  # a robot adds no weight
-    if "frame" in parts and _extension_magnitude(state, "frame") > _MAX_POSE_SHIFT_M:
+    if "frame" in parts and np.linalg.norm(state.x[parts["frame"]]) > _MAX_POSE_SHIFT_M:
         return False
     return "cable" not in parts or max_cable_stiffness_n_m(state) < _MAX_CABLE_STIFFNESS_N_M
 
 
 def max_cable_stiffness_n_m(state: FittedModel) -> float:
-    """Return the largest stiffness of a cable in any direction [N/m]."""
     K = state.parameters_of_extension("cable")[0][3:9][SYMMETRIC_MATRIX_INDICES]
     return float(np.abs(np.linalg.eigvalsh(K)).max())
-
-
-def _is_tilt_significant(state: FittedModel) -> bool:
-    _, angle, ratio = estimated_gravity_tilt_deg_and_size_ratio(state)
-    error = abs(ratio - 1.0)
-    # Noise of the accelerations changes only the magnitude.
-    turned = np.radians(angle) > error
-    share = _MAX_GRAVITY_ERROR_TILTED if turned else _MAX_GRAVITY_ERROR_UPRIGHT
-    return bool(angle > _MIN_GRAVITY_TILT_DEG and error < share)
 
 
 def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array, float, float]:
@@ -212,25 +213,10 @@ def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
     return x
 
 
-def _extension_magnitude(state: FittedModel, name: str) -> float:
-    return float(np.linalg.norm(state.parameters_of_extension(name)[0]))
-
-
-def _is_removed_weight_large(state: FittedModel) -> bool:
-    removed, _ = state.parameters_of_extension("weight")
-    mass = abs(state.x[6])
-    moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
-    return bool(removed[0] > _MIN_REMOVED_MASS_SHARE * mass or moment > _MIN_REMOVED_MOMENT_ARM_M)
-
-
 def drift_amplitudes(state: FittedModel) -> Array:
     """Return bounds (6,) of the drift of the offsets from their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
     return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
-
-
-def _is_drift_significant(state: FittedModel) -> bool:
-    return bool((drift_amplitudes(state) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
 
 
 def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
@@ -245,8 +231,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     usual = min(best.residual_ratio, state.residual_ratio)
     by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * usual
     if by_residual:
-        low = (x for x in fits if x.residual_ratio < 2.0 * least)
-        best = max(low, key=lambda x: x.likelihood)
+        best = max((x for x in fits if x.residual_ratio < 2.0 * least), key=lambda x: x.likelihood)
     if best is fits[0]:
         return
     options = {"iterations": _TORQUE_FACTOR_ITERATIONS} if by_residual else {}

@@ -1,7 +1,8 @@
-"""Causes of a misfit in words: name, time span, and value with its interval."""
+"""Findings about a log, and causes of a misfit in words."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,12 +25,12 @@ CAUSES_WITHOUT_CORRECTION = (*CHANGE_CAUSES, "drift", "contact", "cable", "no lo
 
 
 @dataclass(frozen=True)
-class Cause:
-    """Reason why a rigid load with constant offsets does not explain a wrench.
+class Finding:
+    """Suspicious property of a log, or cause why a rigid load does not explain its wrench.
 
     Attributes:
-        name: such as "axes", "gravity direction", "load change" or "cable".
-        message: cause, value with its interval, and remedy.
+        name: category for programs, such as "units", "axes" or "load change".
+        message: observation or cause, value with its interval, and remedy.
         start_s, stop_s: time span on the clock of the log [s]; None: unlimited.
         values: figures by name, in SI; `angle_deg` in [deg].
         fields: corrected values of fields of the log description, as in YAML.
@@ -57,31 +58,17 @@ class RecordPartWithLoad:
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
-def causes_of_fit(state: FittedModel, always_fitted: tuple[str, ...] = ()) -> list[Cause]:
+def causes_of_fit(state: FittedModel, always_fitted: tuple[str, ...] = ()) -> list[Finding]:
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_wrong_axes_cause(model.axes))
-    makers = {
-        "gravity": _gravity_direction_cause,
-        "weight": _removed_weight_cause,
-        "frame": _pose_frame_cause,
-        "rotation": _sensor_rotation_cause,
-        "cable": _cable_cause,
-        "linear drift": _drift_cause,
-        "drift": _drift_cause,
-    }
-    named = [name for name in model.extensions if name in makers and name not in always_fitted]
-    out += [makers[name](state) for name in named]
+    named = [name for name in model.extensions if name not in ("torque factor", *always_fitted)]
+    out += [_cause_of_extension(state, name) for name in named]
     if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))
     out += [_gain_error_cause(state, c) for c in model.gain_channels]
     changes = [_offset_or_load_step_cause(state, i) for i in range(len(model.steps))]
-    margin = state.data.dt  # one row more than the contact is omitted at both ends
-    changes += [
-        _contact_cause(start + margin, stop - margin)
-        for start, stop in state.contact_spans
-        if not _is_hand_contact((start, stop), model.step_times)
-    ]
+    changes += _contact_causes(state)
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
@@ -106,22 +93,57 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
     return f"[{', '.join(format(float(v), digits) for v in x)}] {unit}"
 
 
-def _wrong_axes_cause(Q: Array) -> Cause:
+def _wrong_axes_cause(Q: Array) -> Finding:
     rows = axis_names_of_rows(Q)
     what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
     if (-np.eye(3) == Q).all():
         what = "the wrench has the opposite sign"
-    return Cause("axes", what, values={"axes": rows, "matrix": Q.tolist()})
+    return Finding("axes", what, values={"axes": rows, "matrix": Q.tolist()})
 
 
-def _gravity_direction_cause(state: FittedModel) -> Cause:
-    true, angle, _ = candidates.estimated_gravity_tilt_deg_and_size_ratio(state)
-    wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
-    text = (
-        f"gravity is {angle:.2f} deg (+- {1.96 * wide:.2g}) off the described direction in the base"
-        " of the arm"
-    )
-    return Cause("gravity direction", text, values={"angle_deg": angle, "gravity": true.tolist()})
+def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
+    x, covariance = state.parameters_of_extension(extension)
+    wide = 1.96 * np.sqrt(np.diag(covariance))
+    values: dict[str, object]
+    match extension:
+        case "gravity":
+            true, angle, _ = candidates.estimated_gravity_tilt_deg_and_size_ratio(state)
+            name, values = "gravity direction", {"angle_deg": angle, "gravity": true.tolist()}
+            text = (
+                f"gravity is {angle:.2f} deg (+- {1.96 * direction_std_deg(true, covariance):.2g})"
+                " off the described direction in the base of the arm"
+            )
+        case "weight":
+            return _removed_weight_cause(state)
+        case "frame":
+            name, values = "pose frame", {"position_in_sensor": (-x).tolist()}
+            text = (
+                f"the pose is that of a point at {_format_vector(-1e3 * x, 'mm in S')}"
+                f" (+- {1e3 * wide.max():.2g} mm), not of the sensor"
+            )
+        case "rotation":
+            name, values = "sensor rotation", {"rotation_vector": x.tolist()}
+            angle = float(np.linalg.norm(x))
+            text = (
+                f"the sensor is rotated by {np.degrees(angle):.2f} deg"
+                f" (+- {np.degrees(wide.max()):.2g}) against the motion, about"
+                f" {_format_vector(x / (angle + 1e-12), 'in S', '.2f')}"
+            )
+        case "cable":
+            stiffness = candidates.max_cable_stiffness_n_m(state)
+            name, values = "cable", {"stiffness": stiffness}
+            text = (
+                "a force that depends on the position acts on the load (about"
+                f" {stiffness:.2g} N/m), probably of a cable or hose; guide it so that it is slack"
+            )
+        case _:
+            size = 2.0 * candidates.drift_amplitudes(state)
+            name, values = "drift", {"range": size.tolist()}
+            text = (
+                f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m"
+                " within the record; the stated offsets are their means: let the sensor warm up"
+            )
+    return Finding(name, text, values=values)
 
 
 def direction_std_deg(x: Array, covariance: Array) -> float:
@@ -132,18 +154,17 @@ def direction_std_deg(x: Array, covariance: Array) -> float:
     return float(np.degrees(np.sqrt(spread) / size))
 
 
-def _removed_weight_cause(state: FittedModel) -> Cause:
+def _removed_weight_cause(state: FittedModel) -> Finding:
     removed, covariance = state.parameters_of_extension("weight")
-    deviation = float(np.sqrt(covariance[0, 0]))
+    deviation, own = float(np.sqrt(covariance[0, 0])), float(np.sqrt(state.covariance[6, 6]))
     mass = float(state.x[6])
-    own = float(np.sqrt(state.covariance[6, 6]))
     values = {"removed_mass": float(removed[0]), "removed_moment": removed[1:].tolist()}
     if abs(removed[0] - mass) < 0.02 * mass + 4.0 * np.hypot(deviation, own):
         text = (
             "the weight is already removed from the wrench, and the inertia of"
             f" {mass:.4g} kg (+- {1.96 * own:.2g}) remains"
         )
-        return Cause("weight removed", text, values=values)
+        return Finding("weight removed", text, values=values)
     com = removed[1:] / removed[0] if removed[0] else np.zeros(3)
     text = (
         f"the weight of a payload of {removed[0]:.4g} kg (+- {1.96 * deviation:.2g}) at"
@@ -151,10 +172,10 @@ def _removed_weight_cause(state: FittedModel) -> Cause:
         f" inertia is that of {mass:.4g} kg: the payload in the robot's controller is not that of"
         " the load"
     )
-    return Cause("payload configured", text, values=values)
+    return Finding("payload configured", text, values=values)
 
 
-def _torque_factor_cause(state: FittedModel) -> Cause:
+def _torque_factor_cause(state: FittedModel) -> Finding:
     factor = state.model.torque_factor
     if factor == -1.0:
         what = "the torque has the opposite sign"
@@ -163,88 +184,51 @@ def _torque_factor_cause(state: FittedModel) -> Cause:
         if others := [other.model.torque_factor for other in fits_with_other_torque_units(state)]:
             listed = " or ".join(f"{x:.6g}" for x in others)
             what += f" (or {listed} times, which the record does not exclude)"
-    return Cause("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
+    return Finding("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
 
 
-def _gain_error_cause(state: FittedModel, c: int) -> Cause:
+def _gain_error_cause(state: FittedModel, c: int) -> Finding:
     value, covariance = state.parameters_of_extension(f"gain {c}")
-    wide = 1.96 * float(np.sqrt(covariance[0, 0]))
+    channel, wide = CHANNEL_NAMES[c], 1.96 * float(np.sqrt(covariance[0, 0]))
     text = (
-        f"{CHANNEL_NAMES[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
-        " channels allow; calibrate the sensor"
+        f"{channel} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other channels"
+        " allow; calibrate the sensor"
     )
-    return Cause("gain", text, values={"channel": CHANNEL_NAMES[c], "gain": 1.0 + float(value[0])})
+    return Finding("gain", text, values={"channel": channel, "gain": 1.0 + float(value[0])})
 
 
-def _pose_frame_cause(state: FittedModel) -> Cause:
-    r, covariance = state.parameters_of_extension("frame")
-    wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
-    text = (
-        f"the pose is that of a point at {_format_vector(-1e3 * r, 'mm in S')}"
-        f" (+- {wide.max():.2g} mm), not of the sensor"
-    )
-    return Cause("pose frame", text, values={"position_in_sensor": (-r).tolist()})
-
-
-def _sensor_rotation_cause(state: FittedModel) -> Cause:
-    rho, covariance = state.parameters_of_extension("rotation")
-    angle = float(np.degrees(np.linalg.norm(rho)))
-    wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
-    text = (
-        f"the sensor is rotated by {angle:.2f} deg (+- {1.96 * wide:.2g}) against the motion, about"
-        f" {_format_vector(rho / (np.linalg.norm(rho) + 1e-12), 'in S', '.2f')}"
-    )
-    return Cause("sensor rotation", text, values={"rotation_vector": rho.tolist()})
-
-
-def _drift_cause(state: FittedModel) -> Cause:
-    size = 2.0 * candidates.drift_amplitudes(state)
-    text = (
-        f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m within the"
-        " record; the stated offsets are their means: let the sensor warm up"
-    )
-    return Cause("drift", text, values={"range": size.tolist()})
-
-
-def _cable_cause(state: FittedModel) -> Cause:
-    stiffness = candidates.max_cable_stiffness_n_m(state)
-    text = (
-        f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"
-        " probably of a cable or hose; guide it so that it is slack"
-    )
-    return Cause("cable", text, values={"stiffness": stiffness})
-
-
-def _offset_or_load_step_cause(state: FittedModel, i: int) -> Cause:
-    step, (values, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
+def _offset_or_load_step_cause(state: FittedModel, i: int) -> Finding:
+    step, (x, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
+    values: dict[str, object] = {"change": x.tolist()}
     if step.kind == "offsets":
         text = (
-            f"{when} the sensor has another zero: {_format_vector(values[:3], 'N')},"
-            f" {_format_vector(values[3:], 'N m')} are added (a tare in the record); the stated"
+            f"{when} the sensor has another zero: {_format_vector(x[:3], 'N')},"
+            f" {_format_vector(x[3:], 'N m')} are added (a tare in the record); the stated"
             " offsets are those before it; do not tare within a record"
         )
-        return Cause("zero change", text, start_s=step.time, values={"change": values.tolist()})
-    mass, com = float(values[0]), mass_com_inertia(values)[1] if values[0] else np.zeros(3)
+        return Finding("zero change", text, start_s=step.time, values=values)
+    mass, com = float(x[0]), mass_com_inertia(x)[1] if x[0] else np.zeros(3)
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
-    what = "added" if mass > 0.0 else "removed"
     text = (
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_format_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each part"
+        f" {_format_vector(1e3 * com, 'mm in S')} are {'added' if mass > 0.0 else 'removed'}; the"
+        " load is given for each part"
     )
-    change = {"mass_change": mass, "com_of_change": np.asarray(com).tolist()}
-    return Cause("load change", text, start_s=step.time, values=change)
+    values = {"mass_change": mass, "com_of_change": np.asarray(com).tolist()}
+    return Finding("load change", text, start_s=step.time, values=values)
 
 
-def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    start, stop = span[0] - _MAX_HAND_CONTACT_TO_STEP_S, span[1] + _MAX_HAND_CONTACT_TO_STEP_S
-    near = any(start < time < stop for time in times)
-    return near and span[1] - span[0] < _MAX_HAND_CONTACT_DURATION_S
-
-
-def _contact_cause(start: float, stop: float) -> Cause:
-    text = (
-        f"from t = {start:.2f} to {stop:.2f} s the load is in contact or the sensor is saturated;"
-        " this part is not used"
-    )
-    return Cause("contact", text, start_s=start, stop_s=stop)
+def _contact_causes(state: FittedModel) -> Iterator[Finding]:
+    dt = state.data.dt  # one row more than the contact is omitted at both ends
+    for a, b in state.contact_spans:
+        first, last = a - _MAX_HAND_CONTACT_TO_STEP_S, b + _MAX_HAND_CONTACT_TO_STEP_S
+        changes_load = any(first < time < last for time in state.model.step_times)
+        if changes_load and b - a < _MAX_HAND_CONTACT_DURATION_S:
+            continue  # the hand that changes the load
+        start, stop = a + dt, b - dt
+        text = (
+            f"from t = {start:.2f} to {stop:.2f} s the load is in contact or the sensor is"
+            " saturated; this part is not used"
+        )
+        yield Finding("contact", text, start_s=start, stop_s=stop)

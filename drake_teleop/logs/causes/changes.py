@@ -41,8 +41,7 @@ def add_step(state: FittedModel, kind: str) -> FittedModel | None:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
             best = found
-    last = len(state.model.steps)
-    return best if best is not None and _is_step_significant(best, last) else None
+    return best if best and _is_step_significant(best, len(state.model.steps)) else None
 
 
 def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
@@ -68,27 +67,21 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
 
 class _StepScan:
     def __init__(self, state: FittedModel, kind: str) -> None:
-        power = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
-        J = state.model.wrench_derivative(state.x) / power[:, None]
-        self._columns = state.rows.y @ J.transpose(1, 2, 0)  # (6, M, p)
-        self._residual = (state.rows.y @ (state.residual / power[:, None]).T).T
+        scale = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
+        self._y, self._rows = state.rows.y, state.data.rows_per_search_block
+        self._J = state.model.wrench_derivative(state.x) / scale[:, None]
+        self._residual = state.residual / scale[:, None]
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
-        self._rows = rows = state.data.rows_per_search_block
-        starts = range(0, len(state.data.t), rows)
-        equations = [self._equations_of_rows(n, n + rows) for n in starts]
-        gram, right = map(np.stack, zip(*equations, strict=True))
+        sums = state.data.lagged_block_sums(self._y, rows=self._rows, lags=1)[:, 0]
+        gram, right = _weighted_equations(self._J, self._residual, sums)
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
 
-    def _equations_of_rows(self, start: int, stop: int) -> tuple[Array, Array]:
-        A, e = self._columns[:, start:stop], self._residual[:, start:stop]
-        flat = A.reshape(-1, A.shape[2])
-        return flat.T @ flat, flat.T @ e.ravel()
-
     def likelihood_gain_of_step_at(self, n: int) -> float:
         j = -(-n // self._rows)
-        gram, right = self._equations_of_rows(n, j * self._rows)
+        y = self._y[n : j * self._rows]
+        gram, right = _weighted_equations(self._J, self._residual, y.T @ y)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
         which = self._which
@@ -96,6 +89,16 @@ class _StepScan:
         pull = right[which] - mixed.T @ (self._inverse @ self._right[0])
         schur = gram[which, which] - mixed.T @ self._inverse @ mixed
         return score_statistic(schur, pull, 1e-6 * np.diag(gram)[which])[0]
+
+
+def _weighted_equations(J: Array, residual: Array, sums: Array) -> tuple[Array, Array]:
+    """Return the normal equations of p parameters for sums (..., W, W) of products of W signals.
+
+    J (p, 6, W) are derivatives of the wrench and `residual` (6, W) coefficients, over the weights.
+    """
+    gram = [J[:, c] @ sums @ J[:, c].T for c in range(6)]
+    right = [sums @ residual[c] @ J[:, c].T for c in range(6)]
+    return np.sum(gram, axis=0), np.sum(right, axis=0)
 
 
 def fit_steps_at_middle_of_ramps(
@@ -127,16 +130,21 @@ def fit_steps_at_middle_of_ramps(
 
 
 def remove_small_steps(state: FittedModel) -> FittedModel:
-    """Refit without insignificant changes of offsets or load."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
             return state
         least = min(small, key=lambda i: _squared_step_over_variance(state, i))
-        steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
-        model = replace(state.model, steps=steps)
-        x = model.start_parameters(state.x, Model())
-        state = FittedModel.fit_record(state.data, model, x, state.contact_spans)
+        state = _refit_without_steps(state, [least], state.contact_spans)
+
+
+def _refit_without_steps(
+    state: FittedModel, removed: Sequence[int], spans: TimeSpans
+) -> FittedModel:
+    kept = tuple(x for i, x in enumerate(state.model.steps) if i not in removed)
+    model = replace(state.model, steps=kept)
+    x = model.start_parameters(state.x, Model())
+    return FittedModel.fit_record(state.data, model, x, spans)
 
 
 def _squared_step_over_variance(state: FittedModel, i: int) -> float:
@@ -159,8 +167,7 @@ def _estimate_ramp_middle(state: FittedModel, own: range, span: tuple[float, flo
     whole = before - residual_with_steps_at(span[0] - data.dt)
     weight = 1.0 / np.maximum(data.wrench_noise, 1e-12) ** 2
     share = (before * whole) @ weight / np.maximum((whole * whole) @ weight, 1e-12)
-    done = float(np.clip(share, 0.0, 1.0).mean())
-    return span[1] - done * (span[1] - span[0])
+    return span[1] - float(np.clip(share, 0.0, 1.0).mean()) * (span[1] - span[0])
 
 
 def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> FittedModel:
@@ -262,19 +269,12 @@ class _NormalEquationsOfBlocks:
         sums = data.lagged_block_sums(y, rows=data.rows_per_search_block, lags=1)[:, 0]
         self._counts = sums[:, 0, 0]
         self.usable = self._counts > 0.5 * data.rows_per_search_block
-        J = state.model.wrench_derivative(state.x)
         sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH_SIGNALS] / max(self._counts.sum(), 1.0))
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
         scale = np.maximum(data.wrench_noise, least)
-        self._gram = np.zeros((len(sums), len(J), len(J)))
-        self._right = np.zeros((len(sums), len(J)))
-        self._square = np.zeros(len(sums))
-        for c in range(6):
-            weighted = J[:, c] @ sums / scale[c] ** 2
-            self._gram += weighted @ J[:, c].T
-            self._right += weighted @ state.residual[c]
-            left = state.residual[c] / scale[c]
-            self._square += np.einsum("i,bij,j->b", left, sums, left)
+        J, left = state.model.wrench_derivative(state.x), state.residual / scale[:, None]
+        self._gram, self._right = _weighted_equations(J / scale[:, None], left, sums)
+        self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return flags of blocks `among` with a residual far above the usual; None for few."""
@@ -351,8 +351,7 @@ def _residuals_by_motion_errors(
     both = data.used[2:] & data.used[:-2]
     second = np.diff(wrench, 2, axis=0) / np.maximum(data.wrench_noise, 1e-12)
     bend[1:-1] = np.where(both, (second * second).sum(axis=1), 0.0)
-    blocks = np.add.reduceat(bend, np.arange(0, len(y), rows)) / rows
-    fast = np.sqrt(blocks[: len(level)])
+    fast = np.sqrt(np.add.reduceat(bend, np.arange(0, len(y), rows)) / rows)[: len(level)]
     fastest = usable & (fast > np.median(fast[usable]))
     if fastest.sum() < 8:
         return np.zeros(len(level))
@@ -369,13 +368,12 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
         ends = [k for k in (i, j) if k >= 0]
         if not ends or all(state.model.steps[k].kind == "load" for k in ends):
             continue
-        kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
-        model, dt = replace(state.model, steps=kept), state.data.dt
-        x, span = model.start_parameters(state.x, Model()), (start - dt, stop + dt)
+        span = start - state.data.dt, stop + state.data.dt
+        spans = (*state.contact_spans, span)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
-            return FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
+            return _refit_without_steps(state, ends, spans)
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
-            calm = FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
+            calm = _refit_without_steps(state, ends, spans)
             limit = min(_CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM)
             if calm.residual_ratio < limit:
                 return shrink_contacts(calm)
@@ -384,23 +382,18 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
 
 def shrink_contacts(state: FittedModel) -> FittedModel:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
-    dt = state.data.dt
-    shrunk = (_shrunk_contact_span(state, span) for span in state.contact_spans)
-    spans = tuple((a - dt, b + dt) for a, b in shrunk)
-    return FittedModel.fit_record(state.data, state.model, state.x, spans)
-
-
-def _shrunk_contact_span(state: FittedModel, span: tuple[float, float]) -> tuple[float, float]:
-    data = state.data
-    inside = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
+    data, spans = state.data, []
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
     usual = np.maximum(data.wrench_noise, state.rows.residual_rms(state.residual)).clip(1e-12)
-    large = (np.abs(y[inside] @ state.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
-    first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
-    if not len(first):
-        return span
-    start, stop = data.t[inside[[first[0], first[-1] + 1]]]
-    return float(start) - 0.5 * data.dt, float(stop) + 0.5 * data.dt
+    for start, stop in state.contact_spans:
+        inside = np.flatnonzero(data.used & is_in_time_spans(data, ((start, stop),)))
+        large = (np.abs(y[inside] @ state.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
+        first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
+        if len(first):
+            start = float(data.t[inside[first[0]]]) - 0.5 * data.dt
+            stop = float(data.t[inside[first[-1] + 1]]) + 0.5 * data.dt
+        spans.append((start - data.dt, stop + data.dt))
+    return FittedModel.fit_record(data, state.model, state.x, tuple(spans))
 
 
 def _median_residual_over_noise(state: FittedModel, span: tuple[float, float]) -> float:

@@ -16,7 +16,7 @@ from drake_teleop.logs.causes.candidates import (
     has_negative_mass,
     start_parameters_of_tilt_fit,
 )
-from drake_teleop.logs.causes.cause import Cause, RecordPartWithLoad
+from drake_teleop.logs.causes.cause import Finding, RecordPartWithLoad
 from drake_teleop.logs.causes.changes import remove_small_steps
 from drake_teleop.logs.causes.instants import BlockMeans, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
@@ -126,7 +126,10 @@ def _search_causes_from(
         ):
             winner = calmest
         if winner is None:
-            explained = _explain_contact_by_steps(state, rejected)
+            limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
+            contacts = (x.state for x in rejected if x.name == "contact")
+            calm = next((x for x in contacts if x.residual_ratio < limit), None)
+            explained = None if calm is None else changes.replace_contacts_by_steps(calm)
             if explained is None:
                 break
             state, delay_s = _apply_fitted_delay(explained, delay_s, with_delay)
@@ -175,13 +178,6 @@ def _candidate_with_much_smaller_residual(
     return min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name), default=None)
 
 
-def _explain_contact_by_steps(state: FittedModel, found: list[Candidate]) -> FittedModel | None:
-    limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
-    contacts = (x.state for x in found if x.name == "contact")
-    calm = next((x for x in contacts if x.residual_ratio < limit), None)
-    return None if calm is None else changes.replace_contacts_by_steps(calm)
-
-
 def _is_misfit_reduced(candidate: Candidate, state: FittedModel) -> bool:
     fitted = candidate.state
     smaller = fitted.residual_ratio < _MAX_EFFECTIVE_MISFIT_SHARE * state.residual_ratio
@@ -221,18 +217,16 @@ class MisfitExplanation:
         misfit_deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of the record with different loads, if the load changes.
-        removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
         always_fitted: quantities such as "gravity", which are no causes.
     """
 
-    causes: tuple[Cause, ...]
+    causes: tuple[Finding, ...]
     explained: bool
     theta: Array
     covariance: Array
     misfit_deviations: Array
     delay_s: float
     loads: tuple[RecordPartWithLoad, ...]
-    removed_weight: Array | None
     state: FittedModel
     always_fitted: tuple[str, ...] = ()
 
@@ -267,7 +261,6 @@ def explain_misfit(
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _no_load_cause(state, covariance)
-        weight = state.model.parameter_slices.get("weight")
         return MisfitExplanation(
             causes=tuple(causes),
             explained=only_noise,
@@ -276,17 +269,16 @@ def explain_misfit(
             misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(cause.loads_between_changes(state, covariance)),
-            removed_weight=None if weight is None else state.x[weight],
             state=state,
             always_fitted=always_fitted,
         )
 
 
-def _no_load_cause(state: FittedModel, covariance: Array) -> list[Cause]:
+def _no_load_cause(state: FittedModel, covariance: Array) -> list[Finding]:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     largest = min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation)
     if not (mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1):
         return []
     most = mass + 1.96 * deviation
     text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
-    return [Cause("no load", text, values={"mass_limit": most})]
+    return [Finding("no load", text, values={"mass_limit": most})]

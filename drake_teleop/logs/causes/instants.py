@@ -176,8 +176,7 @@ def white_noise_deviations(x: Array) -> Array:
 
 
 def _smallest_noise_variance_share(x: Array) -> float:
-    noise = white_noise_deviations(x)
-    return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
+    return float((white_noise_deviations(x) ** 2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
 def _write_motion_signals_and_find_positions(

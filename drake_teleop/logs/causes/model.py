@@ -43,10 +43,6 @@ class StepChange:
     kind: str
     time: float
 
-    @property
-    def size(self) -> int:
-        return 6 if self.kind == "offsets" else 10
-
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -76,15 +72,12 @@ class Model:
         out, at = {}, DELAY_INDEX + 1
         sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
         sizes += [(f"gain {c}", 1) for c in self.gain_channels]
-        sizes += [(f"step {i}", step.size) for i, step in enumerate(self.steps)]
+        steps = enumerate(self.steps)
+        sizes += [(f"step {i}", 6 if step.kind == "offsets" else 10) for i, step in steps]
         for name, size in sizes:
             out[name] = slice(at, at + size)
             at += size
         return out
-
-    @property
-    def _num_signals(self) -> int:
-        return _columns_of_step(len(self.steps)).start
 
     @property
     def size(self) -> int:
@@ -93,7 +86,7 @@ class Model:
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
-        kept = np.ones(self._num_signals, bool)
+        kept = np.ones(_columns_of_step(len(self.steps)).start, bool)
         if not {"gravity", "cable"} & set(self.extensions):
             kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
             for i in range(len(self.steps)):
@@ -126,7 +119,7 @@ class Model:
     def wrench_coefficients(self, x: Array) -> Array:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
-        out = np.zeros((len(x), 6, self._num_signals))
+        out = np.zeros((len(x), 6, _columns_of_step(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
@@ -147,20 +140,17 @@ class Model:
         out[:, 3:] *= factor[:, None, None]
         for c in self.gain_channels:
             out[:, c] *= 1.0 + x[:, parts[f"gain {c}"]]
-        self._add_offsets_delay_and_drift(out, x)
-        return out
-
-    def _add_offsets_delay_and_drift(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
         out[:, :, instants.CONSTANT_COLUMN] += x[:, :6]
         out[:, channels, instants.WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _columns_of_step(i).start] += x[:, self.parameter_slices[f"step {i}"]]
+                out[:, :, _columns_of_step(i).start] += x[:, parts[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
-            if name in self.parameter_slices:
-                rows = x[:, self.parameter_slices[name]].reshape(-1, 6, degree)
+            if name in parts:
+                rows = x[:, parts[name]].reshape(-1, 6, degree)
                 out[:, :, TIME_POLYNOMIALS.start : TIME_POLYNOMIALS.start + degree] += rows
+        return out
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.parameter_slices

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
@@ -39,20 +40,15 @@ class UsedRows:
     @cached_property
     def rows_with_predecessors(self) -> NDArray[np.intp]:
         """Indices of rows whose four predecessors are used, too."""
-        whole = self.used.copy()
-        whole[: instants.MAX_NOISE_LAG] = False
-        for d in range(1, instants.MAX_NOISE_LAG + 1):
-            whole[d:] &= self.used[:-d]
-        return np.flatnonzero(whole)
+        padded = np.pad(self.used, (instants.MAX_NOISE_LAG, 0))
+        return np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).all(axis=1))
 
     @cached_property
     def _lagged_signals_of_edge_rows(self) -> Array:
-        padded = np.concatenate([self.used, np.zeros(instants.MAX_NOISE_LAG, bool)])
-        near = padded.copy()
-        for d in range(1, instants.MAX_NOISE_LAG + 1):
-            near[d:] |= padded[:-d]
-        near[self.rows_with_predecessors] = False
-        at = np.flatnonzero(near)[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
+        padded = np.pad(self.used, instants.MAX_NOISE_LAG)
+        near = np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).any(axis=1))
+        edge = np.setdiff1d(near, self.rows_with_predecessors)
+        at = edge[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
         y = np.vstack([self.y, np.zeros((2 * instants.MAX_NOISE_LAG, self.y.shape[1]))])
         return np.asarray(y[at])
 
@@ -70,8 +66,7 @@ class UsedRows:
     ) -> tuple[Array, Array]:
         """Return whitening filters (6, 5) and noise power (6,) >= `floor` (6,) of the residual."""
         e = self.y @ residual_coefficients.T
-        filters = np.zeros((6, instants.MAX_NOISE_LAG + 1))
-        filters[:, 0] = 1.0
+        filters = np.eye(1, instants.MAX_NOISE_LAG + 1).repeat(6, axis=0)
         now = self.rows_with_predecessors
         history = np.stack([e[now - d] for d in range(instants.MAX_NOISE_LAG + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)

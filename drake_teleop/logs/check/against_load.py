@@ -16,9 +16,9 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.check import corrections
-from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.causes.cause import Finding
+from drake_teleop.logs.check import edits
+from drake_teleop.logs.check.edits import LogData
 from drake_teleop.logs.read.alignment import (
     MAX_SEARCHED_DELAY_S,
     estimate_delay,
@@ -114,12 +114,6 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-def min_unexplained_reduction_by_edit(fit: LoadFitQuality) -> float:
-    """Return the factor by which a correction must reduce the unexplained share of a fit."""
-    n = max(1.0, fit.independent_samples)
-    return max(MIN_REDUCTION_BY_EDIT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
-
-
 UNDETERMINED_UNEXPLAINED_SHARE = 0.9  # of the variance; above it a load is undetermined
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
@@ -145,15 +139,15 @@ def check_wrench_and_estimate_delay(
     given = fit_edited_description(description)
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * MAX_SEARCHED_DELAY_S
-    edits: list[tuple[Finding | None, Description]] = []
+    tried: list[tuple[Finding | None, Description]] = []
     if not (given.is_good and inside):
-        edits += _clock_offset_edits(description, thin)
+        tried += _clock_offset_edits(description, thin)
     if not given.is_good:
-        edits = [*corrections.wrench_and_motion_edits(description), *edits]
-    found = _edits_with_far_better_fit(fit_edited_description, given, edits)
+        tried = [*edits.wrench_and_motion_edits(description), *tried]
+    found = _edits_with_far_better_fit(fit_edited_description, given, tried)
     if not found and not given.is_good and not log.static:  # contact may hide what fits
         without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
-        found = _edits_with_far_better_fit(without_contact, without_contact(description), edits)
+        found = _edits_with_far_better_fit(without_contact, without_contact(description), tried)
     if not found and given.is_good:
         return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
@@ -170,30 +164,31 @@ def check_wrench_and_estimate_delay(
         return lag_finding(description, delay), delay
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
-    first = Finding(finding.name, message, finding.fields)
-    return [first, *lag_finding(description, delay)], delay
+    return [replace(finding, message=message), *lag_finding(description, delay)], delay
 
 
 def _edits_with_far_better_fit(
     fit_description: Callable[[Description], LoadFitQuality],
     given: LoadFitQuality,
-    edits: list[tuple[Finding | None, Description]],
+    tried: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
     """Return edits with which a load of positive mass fits far better, else with opposite sign."""
     positive, negative = [], []
-    for finding, edited in edits:
-        fit = corrections.call_or_none_if_unreadable(fit_description, edited)
+    for finding, edited in tried:
+        fit = edits.call_or_none_if_unreadable(fit_description, edited)
         if fit is None:
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
         elif finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN:
-            negative.append((fit, *corrections.edit_with_opposite_wrench_sign(finding, edited)))
+            negative.append((fit, *edits.edit_with_opposite_wrench_sign(finding, edited)))
         elif finding is None:  # a clock and the sign
-            negative.append((fit, *next(corrections.wrench_and_motion_edits(edited))))
+            negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid = given.max_unexplained_including_noise(VALID_UNEXPLAINED)
-    decisive = given.unexplained / min_unexplained_reduction_by_edit(given)
+    n = max(1.0, given.independent_samples)
+    least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
+    decisive = given.unexplained / max(MIN_REDUCTION_BY_EDIT, least_factor)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -278,14 +273,14 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
     best = float(shifts[int(np.argmin([unexplained_at_shift(x) for x in shifts]))])
     if abs(best) < reach - 0.03:
         offset = description.wrench.time.offset + best
-        yield None, corrections.edit_field(description, "wrench.time.offset", offset)
+        yield None, edits.edit_field(description, "wrench.time.offset", offset)
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     if delay is None or abs(delay) <= MIN_REPORTED_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
-    if abs(delay) > corrections.MIN_LAG_OF_WRONG_CLOCK_S:
+    if abs(delay) > edits.MIN_LAG_OF_WRONG_CLOCK_S:
         offset = description.wrench.time.offset + delay
         text = (
             f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong; set"
@@ -334,8 +329,7 @@ def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     t, delays = np.array(found).T
     slope, late = np.polyfit(t, delays, 1)
     change = abs(slope) * span
-    deviation = float(np.std(delays - late - slope * t))
-    uneven = deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
+    uneven = np.std(delays - late - slope * t) > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
     if change < _MIN_DELAY_DRIFT_S or uneven or abs(slope) > 0.2:
         return None
     return float(late + slope * log.t[0]), float(slope)

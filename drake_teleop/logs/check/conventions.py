@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check import against_load, corrections
+from drake_teleop.logs.causes.cause import Finding
+from drake_teleop.logs.check import against_load, edits
 from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, LoadFitQuality
-from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
-from drake_teleop.logs.check.log_data import LogData, dead_or_repeated_channel_findings
-from drake_teleop.logs.check.pose_checks import position_unit_or_origin_findings
+from drake_teleop.logs.check.edits import LogData
+from drake_teleop.logs.check.motion_checks import (
+    check_imu_against_pose,
+    check_imu_signals,
+    position_unit_or_origin_findings,
+)
 from drake_teleop.logs.read import table_files
+from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
@@ -67,18 +74,18 @@ def findings_if_load_is_suspicious(
         raise DrakeTeleopError(what, where=log.source, remedy=remedy)
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    clocks = log.static or (delay is not None and abs(delay) < corrections.MIN_LAG_OF_WRONG_CLOCK_S)
+    clocks = log.static or (delay is not None and abs(delay) < edits.MIN_LAG_OF_WRONG_CLOCK_S)
     if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_except_lag(check)) if _are_signals_suspicious(log) else ()
     found = _findings_except_lag(check)
+    negative = load.mass < 0 and bool(load.identifiable[6])
     if any(finding.name == "payload" for finding in found):
         own = against_load.undetermined_payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
-        if load.mass < 0 and load.identifiable[6]:
+        if negative:
             raise DrakeTeleopError(found[-1].message, where=log.source)
         return tuple(found)
-    negative = load.mass < 0 and bool(load.identifiable[6])
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
     if worthless and not log.static:
         _require_enough_motion(log)
@@ -97,7 +104,7 @@ def findings_if_load_is_suspicious(
 
 def motion_findings(check: Callable[[], ConventionCheckResult]) -> tuple[Finding, ...]:
     """Return the findings of `check` that concern the described motion, not the wrench."""
-    return tuple(x for x in _findings_except_lag(check) if x.name in corrections.MOTION_FINDINGS)
+    return tuple(x for x in _findings_except_lag(check) if x.name in edits.MOTION_FINDINGS)
 
 
 def _findings_except_lag(check: Callable[[], ConventionCheckResult]) -> list[Finding]:
@@ -153,12 +160,12 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
     # Determine gravity once, not for each edit.
     if "gravity" in log.estimated and log.described is not None:
         description = description.model_copy(update={"gravity": log.described.gravity})
-    dead = dead_or_repeated_channel_findings("imu", description, data.tables)
-    broken = dead_or_repeated_channel_findings("wrench", description, data.tables)
+    dead = _dead_or_repeated_channel_findings("imu", description, data.tables)
+    broken = _dead_or_repeated_channel_findings("wrench", description, data.tables)
     if dead:  # A dead channel would cause wrong findings about motion and load.
         fit = against_load.fit_load(data.read_thinned_log(description))
         return ConventionCheckResult((*dead, *broken), fit, None, None)
-    findings, description = corrections.correct_accelerometer_unit(description, log)
+    findings, description = edits.correct_accelerometer_unit(description, log)
     more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more
     mounting = None
@@ -166,10 +173,10 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
     fit = against_load.fit_load(data.read_thinned_log(description))
-    if broken or (mounting is not None and mounting.is_mirrored):
+    # The checks below require the weight of the load in the wrench.
+    weightless = "weight" in log.estimated
+    if broken or weightless or (mounting is not None and mounting.is_mirrored):
         return ConventionCheckResult((*broken, *findings), fit, mounting, None)
-    if "weight" in log.estimated:  # the checks below require the weight of the load in the wrench
-        return ConventionCheckResult(tuple(findings), fit, mounting, None)
     if not findings:
         more, description = against_load.clock_drift_finding_and_correction(description, data)
         findings += more
@@ -177,9 +184,7 @@ def _check_description(data: LogData, description: Description) -> ConventionChe
         findings += position_unit_or_origin_findings(description, data, lag)
     more, delay = against_load.check_wrench_and_estimate_delay(description, data)
     findings = _merge_clock_findings(description, [*findings, *more], mounting, delay)
-    rest = _too_few_or_similar_poses_finding(log)
-    if rest is not None:
-        findings.append(rest)
+    findings += _too_few_or_similar_poses_findings(log)
     return ConventionCheckResult(tuple(findings), fit, mounting, delay)
 
 
@@ -189,7 +194,7 @@ def _merge_clock_findings(
     num_clocks = sum(finding.name == "clock" for finding in found)
     if num_clocks < 2 or mounting is None or mounting.clock_drift or delay is None:
         return found
-    if abs(mounting.lag_s + delay) > corrections.MIN_LAG_OF_WRONG_CLOCK_S:
+    if abs(mounting.lag_s + delay) > edits.MIN_LAG_OF_WRONG_CLOCK_S:
         return found
     assert description.pose is not None
     text = f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench"
@@ -198,19 +203,78 @@ def _merge_clock_findings(
     return [finding, *(other for other in found if other.name != "clock")]
 
 
-def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:
+def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     if not log.static:
-        return None
+        return []
     if len(log) < _MIN_CHECKED_POSES:
         remedy = "record 12, turned about two horizontal axes"
         text = f"{len(log)} poses at rest are too few to check the fit; {remedy}"
-        return Finding("static poses", text)
+        return [Finding("static poses", text)]
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
     if least >= _MIN_GRAVITY_DIRECTION_SPREAD:
-        return None
-    angle = float(np.degrees(np.arcsin(least)))
-    alike = f"along one direction gravity in S varies by only {angle:.2g} deg"
-    effect = "which does not separate offsets from the load"
-    remedy = "add poses that are turned by 45 deg or more about two horizontal axes"
-    return Finding("static poses", f"the poses are too alike: {alike}, {effect}; {remedy}")
+        return []
+    text = (
+        "the poses are too alike: along one direction gravity in S varies by only"
+        f" {np.degrees(np.arcsin(least)):.2g} deg, which does not separate offsets from the load;"
+        " add poses that are turned by 45 deg or more about two horizontal axes"
+    )
+    return [Finding("static poses", text)]
+
+
+_WRENCH_FIELDS = ("force", "torque")
+_IMU_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration")
+_MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
+
+
+def _dead_or_repeated_channel_findings(
+    stream: str, description: Description, tables: dict[Path, Table]
+) -> list[Finding]:
+    """Return findings about dead and repeated channels of the stream "wrench" or "imu"."""
+    described = getattr(description, stream)
+    found: list[Finding] = []
+    named: dict[str, str] = {}
+    for field in _WRENCH_FIELDS if stream == "wrench" else _IMU_FIELDS:
+        quantity = getattr(described, field, None)
+        if quantity is None:
+            continue
+        where = f"{stream}.{field}"
+        if twice := _repeated_column_findings(where, quantity.columns, named):
+            found += twice
+            continue
+        numbers: dict[str, Array] = {}
+        for column in quantity.columns:
+            x = tables[described.source].numbers_with_nan(column, where).T
+            parts = [f"{column}[{i}]" for i in range(len(x))] if len(x) > 1 else [str(column)]
+            numbers |= zip(parts, x, strict=True)
+        remedy = f"name another column in {where}.columns, or record again"
+        text = "in all rows, and its neighbours are not: the channel is dead or not connected"
+        for name in _dead_channels(numbers):
+            value = f"{name!r} is {numbers[name][0]:.4g}"
+            found.append(Finding("dead channel", f"{value} {text}; {remedy}"))
+        text = "are the same in all rows: one was recorded twice"
+        for (a, x), (b, y) in combinations(numbers.items(), 2):
+            if np.ptp(x) > 0.0 and np.array_equal(x, y):
+                found.append(Finding("repeated channel", f"{a!r} and {b!r} {text}; {remedy}"))
+    return found
+
+
+def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
+    found = []
+    for column, times in Counter(map(str, columns)).items():
+        before = where if times > 1 else named.get(column)
+        named[column] = where
+        if before is not None:
+            both = "twice" if before == where else f"in {before}.columns too"
+            text = f"{where}.columns names {column!r} {both}: one number cannot be two channels"
+            remedy = f"set {where}.columns to three columns of their own"
+            found.append(Finding("repeated channel", f"{text}; {remedy}"))
+    return found
+
+
+def _dead_channels(numbers: dict[str, Array]) -> list[str]:
+    x = np.stack(list(numbers.values()), axis=1)
+    spread, noise = np.ptp(x, axis=0), white_noise_deviations(x)
+    if not (noise > _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE * spread).any():
+        return []
+    return [name for name, width in zip(numbers, spread, strict=True) if width == 0.0]

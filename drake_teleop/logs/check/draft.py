@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_teleop.common.texts import to_yaml_text
-from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
@@ -136,15 +136,16 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
     found |= _find_vectors_in_array_columns(table, plain)
-    _reinterpret_lone_torque_as_position(found, plain)
+    ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
+    if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
+        found["position"] = found.pop("torque")
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
-    none = [_FILL_IN_TEXT] * 3
-    pair = {x: found.get(x, none) for x in ("force", "torque")}
+    pair = {x: found.get(x, [_FILL_IN_TEXT] * 3) for x in ("force", "torque")}
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
@@ -167,8 +168,10 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
-    if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
-        draft = _streams_of_static_poses(draft)
+    without_time = _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time"))
+    if without_time and table.rows <= _MAX_STATIC_ROWS and pose and not _is_template(wrench):
+        kept = {name: value for name, value in wrench.items() if name != "time"}
+        draft = {"static": {**kept, "orientation": pose["orientation"]}}
     times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
     used |= times - {None}
     arrays = _names_of_array_columns(table)
@@ -185,14 +188,6 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return Draft(draft, head)
-
-
-def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
-    pose, wrench = draft.get("pose"), draft.get("wrench")
-    if pose is None or wrench is None or _is_template(wrench):
-        return draft
-    kept = {name: value for name, value in wrench.items() if name != "time"}
-    return {"static": {**kept, "orientation": pose["orientation"]}}
 
 
 def _split_name_and_unit(name: str) -> tuple[str, str]:
@@ -259,12 +254,6 @@ def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
             if all(name in group for name in names):
                 return {axes: [group[name] for name in names]}
     return {}
-
-
-def _reinterpret_lone_torque_as_position(found: _Columns, plain: _NamesAndUnits) -> None:
-    ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
-    if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
-        found["position"] = found.pop("torque")
 
 
 def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
@@ -338,8 +327,11 @@ def _draft_quantity(
     group: dict[str, Any] = {"columns": list(columns)}
     if _FILL_IN_TEXT in columns:
         return group
-    if kind in ("force", "torque") and _are_raw_counts(table, columns[0]):
-        group["scale"] = _FILL_IN_TEXT
+    if kind in ("force", "torque"):
+        x = table.numbers_with_nan(columns[0], columns[0])
+        is_integer = (np.nan_to_num(x) % 1.0 == 0.0).all()
+        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT:
+            group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
         unit = _known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
@@ -354,12 +346,6 @@ def _draft_quantity(
         "position": ("m", "mm", 20),
     }.get(kind, ("rad", "deg", 15))
     return group | {"unit": other if np.nanmax(size) > limit else usual}
-
-
-def _are_raw_counts(table: Table, column: str) -> bool:
-    x = table.numbers_with_nan(column, column)
-    large = np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT
-    return bool(large and (np.nan_to_num(x) % 1.0 == 0.0).all())
 
 
 def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
@@ -398,7 +384,9 @@ def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, A
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
     if unit not in _ALLOWED_UNITS["time"]:
-        unit = _guess_time_unit(table, named[0])
+        step = float(np.nanmedian(np.abs(np.diff(table.single_column(named[0], named[0])))))
+        units = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6)
+        unit = next((unit for unit, scale in units if step * scale <= 0.3), "ns")
     return {"column": named[0], "unit": unit}
 
 
@@ -413,9 +401,3 @@ def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
         return bool((steps > 0.0).all() and even and not is_counter)
 
     return [name for name in plain if is_clock(name)]
-
-
-def _guess_time_unit(table: Table, column: str) -> str:
-    step = float(np.nanmedian(np.abs(np.diff(table.single_column(column, column)))))
-    units = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6)
-    return next((unit for unit, scale in units if step * scale <= 0.3), "ns")

@@ -1,18 +1,28 @@
-"""Findings about a log, and edits of its description, each for one suspected error."""
+"""Edits of a log description, each for one suspected error, and the log that they give."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from itertools import permutations
+from dataclasses import replace
+from itertools import permutations, product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES, right_angled_rotations
+from drake_teleop.logs.causes.cause import Finding
+from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.reading import read_described_log
+from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
+from drake_teleop.logs.read.tables import Table
 
 FINDINGS_CAUSED_BY_MISFIT = ("lag", "units", "payload")  # or by its cause, such as drift
 MOTION_FINDINGS = (
@@ -21,21 +31,6 @@ MOTION_FINDINGS = (
 )
 """Errors of the described motion, which resemble causes."""
 MIN_LAG_OF_WRONG_CLOCK_S = 0.05  # filters lag less
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Suspicious property of a log.
-
-    Args:
-        name: category for programs: "sign", "units" ...
-        message: observation and remedy.
-        fields: corrected values of fields of the log description, as in YAML.
-    """
-
-    name: str
-    message: str
-    fields: dict[str, Any] = field(default_factory=dict)
 
 
 Edit = tuple[Finding, Description]  # a finding, and the corrected description
@@ -56,7 +51,7 @@ def _make_edit(
     lines = " and ".join(f"{path}: {value}" for path, value in shown.items())
     for path, value in fields.items():
         description = edit_field(description, path, _lists_to_tuples(value))
-    return Finding(name, f"{text}; set {lines}{note}", fields), description
+    return Finding(name, f"{text}; set {lines}{note}", fields=fields), description
 
 
 def _lists_to_tuples(value: Any) -> Any:
@@ -67,14 +62,10 @@ def correct_accelerometer_unit(
     description: Description, log: Log
 ) -> tuple[list[Finding], Description]:
     """Return a finding for an accelerometer in a wrong unit, and the corrected description."""
-    sensors: dict[str, Any] = {
-        f"{stream}.{name}": getattr(getattr(description, stream), name, None)
-        for stream in ("imu", "static")
-        for name in ("specific_force", "gravity")
-    }
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     ratio = median / float(np.linalg.norm(description.gravity_W))
-    for path, sensor in sensors.items():
+    for stream, name in product(("imu", "static"), ("specific_force", "gravity")):
+        path, sensor = f"{stream}.{name}", getattr(getattr(description, stream), name, None)
         if sensor is None:
             continue
         read = ratio / description.unit_in_si(sensor.unit)
@@ -126,7 +117,7 @@ def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
     changed = edit_field(description, path, sign)
-    return Finding(finding.name, text, finding.fields | {path: sign}), changed
+    return replace(finding, message=text, fields=finding.fields | {path: sign}), changed
 
 
 def call_or_none_if_unreadable(function: Callable[[Description], Any], edited: Description) -> Any:
@@ -168,3 +159,106 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         fields = {f"{stream}.frame": (R @ old).tolist()}
         yield _make_edit(description, "swapped axes", "the wrench is in other axes", fields)
+
+
+_THINNED_RATE_HZ = 100.0
+_THIN_TIME_PREFIX = "thinned time stamps of"
+
+
+class LogData:
+    """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
+
+    def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
+        self._source, self.tables = source, tables
+        self._thinned: dict[Path, Table] = {}
+        steps: dict[Path, list[int]] = {}
+        for stream in description.streams.values():
+            if stream.source not in tables:
+                tables[stream.source] = read_stream_table(stream)
+            steps.setdefault(stream.source, []).append(self._thinning_stride(stream))
+        for name, stream in description.streams.items():
+            whole = tables[stream.source]
+            copied = replace(whole, columns=dict(whole.columns))
+            thinned = self._thinned.setdefault(stream.source, copied)
+            self._add_thinned_columns(name, stream, thinned, min(steps[stream.source]))
+
+    def read_whole_log(self, description: Description) -> Log:
+        return read_described_log(description, self._source, tables=self.tables)
+
+    def read_thinned_log(self, description: Description) -> Log:
+        """Return the log at about 100 Hz, as a description defines it."""
+        stamped = {}
+        for name, stream in description.streams.items():
+            if (time := getattr(stream, "time", None)) is not None:
+                column = {"column": f"{_THIN_TIME_PREFIX} {name}", "unit": "s"}
+                time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
+                stamped[name] = stream.model_copy(update={"time": time})
+        description = description.model_copy(update=stamped)
+        return read_described_log(description, self._source, tables=self._thinned)
+
+    def start_lag_and_clock_drift_correction(
+        self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
+    ) -> tuple[float, str, Description]:
+        """Return a stream's lag at its first row [s], lines to set, and the edited description.
+
+        The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row, and by
+        `drift` [s/s] more each second.
+        """
+        time = getattr(description, name).time
+        start = self._start_time_of_stream(getattr(description, name))
+        start -= self._start_time_of_stream(description.wrench)
+        scale = 1.0 / (1.0 + drift)
+        lag = scale * (lag_at_wrench_start_s + drift * start)
+        offset, factor = time.offset - lag, scale * time.scale
+        edited = edit_field(description, f"{name}.time.offset", offset)
+        lines = f"{name}.time.offset: {offset:.3f} and {name}.time.scale: {factor:.6f}"
+        return lag, lines, edit_field(edited, f"{name}.time.scale", factor)
+
+    def _start_time_of_stream(self, stream: Any) -> float:
+        return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
+
+    def _thinning_stride(self, stream: Any) -> int:
+        if getattr(stream, "time", None) is None:
+            return 1
+        t, _ = self._times_and_rows(stream)
+        if len(t) < 2:  # read_log raises the error
+            return 1
+        rate = 1 / max(1e-12, float(np.median(np.diff(t))))
+        # A short record keeps enough samples.
+        most = min(rate / _THINNED_RATE_HZ, len(t) / MIN_STREAM_SAMPLES)
+        return max(1, math.floor((most - 1) / 2) * 2 + 1)
+
+    def _table_of_stream(self, stream: Any) -> Table:
+        return self.tables[stream.source].rows_with_any_number(stream.columns)
+
+    def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
+        t, _ = time_stamps_and_num_episodes(stream.time, self._table_of_stream(stream), "time")
+        rows = np.flatnonzero(np.isfinite(t))
+        t = t[rows]
+        steps = np.diff(t)
+        shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
+        return (spread_shared_stamps(t) if shared else t), rows
+
+    def _add_thinned_columns(self, name: str, stream: Any, thinned: Table, block_rows: int) -> None:
+        table, rows = self._table_of_stream(stream), None
+        if getattr(stream, "time", None) is not None:
+            t, rows = self._times_and_rows(stream)
+            means = _means_of_consecutive_rows(t[:, None], block_rows)
+            thinned.columns[f"{_THIN_TIME_PREFIX} {name}"] = means
+        for field in type(stream).model_fields:
+            quantity = getattr(stream, field)
+            for column in map(str, getattr(quantity, "columns", ())):
+                x = table.numbers_with_nan(column, field)
+                x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
+                if field == "orientation":
+                    x = x[block_rows // 2 :: block_rows][: len(x) // block_rows]
+                else:
+                    x = _means_of_consecutive_rows(x, block_rows)
+                thinned.columns[column] = x
+
+
+def _means_of_consecutive_rows(x: Array, block_rows: int) -> Array:
+    if block_rows == 1:
+        return x
+    rows = len(x) // block_rows
+    return np.asarray(x[: rows * block_rows].reshape(rows, block_rows, -1).mean(axis=1))
