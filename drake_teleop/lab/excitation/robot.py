@@ -178,7 +178,6 @@ def _make_robot(
     if touching:
         names = ", ".join(touching)
         assumptions.append(f"no clearance required, as they touch in the start posture: {names}")
-    rows, ends, radii, pairs, distances = scene.bounding_capsules_and_pairs(candidates, postures)
     phi, std = arm.phi_load, sensor.wrench_std()
     noise = float(std[0]), float(std[3])
     force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)
@@ -195,12 +194,8 @@ def _make_robot(
         points_S=points_S,
         box_middle=box[0],
         box_half=box[1],
-        capsule_links=rows,
-        capsule_ends=ends,
-        capsule_radius=radii,
-        capsule_pairs=pairs,
-        min_pair_distances=distances,
         clearance=MIN_CLEARANCE_M,
+        **scene.bounding_capsules_and_pairs(candidates, postures),
     )
     return Robot(
         name=name,
