@@ -7,6 +7,7 @@ The tool is along an axis of S, the z axis of frame A; S and A are the same for 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +29,6 @@ from drake_teleop.lab.new_station.random_postures import (
     posture_scores,
     postures_at,
     random_postures,
-    rotate_sensor_frame_of_arm,
     select_suitable_postures,
     sensor_degrees_of_freedom,
 )
@@ -148,7 +148,9 @@ def find_start_place(
         plane: height of the base plane, below which the arm has no joints [m].
         axis: axis of S along the tool, one of `TOOL_AXES`.
     """
-    pointed = rotate_sensor_frame_of_arm(arm, TOOL_AXES[axis].matrix())
+    table, rotation = arm.table.copy(), slice(ROTATION_COLUMN, TRANSLATION_COLUMN)
+    table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ TOOL_AXES[axis].matrix()).ravel()
+    pointed = replace(arm, table=table)  # with frame A instead of S
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     has_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -223,11 +223,3 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
     return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
-
-
-def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with its sensor frame rotated by R_SA."""
-    table = arm.table.copy()
-    R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
-    table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()
-    return replace(arm, table=table)
