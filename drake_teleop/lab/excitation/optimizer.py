@@ -87,7 +87,8 @@ class DesignProblem:
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
         q_qd_qdd, g = self._evaluate_motion(x), self._gradients
-        value, g_V = self._criterion.smooth_log_and_gradient(*self._vectors, criterion_sharpness)
+        s, omega, alpha = self._vectors
+        value, g_V = self._criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
         smooth, largest = self._write_gradients(q_qd_qdd, g_V, limit_sharpness, g)
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
@@ -115,7 +116,8 @@ class DesignProblem:
 
     def value(self) -> float:
         """Return the exact criterion of the last evaluated point."""
-        return self._criterion.value(*self._vectors, self._period_s)
+        s, omega, alpha = self._vectors
+        return self._criterion.value(s, omega, alpha, self._period_s)
 
     def _gradients_by_unknowns(self) -> Array:
         g = self._gradients

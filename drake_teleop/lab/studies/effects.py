@@ -244,7 +244,8 @@ class _MeasureData:
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
         count = len(levels.names)
-        figures, is_compared, used = np.full((4, count), np.nan), np.zeros(count, bool), np.zeros(1)
+        mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
+        is_compared, used = np.zeros(count, dtype=bool), np.zeros(1, dtype=bool)
         if self.model is not None:
             comparable, combinations, weights = self.model.comparison_weights(factor)
             if comparable.sum() > 1:
@@ -254,34 +255,34 @@ class _MeasureData:
                 figures[:, is_compared] = found
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
         reasons_and_counts = self._reasons_and_counts(is_compared, levels.index, used, factor)
-        return MainEffect(levels.names, runs, *figures, *reasons_and_counts)
+        return MainEffect(levels.names, runs, mean, half, effect, effect_half, *reasons_and_counts)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.comparison_weights(first, second)
+        is_compared, over, weights = self.model.comparison_weights(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why, *counts = self._reasons_and_counts(is_compared, cell, combinations, first, second)
+        why, used, unused, fitted = self._reasons_and_counts(is_compared, cell, over, first, second)
         fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
-        return PairMeans(fields, names, mean.reshape(shape), np.reshape(why, shape), *counts)
+        reasons = np.array(why).reshape(shape)
+        return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
     def _reasons_and_counts(
-        self, compared: BooleanArray, cell: NDArray[np.int64], combinations: NDArray[Any],
-        *shown: int,
-    ) -> tuple[list[str], int, int, bool]:  # fmt: skip
-        # The last four fields of `MainEffect`.
+        self, compared: BooleanArray, cell: NDArray[np.int64], over: BooleanArray, *shown: int
+    ) -> tuple[list[str], int, int, bool]:
+        # The last four fields of `MainEffect`; `over` flags the used combinations.
         points, runs = (np.bincount(cell, each, len(compared)) for each in (None, self.runs))
         why = missing_value_reasons(compared, points, runs)
         why = [TOO_FEW_POINTS] * len(compared) if self.model is None else why
         total = math.prod(len(f.names) for k, f in enumerate(self.levels) if k not in shown)
-        used = round(np.mean(combinations) * total)
+        used = round(np.mean(over) * total)
         return why, used, total - used, not isinstance(self.model, Factorial)
 
 
