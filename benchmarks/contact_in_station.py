@@ -41,7 +41,7 @@ from drake_teleop.lab.identification import (
     sensor_samples,
     slave_arm,
 )
-from drake_teleop.lab.run_summary import is_in_contact
+from drake_teleop.lab.run import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.channel.channel import Channel

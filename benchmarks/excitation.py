@@ -35,7 +35,6 @@ from drake_teleop.lab.excitation.excite import (
 from drake_teleop.lab.excitation.optimizer import (
     USABLE_LIMIT_SHARE,
     DesignProblem,
-    DesignTask,
     minimise_criterion,
 )
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
@@ -61,24 +60,16 @@ MOTION_NOISE = (0.06, 0.002, 1.5)
 GAIN, CROSS_TALK, DELAY, DRAWS = 0.01, 0.003, 1e-3, 16
 
 
-def task_of(robot: Robot, criterion: str, period: float) -> DesignTask:
-    return DesignTask(
-        robot.arm.table,
-        robot.limits,
-        Criterion(criterion, robot.criterion_scales),
-        robot.home_posture,
-        period,
-        5,
-    )
+def problem_of(robot: Robot, criterion: str, period: float) -> DesignProblem:
+    return DesignProblem(robot, Criterion(criterion, robot.criterion_scales), period, 5)
 
 
 def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dict[str, Any]:
     """Return the checked values after both times, by seed, and the time of one check."""
     criterion, period, soon, later = row
-    task = task_of(robot, criterion, period)
     values: dict[str, list[float]] = {"soon": [], "later": []}
     for seed in range(seeds):
-        found = minimise_criterion(DesignProblem(task), seed=seed, seconds=later)
+        found = minimise_criterion(problem_of(robot, criterion, period), seed=seed, seconds=later)
         for name, seconds in (("soon", soon), ("later", later)):
             trajectory, _ = find_best_within_limits(
                 robot, [it for it in found if it.cpu_time_s <= seconds]
@@ -96,7 +87,7 @@ class _TimeIsUpError(Exception):
 
 def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -> float:
     """Return kappa_w10 on the grid after a time of SLSQP without gradients, or inf."""
-    problem = DesignProblem(task_of(robot, "kappa_w10", period))
+    problem = problem_of(robot, "kappa_w10", period)
     rng = np.random.default_rng(seed)
     candidates = [problem.candidate(rng, near_home=k % 2 == 0) for k in range(64)]
     merits = []

@@ -20,11 +20,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from drake_teleop.lab.excitation.limits import (
-    allocate_link_motions,
-    write_link_motions,
-    write_sensor_motion,
-)
+from drake_teleop.lab.excitation.limits import motion_of_sensor, motions_of_links
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import design_shortest_motion
 from drake_teleop.load.normal_equations import identify
@@ -72,10 +68,7 @@ def reached(
     sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.heaviest_phi
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
-    motions = allocate_link_motions(*joints[0].shape)
-    write_link_motions(table, *joints, motions)
-    vectors = np.empty((3, len(motions), 3))
-    write_sensor_motion(motions, vectors)
+    vectors = motion_of_sensor(motions_of_links(table, *joints))
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     noisy = without_parts(sensor, "calibration")
     constants, memory = initialize_sensor_chain(noisy, joints[0].shape[1], period)

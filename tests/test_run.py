@@ -14,13 +14,13 @@ from shown import type_in
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.lab.run import run_command
-from drake_teleop.lab.run_summary import (
+from drake_teleop.lab.run import (
     FILTER_TAIL_S,
     ScenarioRun,
     _detection_delays,
     _moving_body_displacements,
     is_in_contact,
+    run_command,
     summarise,
 )
 from drake_teleop.load.batch.uncertainty import confidence_intervals

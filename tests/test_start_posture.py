@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.new_station import scenario_text
 from drake_teleop.lab.new_station.place import (
     _find_roomy_holdable_postures,
     _order_postures_to_solve,
@@ -28,7 +29,6 @@ from drake_teleop.lab.new_station.random_postures import (
     sensor_degrees_of_freedom,
     upward_share_of_elbow_offset,
 )
-from drake_teleop.lab.new_station.text import scenario_text, wall_of_plan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
@@ -187,8 +187,8 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     assert (
         plan.posture_shapes.points_on_bodies(plan.posture_shapes.moving_bodies())[:, 2].min() > 0.02
     )
-    assert start_overlap_texts(slave_of(plan, path), wall_of_plan(plan))[0] == ()
-    assert wall_of_plan(plan).position[2] < plan.lowest_tool_point_W[2] - 0.01
+    assert start_overlap_texts(slave_of(plan, path), plan.wall)[0] == ()
+    assert plan.wall.position[2] < plan.lowest_tool_point_W[2] - 0.01
 
 
 def test_arm_that_can_only_face_minus_y_starts_there(tmp_path):
@@ -210,7 +210,7 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
 def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
     path, plan = plain
     slave = slave_of(plan, path)
-    assert start_overlap_texts(slave, wall_of_plan(plan))[0] == ()
+    assert start_overlap_texts(slave, plan.wall)[0] == ()
     elbow = postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
     (said,) = [
         text
@@ -298,11 +298,7 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
         near = [{each.first.name(), each.second.name()} for each in shapes.overlaps()]
         counts.append({"link2", "link4"} in near)
     assert 0.6 < np.mean(counts) < 0.95
-    assert (
-        start_overlap_texts(slave_of(plan, path), wall_of_plan(plan))[0]
-        == ()
-        == plan.overlap_warnings
-    )
+    assert start_overlap_texts(slave_of(plan, path), plan.wall)[0] == () == plan.overlap_warnings
     assert not any("link2 and link4" in text for text in plan.assumptions)
 
 

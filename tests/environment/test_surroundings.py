@@ -25,7 +25,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
-from drake_teleop.lab.run_summary import ScenarioRun, summarise
+from drake_teleop.lab.run import ScenarioRun, summarise
 from drake_teleop.station.environment.environment import SeveralObjects
 from drake_teleop.station.environment.moving_bodies import (
     MakeJointTableAndRowBodies,

@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
-from drake_teleop.lab.run_summary import is_in_contact
+from drake_teleop.lab.run import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import CONTACT_END_LEVEL, CUSUM_SLACK, ContactDetector
 from drake_teleop.load.contact.noise_floor import NoiseFloor

@@ -20,12 +20,11 @@ from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
-    allocate_link_motions,
     capsule_distances,
+    motions_of_links,
     write_limit_uses,
-    write_link_motions,
 )
-from drake_teleop.lab.excitation.optimizer import DesignProblem, DesignTask, _DescentSearch
+from drake_teleop.lab.excitation.optimizer import DesignProblem, _DescentSearch
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     _motion_error_polynomials,
@@ -159,6 +158,11 @@ def limits_of(arm) -> Limits:
     )
 
 
+def problem_of(table, limits, home, name="kappa_w10", period=6.0) -> DesignProblem:
+    robot = SimpleNamespace(arm=SimpleNamespace(table=table), limits=limits, home_posture=home)
+    return DesignProblem(robot, Criterion(name, SCALES), period, 3)
+
+
 @pytest.fixture(scope="module")
 def arm():
     return AddSlavePlant(DiagramBuilder(), Slave(), None).arm
@@ -173,8 +177,7 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     table[:-1, 23] = 0.5
     table[sliding, IS_PRISMATIC_COLUMN] = 1.0
     home = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0])
-    task = DesignTask(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
-    problem = DesignProblem(task)
+    problem = problem_of(table, limits_of(arm), home, name)
     x = problem.candidate(np.random.default_rng(0), near_home=True)
     gradients = problem.evaluate(x, 3.0, 5.0).gradients
     scale = np.abs(gradients).max(axis=1)
@@ -193,10 +196,8 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     limits, rng = limits_of(arm), np.random.default_rng(3)
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
-    motions = allocate_link_motions(30, 6)
-    write_link_motions(arm.table, q, qd, qdd, motions)
-    smooth, largest, gradient = np.empty(7), np.empty(7), np.empty((7, 3, 30, 6))
-    write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
+    motions, gradient = motions_of_links(arm.table, q, qd, qdd), np.empty((7, 3, 30, 6))
+    smooth, largest = write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, gradient)
     assert np.all(smooth >= largest)
     R_WS, p_WS = motions[:, -1, 12:].reshape(-1, 3, 3), motions[:, -1, 9:12]
     points = p_WS[:, None] + np.einsum("tij,kj->tki", R_WS, limits.points_S)
@@ -223,9 +224,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
 def test_candidates_cover_the_middle_of_the_range(arm):
     limits, rng = limits_of(arm), np.random.default_rng(1)
     home = np.zeros(6)
-    problem = DesignProblem(
-        DesignTask(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3)
-    )
+    problem = problem_of(arm.table, limits, home)
     starts = np.array([problem.candidate(rng, near_home=False)[:6] for _ in range(50)])
     share = np.abs(starts - limits.q_middle) / limits.q_half
     assert np.all(share <= 0.6) and np.all(share.max(axis=0) > 0.5)
@@ -238,9 +237,9 @@ def test_candidate_size_grows_with_the_square_of_the_period(arm):
     limits = limits_of(arm)._replace(q_half=wide, velocity=wide, acceleration=np.ones(6))
     coefficients = []
     for period in (3.0, 6.0):
-        task = DesignTask(arm.table, limits, Criterion("kappa_w10", SCALES), np.zeros(6), period, 3)
+        problem = problem_of(arm.table, limits, np.zeros(6), period=period)
         rng = np.random.default_rng(2)
-        coefficients.append(DesignProblem(task).candidate(rng, near_home=True)[6:])
+        coefficients.append(problem.candidate(rng, near_home=True)[6:])
     np.testing.assert_allclose(coefficients[1], 4.0 * coefficients[0], rtol=1e-12)
 
 
@@ -290,6 +289,6 @@ def test_distances_of_capsules():
     )
     rows, radii = np.full(6, -1), np.full(6, 0.1)
     pairs = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [4, 5], [3, 4], [4, 3]])
-    distances = capsule_distances(allocate_link_motions(1, 1), rows, ends, radii, pairs)[0]
+    distances = capsule_distances(np.empty((1, 2, 21)), rows, ends, radii, pairs)[0]
     expected = [0.5, 0.3, 1, 2, 3, np.sqrt(8), np.sqrt(8)]
     np.testing.assert_allclose(distances, np.array(expected) - 0.2, atol=1e-12)

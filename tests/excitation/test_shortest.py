@@ -7,9 +7,7 @@ import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.excitation import shortest as module
-from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import trajectory_sensor_motion
-from drake_teleop.lab.excitation.optimizer import DesignTask
 from drake_teleop.lab.excitation.prediction import predicted_covariance
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import (
@@ -33,11 +31,8 @@ def slave() -> Robot:
 
 
 def problem_of(slave: Robot, times: float = 1.0) -> ShortestMotionProblem:
-    criterion = Criterion("A16", slave.criterion_scales)
-    task = DesignTask(slave.arm.table, slave.limits, criterion, slave.home_posture, 1.0, 3)
-    return ShortestMotionProblem(
-        task, times * derivatives_over_tolerances(ASKED, slave.limits.heaviest_phi), slave, None
-    )
+    errors = times * derivatives_over_tolerances(ASKED, slave.limits.heaviest_phi)
+    return ShortestMotionProblem(slave, 3, errors, None)
 
 
 def test_reliable_factor_grows_with_the_number_of_tolerances() -> None:

@@ -30,7 +30,7 @@ from drake_teleop.lab.reproduction.report import (
     describe_unaccepted,
     values_by_full_name,
 )
-from drake_teleop.lab.run_summary import is_in_contact
+from drake_teleop.lab.run import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor_into

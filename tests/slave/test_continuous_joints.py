@@ -18,8 +18,7 @@ from drake_teleop.common.vectors import quaternion_product
 from drake_teleop.lab.excitation.check import check_trajectory
 from drake_teleop.lab.excitation.excite import excite
 from drake_teleop.lab.excitation.robot import RobotFromModel
-from drake_teleop.lab.run import run_scenario
-from drake_teleop.lab.run_summary import summarise
+from drake_teleop.lab.run import run_scenario, summarise
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.inputs import Inputs
 from drake_teleop.station.master.leader_model import Leader

@@ -18,7 +18,7 @@ from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies import runs
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
-from drake_teleop.lab.studies.shards import parse_shard
+from drake_teleop.lab.studies.store import parse_shard
 from drake_teleop.lab.studies.study import study_command
 
 STUDY = Study(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,8 @@ def bounding_capsule(shape: geometry.Shape) -> Capsule:
         end = np.array([0.0, 0.0, shape.length() / 2])
         return Capsule(np.array([-end, end]), shape.radius())
     points = _convex_hull_points(shape)
-    middle = (points.max(axis=0) + points.min(axis=0)) / 2
-    half = (points.max(axis=0) - points.min(axis=0)) / 2
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (high + low) / 2, (high - low) / 2
     candidates = []
     for axis in np.eye(3):
         for share in (0.0, 0.4, 0.6, 0.8, 0.9, 1.0):
@@ -62,11 +63,10 @@ def bounding_capsule(shape: geometry.Shape) -> Capsule:
 
 
 def _convex_hull_points(shape: geometry.Shape) -> Array:
+    corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
     if isinstance(shape, geometry.Box):
-        corners = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, 8).T
-        return corners * shape.size()
+        return corners * (shape.size() / 2)
     if isinstance(shape, geometry.Ellipsoid):
-        corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
         return corners * [shape.a(), shape.b(), shape.c()]
     if isinstance(shape, geometry.Cylinder):
         angle = 2 * np.pi * np.arange(_NUM_CYLINDER_RIM_POINTS) / _NUM_CYLINDER_RIM_POINTS
@@ -125,8 +125,7 @@ class CollisionScene:
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
         _add_load(self.plant, instance, self.sensor_frame, reserve)
-        _complete_collision_shapes(self.plant, self.scene_graph, visuals_collide)
-        _check_shape_sizes(self.plant, self.scene_graph, where)
+        _complete_and_check_shapes(self.plant, self.scene_graph, visuals_collide, where)
         world, table = self.plant.world_body(), geometry.HalfSpace()
         _add_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)
         finalize_without_limit_warnings(self.plant)
@@ -186,14 +185,13 @@ class CollisionScene:
 
     def bounding_capsules_and_pairs(
         self, candidates: dict[_ShapePair, Array], postures: Array
-    ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
-        """Return capsules around the shapes, as the fields of `Limits` from `capsule_links` on."""
+    ) -> dict[str, NDArray[Any]]:
+        """Return the fields of `Limits` that describe capsules around the shapes."""
         inspector = self.scene_graph.model_inspector()
-        motions = limits.allocate_link_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
-        limits.write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
+        motions = limits.motions_of_links(self.arm.table, q, 0 * q, 0 * q)
         capsules: dict[geometry.GeometryId, tuple[int, Capsule]] = {}
         shapes = {shape for pair in candidates for shape in pair}
         for shape in sorted(shapes, key=geometry.GeometryId.get_value):
@@ -216,13 +214,14 @@ class CollisionScene:
             known = shape_distances.get((first, second), np.inf)
             shape_distances[first, second] = np.minimum(of_pair, known)
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
-        capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         outer_capsules = [capsules[shape][1] for shape in outer_shapes]
-        motions = limits.allocate_link_motions(len(postures), self.arm.num_joints)
-        limits.write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
-        ends = np.array([capsule.ends for capsule in outer_capsules]).reshape(-1, 2, 3)
-        radii = np.array([capsule.radius for capsule in outer_capsules])
-        capsules_apart = limits.capsule_distances(motions, capsule_rows, ends, radii, pairs)
+        motions = limits.motions_of_links(self.arm.table, postures, 0 * postures, 0 * postures)
+        fields: dict[str, NDArray[Any]] = {
+            "capsule_links": np.array([capsules[shape][0] for shape in outer_shapes], np.int64),
+            "capsule_ends": np.array([each.ends for each in outer_capsules]).reshape(-1, 2, 3),
+            "capsule_radius": np.array([each.radius for each in outer_capsules]),
+        }
+        capsules_apart = limits.capsule_distances(motions, *fields.values(), pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
             distance = _required_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
@@ -236,7 +235,7 @@ class CollisionScene:
             if useful:
                 used.append(k)
                 distances.append(distance)
-        return capsule_rows, ends, radii, pairs[used], np.array(distances)
+        return fields | {"capsule_pairs": pairs[used], "min_pair_distances": np.array(distances)}
 
 
 def _required_capsule_distance(shape_distances: Array, capsules_apart: Array) -> float:
@@ -292,28 +291,22 @@ def _add_load(
     plant.AddJoint(weld)
 
 
-def _complete_collision_shapes(
-    plant: MultibodyPlant, scene_graph: geometry.SceneGraph, visuals_collide: bool
+def _complete_and_check_shapes(
+    plant: MultibodyPlant, scene_graph: geometry.SceneGraph, visuals_collide: bool, where: str
 ) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(tree.BodyIndex(index))
-        for k, solid in enumerate(plant.GetCollisionGeometriesForBody(body)):
+        solids = plant.GetCollisionGeometriesForBody(body)
+        for k, solid in enumerate(solids):
             if isinstance(shape := inspector.GetShape(solid), geometry.HalfSpace):
                 X_BG = inspector.GetPoseInFrame(solid)
                 scene_graph.RemoveRole(plant.get_source_id(), solid, geometry.Role.kProximity)
                 _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
-        if plant.GetCollisionGeometriesForBody(body) and not visuals_collide:
-            continue
-        for k, visual in enumerate(plant.GetVisualGeometriesForBody(body)):
+        visuals = plant.GetVisualGeometriesForBody(body) if visuals_collide or not solids else ()
+        for k, visual in enumerate(visuals):
             X_BG, shape = inspector.GetPoseInFrame(visual), inspector.GetShape(visual)
             _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
-
-
-def _check_shape_sizes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph, where: str) -> None:
-    inspector = scene_graph.model_inspector()
-    for index in range(plant.num_bodies()):
-        body = plant.get_body(tree.BodyIndex(index))
         for shape in map(inspector.GetShape, plant.GetCollisionGeometriesForBody(body)):
             if isinstance(shape, geometry.HalfSpace):  # replaced by a plate
                 continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import accumulate, chain
+from itertools import accumulate, chain, islice
 
 import numpy as np
 
@@ -68,15 +68,14 @@ def excite(
 
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
-    scaled, start = Criterion(criterion, robot.criterion_scales), robot.home_posture
-    task = optimizer.DesignTask(robot.arm.table, robot.limits, scaled, start, period, harmonics)
+    scaled = Criterion(criterion, robot.criterion_scales)
     with show_progress(progress) as stage:
         report = stage("Design the trajectory")
 
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        problem = optimizer.DesignProblem(task)
+        problem = optimizer.DesignProblem(robot, scaled, period, harmonics)
         found = optimizer.minimise_criterion(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
@@ -125,7 +124,8 @@ def find_best_within_limits(
     If none of `iterates` passes, `fallback_trajectories` are checked in their order.
     """
     worst: LimitUse | None = None
-    for trajectory in chain(_feasible_candidates(iterates, robot), fallback_trajectories):
+    candidates = islice(_feasible_candidates(iterates, robot), _MAX_CHECKED_CANDIDATES)
+    for trajectory in chain(candidates, fallback_trajectories):
         uses = check_trajectory(robot, trajectory, progress)
         if uses[0].used_share <= 1:
             return trajectory, uses
@@ -153,9 +153,7 @@ def trajectory_sensor_motion(
 ) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
     _, motions = _joint_and_link_motions(robot, trajectory)
-    out = np.empty((3, len(motions), 3))
-    limits.write_sensor_motion(motions, out)
-    s, omega, alpha = out
+    s, omega, alpha = limits.motion_of_sensor(motions)
     return s, omega, alpha
 
 
@@ -163,9 +161,7 @@ def _joint_and_link_motions(
     robot: Robot, trajectory: FourierTrajectory
 ) -> tuple[tuple[Array, Array, Array], Array]:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = limits.allocate_link_motions(*joints[0].shape)
-    limits.write_link_motions(robot.arm.table, *joints, motions)
-    return joints, motions
+    return joints, limits.motions_of_links(robot.arm.table, *joints)
 
 
 def _feasible_candidates(
@@ -173,7 +169,6 @@ def _feasible_candidates(
 ) -> Iterator[FourierTrajectory]:
     ranked = sorted(iterates, key=lambda iterate: iterate.criterion_value)
     last = dict.fromkeys((iterate.start_index for iterate in ranked), 0.0)
-    checks = 0
     for iterate in ranked:
         if iterate.criterion_value < _MIN_CRITERION_RATIO_OF_CANDIDATES * last[iterate.start_index]:
             continue
@@ -182,10 +177,7 @@ def _feasible_candidates(
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_limit_uses(robot, trajectory).max() <= 1:
                 yield trajectory
-                checks += 1
                 break
-        if checks == _MAX_CHECKED_CANDIDATES:
-            return
 
 
 def _shrinking_motions_about_start_posture(
@@ -210,9 +202,6 @@ def _shrinking_motions_about_start_posture(
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     joints, motions = _joint_and_link_motions(robot, trajectory)
-    smooth, largest = np.empty((2, len(limits.LIMIT_NAMES)))
     gradients = np.empty((len(limits.LIMIT_NAMES), 3, *joints[0].shape))
-    limits.write_limit_uses(
-        robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
-    )
-    return largest
+    table, bounds = robot.arm.table, robot.limits
+    return limits.write_limit_uses(table, *joints, motions, bounds, 1e3, gradients)[1]

@@ -22,6 +22,7 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
+from drake_teleop.load.regressor import wrench_of_load
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, SENSOR_MOTION_SIZE
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
@@ -98,11 +99,7 @@ def add_torque_to_seeds(table, motions, c, virtual_velocities, seeds):
         v_L, w_L = rotate_to_link(motion, v), rotate_to_link(motion, w)
         s, omega = add_wrench_to_seed(motion, phi, v_L, w_L, seeds[row])
         alpha = rotate_to_link(motion, vector_at(motion, _ALPHA_IN_SEED))
-        h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
-        force = plus(scale_vector(phi[0], s), cross(alpha, h))
-        force = plus(force, cross(omega, cross(omega, h)))
-        torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
-        torque = plus(torque, cross(h, s))
+        force, torque = wrench_of_load(s, omega, alpha, phi)
         F, N = rotate_to_world(motion, force), rotate_to_world(motion, torque)
         add_vector_into(seeds[row], _VIRTUAL_V_IN_SEED, F)
         add_vector_into(seeds[row], _VIRTUAL_W_IN_SEED, N)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Box, Cylinder, Meshcat, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.numeric import Array
@@ -81,24 +80,16 @@ def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
         visuals = plant.GetVisualGeometriesForBody(body)
         shapes = visuals or plant.GetCollisionGeometriesForBody(body)
         replay_file.add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _LINK_COLOUR)
-        points = () if visuals else _outboard_joint_points(robot, context, body)
-        for number, p_BJ in enumerate(points):
+        joints = [] if visuals else [plant.get_joint(index) for index in plant.GetJointIndices()]
+        frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]
+        if robot.scene.sensor_frame.body() is body and not visuals:
+            frames.append(robot.scene.sensor_frame)
+        points = (frame.CalcPose(context, body.body_frame()).translation() for frame in frames)
+        for number, p_BJ in enumerate(p for p in points if np.linalg.norm(p) > 1e-3):
             name, length = f"/arm/{k}/bone_{number}", float(np.linalg.norm(p_BJ))
             meshcat.SetObject(name, Cylinder(0.04 * length, length), _LINK_COLOUR)
             along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
             meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
-
-
-def _outboard_joint_points(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
-    plant = robot.scene.plant
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]
-    if robot.scene.sensor_frame.body() is body:
-        frames.append(robot.scene.sensor_frame)
-    for frame in frames:
-        p_BJ = frame.CalcPose(context, body.body_frame()).translation()
-        if np.linalg.norm(p_BJ) > 1e-3:
-            yield p_BJ
 
 
 def _add_table_and_sensor_path(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:

@@ -13,17 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.lab.excitation import limits
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.limits import (
-    LIMIT_NAMES,
-    Limits,
-    add_gradient_by_joints,
-    allocate_link_motions,
-    finite_half_ranges,
-    write_limit_uses,
-    write_link_motions,
-    write_sensor_motion,
-)
+from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
 Bounds = list[tuple[float | None, float | None]]
@@ -31,25 +23,6 @@ Bounds = list[tuple[float | None, float | None]]
 
 _SAMPLES_PER_PERIOD_AND_HARMONIC = 24
 _RANDOM_MOTION_LIMIT_SHARE = 0.35  # size of random motions over speed and acceleration limits
-
-
-@dataclass(frozen=True, eq=False)
-class DesignTask:
-    """Specification of a trajectory design.
-
-    Args:
-        arm_table: `ArmModel.table`, with the heaviest load.
-        home_posture: (n,) posture around which half of the candidates are drawn [rad].
-        period_s: duration of the trajectory [s].
-        num_harmonics: number N of harmonics in Eq. (9), at least 2.
-    """
-
-    arm_table: Array
-    limits: Limits
-    criterion: Criterion
-    home_posture: Array
-    period_s: float
-    num_harmonics: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,36 +43,42 @@ class Evaluation:
 
 
 class DesignProblem:
-    """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
+    """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`.
 
-    def __init__(self, task: DesignTask) -> None:
-        self.task = task
-        n, free = len(task.home_posture), 2 * (task.num_harmonics - 1)
-        samples = _SAMPLES_PER_PERIOD_AND_HARMONIC * task.num_harmonics
+    Args:
+        robot: arm, whose home posture is the centre of half of the candidates.
+        period_s: duration of the trajectory [s].
+        num_harmonics: number N of harmonics in Eq. (9), at least 2.
+    """
+
+    def __init__(
+        self, robot: Robot, criterion: Criterion, period_s: float, num_harmonics: int
+    ) -> None:
+        self._criterion, self._period_s, self._num_harmonics = criterion, period_s, num_harmonics
+        self._table, self._limits, self._home = robot.arm.table, robot.limits, robot.home_posture
+        free, samples = 2 * (num_harmonics - 1), _SAMPLES_PER_PERIOD_AND_HARMONIC * num_harmonics
         sine, cosine = np.hsplit(np.eye(free), 2)
-        basis = FourierTrajectory.at_rest(np.zeros(free), sine, cosine, 1 / task.period_s)
+        basis = FourierTrajectory.at_rest(np.zeros(free), sine, cosine, 1 / period_s)
         #: (3, T, free): q, qd, qdd of unit coefficients.
-        self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period_s / samples))
-        self._motions = allocate_link_motions(samples, n)
-        self._vectors = np.empty((3, samples, 3))
-        self._gradients = np.empty((1 + len(LIMIT_NAMES), 3, samples, n))
+        self._basis = np.stack(basis.evaluate(np.arange(samples) * period_s / samples))
+        self._gradients = np.empty((1 + len(limits.LIMIT_NAMES), 3, samples, len(self._home)))
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        n = len(self.task.home_posture)
+        n = len(self._home)
         sine, cosine = x[n:].reshape(2, n, -1)
-        return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period_s)
+        return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self._period_s)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
         """Return the unknowns of a random motion, near or far from the home posture."""
-        task, limits = self.task, self.task.limits
-        rate = 2 * np.pi / task.period_s * np.sqrt(task.num_harmonics)
-        size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
-        amplitude = _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, limits.q_half)
-        spread = np.tile(np.repeat(amplitude, task.num_harmonics - 1), 2)
-        q0 = task.home_posture + 0.1 * rng.standard_normal(len(size))
+        bounds, harmonics = self._limits, self._num_harmonics
+        rate = 2 * np.pi / self._period_s * np.sqrt(harmonics)
+        size = np.minimum(bounds.velocity / rate, bounds.acceleration / rate**2)
+        amplitude = _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, bounds.q_half)
+        spread = np.tile(np.repeat(amplitude, harmonics - 1), 2)
+        q0 = self._home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
-            half = finite_half_ranges(limits.q_half)
-            q0 = limits.q_middle + 0.6 * half * rng.uniform(-1, 1, len(size))
+            half = limits.finite_half_ranges(bounds.q_half)
+            q0 = bounds.q_middle + 0.6 * half * rng.uniform(-1, 1, len(size))
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:
@@ -107,40 +86,38 @@ class DesignProblem:
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
-        q_qd_qdd, g, criterion = self._evaluate_motion(x), self._gradients, self.task.criterion
-        g[0] = 0.0
+        q_qd_qdd, g = self._evaluate_motion(x), self._gradients
         s, omega, alpha = self._vectors
-        value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0])
-        smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[1:])
+        value, g_V = self._criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
+        smooth, largest = self._write_gradients(q_qd_qdd, g_V, limit_sharpness, g)
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
     def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
         # q, qd, qdd (3, T, n); also writes the motions of links and sensor.
-        n = len(self.task.home_posture)
+        n = len(self._home)
         q_qd_qdd: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q_qd_qdd[0] += x[:n]
         q_qd_qdd[1] /= slowdown
         q_qd_qdd[2] /= slowdown**2
-        write_link_motions(self.task.arm_table, *q_qd_qdd, self._motions)
-        write_sensor_motion(self._motions, self._vectors)
+        self._motions = limits.motions_of_links(self._table, *q_qd_qdd)
+        self._vectors = limits.motion_of_sensor(self._motions)
         return q_qd_qdd
 
-    def _limit_uses(
-        self, q_qd_qdd: Array, sharpness: float, gradients: Array
+    def _write_gradients(
+        self, q_qd_qdd: Array, g_V: Array, sharpness: float, gradients: Array
     ) -> tuple[Array, float]:
-        # Smooth uses (7,) and the exact largest one; writes the gradients (7, 3, T, n).
-        smooth, largest = np.empty((2, len(LIMIT_NAMES)))
-        write_limit_uses(
-            self.task.arm_table, *q_qd_qdd, self._motions, self.task.limits, sharpness,
-            smooth, largest, gradients,
-        )  # fmt: skip
+        # Gradients (8, 3, T, n) of a function of V and of uses; returns smooth and largest uses.
+        gradients[0] = 0.0
+        limits.add_gradient_by_joints(self._table, self._motions, *q_qd_qdd[1:], g_V, gradients[0])
+        smooth, largest = limits.write_limit_uses(
+            self._table, *q_qd_qdd, self._motions, self._limits, sharpness, gradients[1:]
+        )
         return smooth, float(largest.max())
 
     def value(self) -> float:
         """Return the exact criterion of the last evaluated point."""
         s, omega, alpha = self._vectors
-        return self.task.criterion.value(s, omega, alpha, self.task.period_s)
+        return self._criterion.value(s, omega, alpha, self._period_s)
 
     def _gradients_by_unknowns(self) -> Array:
         g = self._gradients

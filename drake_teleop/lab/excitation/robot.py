@@ -45,7 +45,7 @@ _MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 # The station's wrist centre and ball tip, and their box in front of the arm and above the table.
 _TOOL_POINTS_IN_WORKSPACE_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
 _WORKSPACE_BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
-_UNLIMITED_BOX = np.zeros(3), np.full(3, np.inf)
+_SENSOR_ORIGIN_S, _UNLIMITED_BOX = np.zeros((1, 3)), (np.zeros(3), np.full(3, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +84,16 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     scene = CollisionScene(parse, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
+    sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
     return _make_robot(
         scene,
         "the station's slave",
-        scenario.wrist_sensor,
-        scenario.motion_estimation,
-        scenario.rates.sensor_hz,
+        sensor,
+        sensor_noise(sensor, scenario.motion_estimation, scene.arm.num_joints, period),
+        ["a table at z = 0", *slave.assumptions],
         start=slave.start,
         points_S=np.array([np.zeros(3), slave.tip] if own else _TOOL_POINTS_IN_WORKSPACE_S),
         box=_UNLIMITED_BOX if own else ((upper + lower) / 2, (upper - lower) / 2),
-        assumptions=["a table at z = 0", *slave.assumptions],
     )
 
 
@@ -145,30 +145,20 @@ def RobotFromModel(
     assumptions += missing
     hint = " (--acceleration)"
     scene.arm, completed = fill_missing_joint_limits(scene.arm, str(path), acceleration, hint=hint)
-    return _make_robot(
-        scene,
-        path.name,
-        sensor,
-        estimation or MotionEstimationConfig(),
-        sensor_hz,
-        start=None,
-        points_S=np.zeros((1, 3)),
-        box=_UNLIMITED_BOX,
-        assumptions=assumptions + completed,
-    )
+    estimation = estimation or MotionEstimationConfig()
+    noise = sensor_noise(sensor, estimation, scene.arm.num_joints, 1 / sensor_hz)
+    return _make_robot(scene, path.name, sensor, noise, assumptions + completed)
 
 
 def _make_robot(
     scene: CollisionScene,
     name: str,
     sensor: WristSensorConfig,
-    estimation: MotionEstimationConfig,
-    sensor_hz: float,
-    *,
-    start: Array | None,
-    points_S: Array,
-    box: tuple[Array, Array],
+    noise: SensorNoise,
     assumptions: list[str],
+    start: Array | None = None,
+    points_S: Array = _SENSOR_ORIGIN_S,
+    box: tuple[Array, Array] = _UNLIMITED_BOX,
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
@@ -178,9 +168,8 @@ def _make_robot(
     if touching:
         names = ", ".join(touching)
         assumptions.append(f"no clearance required, as they touch in the start posture: {names}")
-    rows, ends, radii, pairs, distances = scene.bounding_capsules_and_pairs(candidates, postures)
     phi, std = arm.phi_load, sensor.wrench_std()
-    noise = float(std[0]), float(std[3])
+    wrench_noise = float(std[0]), float(std[3])
     force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)
     torque = _USABLE_SENSOR_TORQUE_SHARE * min(sensor.torque_range)
     alpha = sensor.angular_acceleration_range
@@ -195,20 +184,16 @@ def _make_robot(
         points_S=points_S,
         box_middle=box[0],
         box_half=box[1],
-        capsule_links=rows,
-        capsule_ends=ends,
-        capsule_radius=radii,
-        capsule_pairs=pairs,
-        min_pair_distances=distances,
         clearance=MIN_CLEARANCE_M,
+        **scene.bounding_capsules_and_pairs(candidates, postures),
     )
     return Robot(
         name=name,
         scene=scene,
         arm=arm,
         limits=limits,
-        criterion_scales=CriterionScales(noise, limited_gyration_radius(phi), phi),
-        sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
+        criterion_scales=CriterionScales(wrench_noise, limited_gyration_radius(phi), phi),
+        sensor_noise=noise,
         home_posture=middle if start is None else start,
         assumptions=tuple(assumptions),
     )

@@ -74,12 +74,10 @@ def design_shortest_motion(
     errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
     errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
-    unused, start = Criterion("A16", robot.criterion_scales), robot.home_posture
-    task = optimizer.DesignTask(robot.arm.table, robot.limits, unused, start, 1.0, harmonics)
     worst, around, vain_rounds, empty_rounds = np.inf, None, 0, 0
     best: ShortestMotion | None = None
     for k in range(_MAX_DESIGN_ROUNDS):
-        problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
+        problem = ShortestMotionProblem(robot, harmonics, errors * factor[:, np.newaxis], around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
         found = optimizer.minimise_criterion(
             problem, seed=seed + _SEED_STEP_BETWEEN_ROUNDS * k, starts=num_starts, progress=progress
@@ -129,7 +127,6 @@ class ShortestMotionProblem(optimizer.DesignProblem):
     """Design problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        task: design task with a period of 1 s; its criterion is not used.
         errors: (k, 16) combinations of offsets and phi, scaled to required deviations of 1.
         around: unknowns of an earlier motion, if any.
 
@@ -137,18 +134,16 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         best: unknowns of the shortest period passed to `value`.
     """
 
-    def __init__(
-        self, task: optimizer.DesignTask, errors: Array, robot: Robot, around: Array | None
-    ) -> None:
-        super().__init__(task)
+    def __init__(self, robot: Robot, harmonics: int, errors: Array, around: Array | None) -> None:
+        # The criterion is not used.
+        super().__init__(robot, Criterion("A16", robot.criterion_scales), 1.0, harmonics)
         self._around, self._at, self.best = around, np.empty(0), around
         self._errors, self._least = errors, np.inf
         noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
         self._noise = white_noise_densities_over_wrench_noise(noise, phi)
         self._roots = np.sqrt(noise.white_noise_densities[:6])
-        samples, n = self._vectors.shape[1], len(task.home_posture)
-        self._gradients = np.empty((2 + len(limits.LIMIT_NAMES), 3, samples, n))
-        self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
+        self._gradients = np.empty((2 + len(limits.LIMIT_NAMES), *self._gradients.shape[1:]))
+        self._period, self._shortest = 1.0, harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
@@ -161,10 +156,9 @@ class ShortestMotionProblem(optimizer.DesignProblem):
             x[-1] += np.log(_MAX_PERIOD_VARIATION_FACTOR) * rng.uniform(-1.0, 1.0)
             return x
         period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
-        task = self.task
-        self.task = replace(task, period_s=period)  # the size of motions depends on the period
+        self._period_s = period  # the size of motions depends on the period
         x = super().candidate(rng, near_home=near_home)
-        self.task = task
+        self._period_s = 1.0
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> optimizer.Bounds:
@@ -181,11 +175,10 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
-        g[:2] = 0.0
+        g[0] = 0.0
         sharpness = _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
         use, worst, g_V = self._largest_error_over_tolerance(sharpness)
-        limits.add_gradient_by_joints(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
-        smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
+        smooth, largest = self._write_gradients(q_qd_qdd, g_V, limit_sharpness, g[1:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
         by_log_period[1] -= 0.25

@@ -12,12 +12,18 @@ from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, replace_file_on_success, write_picture
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.lab.new_station.picture import draw_start
-from drake_teleop.lab.new_station.plan import StationPlan, plan_station
-from drake_teleop.lab.new_station.text import round_to_four_significant_digits, scenario_text
+from drake_teleop.lab.new_station.plan import (
+    SWING_HZ,
+    StationPlan,
+    plan_station,
+    round_to_four_significant_digits,
+)
 from drake_teleop.lab.run import run_command
-from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME
-from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.environment.solids import Wall
+from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME, Master
+from drake_teleop.station.scenario import LoadScenario, Rates
 from drake_teleop.station.sensor.presets import PRESETS
 
 
@@ -91,6 +97,69 @@ def new_command(
     return run_command(scenario, folder / "first_run", quiet=quiet)
 
 
+def scenario_text(
+    plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
+) -> str:
+    """Return the commented scenario; `slave` contains model, packages and sensor frame.
+
+    Args:
+        tool: path of the tool's file, if given.
+        sensor: preset of the wrist sensor, or None.
+    """
+    s, swing, place = plan.translation_scale, plan.swing_amplitude_m, plan.place
+    down = 1.5 * swing + min(0.01, swing / 4.0)  # at most 10 mm into the wall
+    if place.is_set_by_position:
+        slave["position"] = round_to_four_significant_digits(place.position)
+    else:
+        slave["home"] = place.home
+    comments = {
+        "slave.position": "sensor at the start, tool down [m]",
+        "slave.home": "joints at the start, tool down [rad, m]",
+        "slave.tip": "contact point, p_STip [m]",
+        "slave.torque_limits": "the limits of the model cannot hold the arm",
+        "kinematic_scaling": f"the arm can move {place.reachable_text}",
+        "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
+        "operator.intent": "hand motion: up and down, then down onto the wall",
+        "rates": "rates of the device",
+    }
+    if tool is not None:
+        slave["tool"] = {"model": tool}
+    elif plan.stand_in_tool is None:
+        slave["tool"], comments["slave.tool"] = None, "the bodies of the model beyond the sensor"
+    else:
+        slave["tool"] = {"mass": plan.stand_in_tool.mass, "com": plan.stand_in_tool.com}
+        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(plan.stand_in_tool.shapes[0])]}
+        comments["slave.tool"] = "a stand-in: put model file or numbers of your tool here"
+    if plan.weak_joints:
+        slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
+    if plan.tip_S:
+        slave["tip"] = round_to_four_significant_digits(plan.tip_S)
+    up, press = (round_to_four_significant_digits([0.0, 0.0, z / s]) for z in (swing, -down))
+    swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
+    swing_motion |= {"frequency": SWING_HZ, "translation": up}
+    press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2, "translation": press}
+    wall = plan.wall
+    wall_data = {"_tag": "!Wall", "position": wall.position, "stiffness": wall.stiffness}
+    wall_data |= {} if wall.size == Wall().size else {"size": wall.size}
+    own = Master(model=device).sampling_period_if_slower_than_hand(Rates().hand_hz)
+    names = ("hand_hz", "joint_control_hz")
+    rates = {} if own is None else {"rates": dict.fromkeys(names, 1 / own)}
+    data = {
+        "description": f"{Path(slave['model']).stem} commanded by {device}",
+        "simulation": {"duration": 5.0, "settle": 0.8},
+        **rates,
+        "slave": slave,
+        "master": {"model": device},
+        **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
+        "kinematic_scaling": {"translation_scale": s},
+        "force_scaling": {"sigma": 0.0, "force_scale": plan.force_scale},
+        "environment": [wall_data],
+        "operator": {"grip": "medium", "intent": [swing_motion, press_motion]},
+    }
+    head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
+    return to_yaml_text(data, head=[head], comments=comments)
+
+
 def _relative_path(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
@@ -101,9 +170,10 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
 
     table = Table(title=f"A station: {scenario}", title_justify="left", show_header=False)
     tool = "of the model" if plan.has_own_tool else "on the sensor"
+    joint_names = plan.posture_shapes.arm.joint_names
     position = round_to_four_significant_digits(plan.place.position)
     for name, value in (
-        ("Joints", f"{len(plan.joint_names)}: {', '.join(plan.joint_names)}"),
+        ("Joints", f"{len(joint_names)}: {', '.join(joint_names)}"),
         ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
         ("Start", f"sensor at {position} m, tool down"),
         ("Reachable around it", plan.place.reachable_text),

@@ -14,7 +14,6 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.new_station.plan import StationPlan
 from drake_teleop.lab.new_station.random_postures import postures_at
-from drake_teleop.lab.new_station.text import wall_of_plan
 from drake_teleop.station.slave.posture_shapes import PostureShapes
 
 _LINK_COLOURS = ((0.74, 0.77, 0.82), (0.52, 0.57, 0.65))
@@ -35,7 +34,7 @@ _HULL_SAMPLE_DIRECTIONS = np.column_stack(
 
 def draw_start(plan: StationPlan, title: str) -> Figure:
     """Draw the shapes in the start posture; meshes as convex hulls."""
-    shapes, wall = plan.posture_shapes, wall_of_plan(plan)
+    shapes, wall = plan.posture_shapes, plan.wall
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade_triangles(faces, _WALL_COLOUR)]
@@ -58,17 +57,12 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
             _draw_triad(axes, shapes, 0.12 * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
             _fit_view(axes, lower, upper, plan.base_plane_height)
-        figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
+        gap = 1e3 * (plan.lowest_tool_point_W[2] - wall.position[2])
+        plane = round(plan.base_plane_height, 2) + 0.0  # not -0
+        caption = f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m;"
+        caption += " axes of S: x red, y green, z blue; meshes as convex hulls"
+        figure.supxlabel(caption, x=0.02, ha="left", fontsize=9, color=BLACK)
     return figure
-
-
-def _caption(plan: StationPlan) -> str:
-    gap = 1e3 * (plan.lowest_tool_point_W[2] - wall_of_plan(plan).position[2])
-    plane = round(plan.base_plane_height, 2) + 0.0  # not -0
-    return (
-        f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m; axes of S: x red,"
-        " y green, z blue; meshes as convex hulls"
-    )
 
 
 def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:

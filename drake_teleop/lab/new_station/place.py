@@ -7,6 +7,7 @@ The tool is along an axis of S, the z axis of frame A; S and A are the same for 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +29,6 @@ from drake_teleop.lab.new_station.random_postures import (
     posture_scores,
     postures_at,
     random_postures,
-    rotate_sensor_frame_of_arm,
     select_suitable_postures,
     sensor_degrees_of_freedom,
 )
@@ -47,6 +47,7 @@ from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShap
 
 #: Edges of the walls that are tried, the first preferred [m].
 WALL_EDGES_M = (0.4, 0.25, 0.15)
+_TRIAL_WALL_NAMES = {edge: f"wall of {edge:g} m" for edge in WALL_EDGES_M}
 #: Rotation R_SA from each axis of S to z.
 TOOL_AXES = {
     "z": RotationMatrix(),
@@ -128,18 +129,13 @@ class TrialWalls(Environment):
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add one floating body for each wall."""
-        for edge in WALL_EDGES_M:
-            name = _trial_wall_name(edge)
+        for edge, name in _TRIAL_WALL_NAMES.items():
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
             AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
             shape = Box(edge, edge, _SPACE_ABOVE_TOOL_POINT_M + _SPACE_BELOW_TOOL_POINT_M)
             X_BG, properties = RigidTransform(), ProximityProperties()
             plant.RegisterCollisionGeometry(body, X_BG, shape, name, properties)
-
-
-def _trial_wall_name(edge: float) -> str:
-    return f"wall of {edge:g} m"
 
 
 def find_start_place(
@@ -152,8 +148,9 @@ def find_start_place(
         plane: height of the base plane, below which the arm has no joints [m].
         axis: axis of S along the tool, one of `TOOL_AXES`.
     """
-    R_SA = TOOL_AXES[axis]
-    pointed = rotate_sensor_frame_of_arm(arm, R_SA.matrix())
+    table, rotation = arm.table.copy(), slice(ROTATION_COLUMN, TRANSLATION_COLUMN)
+    table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ TOOL_AXES[axis].matrix()).ravel()
+    pointed = replace(arm, table=table)  # with frame A instead of S
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     has_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6
@@ -265,37 +262,32 @@ def _with_largest_wall(
     if shapes is None:
         return place
     shapes.move_to(place.q)
-    walls = _move_walls_below_tool_and_get_edges(shapes)
-    depths = dict.fromkeys(walls, 0.0)
+    p_WB = lowest_tool_point(shapes)
+    p_WB[2] += (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0
+    walls = [shapes.plant.GetBodyByName(name) for name in _TRIAL_WALL_NAMES.values()]
+    for wall in walls:
+        shapes.plant.SetFreeBodyPose(shapes.context, wall, RigidTransform(p_WB))
+    depths = {wall.index(): 0.0 for wall in walls}
     lowest = shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf)
     cost, overlaps = max(region.plane_height - lowest, 0.0), False
     for first, second, distance in shapes.overlaps():
         pair = {first.index(), second.index()}
-        if wall := pair & walls.keys():
+        if indices := pair & depths.keys():
             if not pair & shapes.tool_bodies:
-                depths[wall.pop()] -= distance
+                depths[indices.pop()] -= distance
         else:
             cost -= distance
             overlaps |= distance < -MIN_OVERLAP_M
     large = sum(edge > _MAX_WALL_EDGE_OVER_REACH * region.reach for edge in WALL_EDGES_M[:-1])
     free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
     rank = next(free, len(walls) - 1)
-    cost += list(depths.values())[rank]
+    cost += depths[walls[rank].index()]
     score = place.posture_score - _OVERLAP_COST_PER_M * cost - _COST_OF_ANY_OVERLAP * overlaps
-    score -= _COST_OF_SMALLER_WALL * (rank - large)
-    edge = WALL_EDGES_M[rank]
-    return place._replace(posture_score=score, wall_edge_m=edge, has_overlaps=overlaps)
-
-
-def _move_walls_below_tool_and_get_edges(shapes: PostureShapes) -> dict[BodyIndex, float]:
-    x, y, z = lowest_tool_point(shapes)
-    offset = (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0
-    middle, walls = RigidTransform([x, y, z + offset]), {}
-    for edge in WALL_EDGES_M:
-        body = shapes.plant.GetBodyByName(_trial_wall_name(edge))
-        shapes.plant.SetFreeBodyPose(shapes.context, body, middle)
-        walls[body.index()] = edge
-    return walls
+    return place._replace(
+        posture_score=score - _COST_OF_SMALLER_WALL * (rank - large),
+        wall_edge_m=WALL_EDGES_M[rank],
+        has_overlaps=overlaps,
+    )
 
 
 def lowest_tool_point(shapes: PostureShapes) -> Array:
@@ -349,8 +341,6 @@ def _can_reach_corner(
 
 
 _MIN_COSINE_TOOL_TO_AXIS = 0.75  # smallest cosine of the angle between tool and axis
-#: Opposite of each axis.
-OPPOSITE_AXIS = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
 _ROUNDING_TOLERANCE_M = 1e-9
 _MIN_DIRECTED_COM_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
 

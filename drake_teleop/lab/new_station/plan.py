@@ -4,25 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.new_station.place import (
-    MAX_HOLDING_TORQUE_USE,
-    MIN_LOAD_SHARE_HELD_BY_MOTORS,
-    OPPOSITE_AXIS,
-    TOOL_AXES,
-    StartPlace,
-    TrialWalls,
-    extent_beyond_sensor,
-    find_start_place,
-    lowest_tool_point,
-    nearest_sensor_axis,
-    sensor_axis_along_last_joint,
-    tool_frame_advice,
-)
+from drake_teleop.lab.new_station import place as start
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.slave.arm import ArmModel, holding_torque
@@ -45,7 +34,7 @@ _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
 # 680 N/m with medium grip.
-WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
+_WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
 SWING_HZ, _MAX_JOINT_SPEED_USE = 1.0, 0.5  # Hz; largest share of the joint speed limits
 
 
@@ -58,20 +47,21 @@ class StationPlan:
         swing_amplitude_m: amplitude of the slave in free motion [m].
         base_plane_height: height of the base plane [m].
         lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
+        wall: horizontal wall, 1.5 swing amplitudes below this point.
         tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
         tool_axis_advice: advice if the tool is not along z_S.
         weak_joints: joints whose torque limits cannot hold the arm.
     """
 
-    joint_names: tuple[str, ...]
     stand_in_tool: Tool | None
     tool_mass_kg: float
     has_own_tool: bool
-    place: StartPlace
+    place: start.StartPlace
     translation_scale: float
     force_scale: float
     swing_amplitude_m: float
     lowest_tool_point_W: Array
+    wall: Wall
     tip_S: list[float]
     assumptions: tuple[str, ...]
     tool_axis_advice: str
@@ -96,16 +86,18 @@ def plan_station(
         package_paths=[str(path) for path in package_paths],
         tool=stand_in if tool is None else Tool(model=str(tool)),
     )
-    shapes = PostureShapes(slave, TrialWalls(), sticks=True)
+    shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
     load = shapes.arm.phi_load[:4] - (_STAND_IN_TOOL_LOAD if tool is None else 0.0)
-    axis, own_tool = _sensor_axis_along_tool(shapes, load), False
+    # Axis of S towards the model's own load, or else along the last joint; else z.
+    axis = start.nearest_sensor_axis(load[1:] / load[0]) if load[0] > _MIN_TOOL_MASS_KG else ""
+    axis, own_tool = axis or start.sensor_axis_along_last_joint(shapes.arm) or "z", False
     if tool is None and _has_tool_beyond_sensor_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
         slave.tool, own_tool = None, True
-        shapes = PostureShapes(slave, TrialWalls(), sticks=True)
+        shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
     plane = find_base_plane_height(shapes)
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
-    share = 1.0 if own_tool else MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
+    share = 1.0 if own_tool else start.MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
     model, weak_joints, assumed = _without_weak_torque_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _largest_mass_to_hold(model, place.q)
@@ -115,25 +107,31 @@ def plan_station(
     peak = PEAK_FORCE_N if figures is None else figures.peak_force
     translation_scale = _floor_to_two_significant_digits(min(place.cube_half_m / room, 1.0))
     by_force = peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N)
-    by_stiffness = _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS_N_M * translation_scale)
+    by_stiffness = _MAX_DISPLAYED_STIFFNESS / (_WALL_STIFFNESS_N_M * translation_scale)
     shapes.move_to(place.q)
-    lowest = lowest_tool_point(shapes)
+    lowest = start.lowest_tool_point(shapes)
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
     swing *= min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_use(model, place, swing))
+    swing = _floor_to_two_significant_digits(swing)
+    wall_position = lowest - [0.0, 0.0, 1.5 * swing]
     return StationPlan(
-        joint_names=tuple(model.joint_names),
         stand_in_tool=on_sensor,
         tool_mass_kg=mass,
         has_own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
         force_scale=_floor_to_two_significant_digits(min(by_force, by_stiffness, 1.0)),
-        swing_amplitude_m=_floor_to_two_significant_digits(swing),
+        swing_amplitude_m=swing,
         lowest_tool_point_W=lowest,
+        wall=Wall(
+            position=round_to_four_significant_digits(wall_position),
+            size=[place.wall_edge_m, place.wall_edge_m],
+            stiffness=_WALL_STIFFNESS_N_M,
+        ),
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
-        tool_axis_advice=tool_frame_advice(arm, sensor_frame, axis),
+        tool_axis_advice=start.tool_frame_advice(arm, sensor_frame, axis),
         overlap_warnings=tuple(overlap_warnings(shapes, of_arm=True)),
         base_plane_height=plane,
         weak_joints=weak_joints,
@@ -143,20 +141,19 @@ def plan_station(
 
 def _find_start_and_tool_axis(
     slave: Slave, shapes: PostureShapes, plane: float, natural_axis: str
-) -> tuple[StartPlace, str, PostureShapes]:
+) -> tuple[start.StartPlace, str, PostureShapes]:
     # The start, the tool's axis of S, and the shapes; a stand-in tool is set along that axis.
-    found: list[tuple[StartPlace, str, PostureShapes]] = []
+    found: list[tuple[start.StartPlace, str, PostureShapes]] = []
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
-    for axis in dict.fromkeys((natural_axis, "z", *TOOL_AXES)):
-        if axis == OPPOSITE_AXIS[natural_axis] and axis != "z":
-            continue
+    others = (axis for axis in start.TOOL_AXES if axis.strip("-") != natural_axis.strip("-"))
+    for axis in dict.fromkeys((natural_axis, "z", *others)):
         if is_stand_in:
             slave.tool = _stand_in_tool(axis, _stand_in_length(shapes, axis))
             if axis != "z" or slave.tool.shapes[0].position[2] != _STAND_IN_LENGTH_M:
-                shapes = PostureShapes(slave, TrialWalls(), sticks=True)
+                shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
         try:
-            place = find_start_place(shapes.arm, shapes, plane=plane, axis=axis)
+            place = start.find_start_place(shapes.arm, shapes, plane=plane, axis=axis)
             found.append((place, axis, shapes))
         except DrakeTeleopError as error:
             errors.append(error)
@@ -170,18 +167,11 @@ def _find_start_and_tool_axis(
     return best
 
 
-def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
-    # Axis of S towards the model's own load, or else along the last joint; else z.
-    if load[0] > _MIN_TOOL_MASS_KG and (axis := nearest_sensor_axis(load[1:] / load[0])):
-        return axis
-    return sensor_axis_along_last_joint(shapes.arm) or "z"
-
-
-def _has_tool_beyond_sensor_link(shapes: PostureShapes, sensor_axis: str) -> bool:
+def _has_tool_beyond_sensor_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
     link_bodies = shapes.bodies_welded_to_sensor() - shapes.tool_bodies
-    link_end = extent_beyond_sensor(shapes, link_bodies, sensor_axis)
-    return extent_beyond_sensor(shapes, own_bodies, sensor_axis) > link_end + _MIN_TOOL_LENGTH_M
+    link_end = start.extent_beyond_sensor(shapes, link_bodies, axis)
+    return start.extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
 def find_base_plane_height(shapes: PostureShapes) -> float:
@@ -194,14 +184,15 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
 
 
 def _stand_in_tool(axis: str, length: float) -> Tool:
-    along = TOOL_AXES[axis].matrix()[:, 2]
+    along = start.TOOL_AXES[axis].matrix()[:, 2]
     ball = Ball(_STAND_IN_BALL_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
     com = (_STAND_IN_COM_M * along).round(6).tolist()
     return Tool(mass=_STAND_IN_MASSES_KG[0], com=com, shapes=[ball])
 
 
 def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
-    end = extent_beyond_sensor(shapes, shapes.bodies_welded_to_sensor() - {shapes.tool_body}, axis)
+    link_bodies = shapes.bodies_welded_to_sensor() - {shapes.tool_body}
+    end = start.extent_beyond_sensor(shapes, link_bodies, axis)
     return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _STAND_IN_FREE_LENGTH_M)) / 100.0))
 
 
@@ -213,7 +204,7 @@ def _without_weak_torque_limits(
     The arm must hold `load_share` of its load.
     """
     torque = np.abs(holding_torque(arm.with_load(load_share * arm.phi_load), q))
-    weak = torque > MAX_HOLDING_TORQUE_USE * arm.effort_limit
+    weak = torque > start.MAX_HOLDING_TORQUE_USE * arm.effort_limit
     names = tuple(np.array(arm.joint_names)[weak].tolist())
     texts = [
         f"no torque limit for {name}, as holding the arm takes {needed:.3g} of its {limit:.3g}"
@@ -226,12 +217,12 @@ def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
     phi = arm.phi_load
     for mass in _STAND_IN_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
-        if np.abs(torque / arm.effort_limit).max() < MAX_HOLDING_TORQUE_USE:
+        if np.abs(torque / arm.effort_limit).max() < start.MAX_HOLDING_TORQUE_USE:
             break
     return mass
 
 
-def _swing_speed_use(arm: ArmModel, place: StartPlace, swing: float) -> float:
+def _swing_speed_use(arm: ArmModel, place: start.StartPlace, swing: float) -> float:
     above = place.pose.copy()
     above[6] += swing
     displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)
@@ -241,3 +232,8 @@ def _swing_speed_use(arm: ArmModel, place: StartPlace, swing: float) -> float:
 def _floor_to_two_significant_digits(value: float) -> float:
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")
+
+
+def round_to_four_significant_digits(values: Any) -> list[float]:
+    """Return numbers with four significant digits, for a file."""
+    return [float(f"{value:.4g}") for value in values]

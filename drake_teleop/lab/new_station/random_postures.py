@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -135,9 +135,12 @@ def select_suitable_postures(
     lowest_origin = plane + _MIN_JOINT_ORIGIN_HEIGHT_M
     raised = postures.origins[:, :, 2].max(axis=0) > lowest_origin
     raised[0] = False
-    in_region = _is_within_limits(radius / reach, _SENSOR_RADIUS_RANGE_OVER_REACH)
-    in_region &= _is_within_limits(from_first[:, 2] / reach, _SENSOR_HEIGHT_RANGE_OVER_REACH)
-    in_region &= tool_height > _MIN_TOOL_HEIGHT_M
+    in_region = tool_height > _MIN_TOOL_HEIGHT_M
+    for values, (low, high) in (
+        (radius, _SENSOR_RADIUS_RANGE_OVER_REACH),
+        (from_first[:, 2], _SENSOR_HEIGHT_RANGE_OVER_REACH),
+    ):
+        in_region &= (values / reach > low) & (values / reach < high)
     in_region &= (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1)
     points_down = postures.R_WS[:, 2, 2] < -_MIN_COS_TOOL_TILT
     above_plane: Any = (postures.origins[:, raised, 2] > lowest_origin).all(axis=1)
@@ -156,10 +159,6 @@ def select_suitable_postures(
     side = float(sides[int(np.argmax(counts))])
     region = StartRegion(plane, tool_length, first, reach, raised, side, tuple(removed))
     return postures[rows[_is_angle_on_side(angle, side)]], region
-
-
-def _is_within_limits(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    return (values > limits[0]) & (values < limits[1])
 
 
 def _is_angle_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
@@ -224,11 +223,3 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
     return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
-
-
-def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with its sensor frame rotated by R_SA."""
-    table = arm.table.copy()
-    R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
-    table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()
-    return replace(arm, table=table)

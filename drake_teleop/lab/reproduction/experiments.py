@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, UpdateProgress
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
-from drake_teleop.lab.run_summary import FILTER_TAIL_S, is_in_contact
+from drake_teleop.lab.run import FILTER_TAIL_S, is_in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.operator.operator import Sine

@@ -245,51 +245,45 @@ class _MeasureData:
         levels = self.levels[factor]
         count = len(levels.names)
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
-        why, compared = [TOO_FEW_POINTS] * count, 0
+        is_compared, used = np.zeros(count, dtype=bool), np.zeros(1, dtype=bool)
         if self.model is not None:
-            is_compared, combinations, weights = self.model.comparison_weights(factor)
-            if is_compared.sum() > 1:
+            comparable, combinations, weights = self.model.comparison_weights(factor)
+            if comparable.sum() > 1:
+                is_compared, used = comparable, combinations
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
-                compared = self._count_combinations(combinations, factor)
-            why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        unused = self._count_combinations(np.ones(1), factor) - compared
-        return MainEffect(
-            levels.names, runs, mean, half, effect, effect_half, why, compared, unused,
-            self.is_fitted,
-        )  # fmt: skip
+        reasons_and_counts = self._reasons_and_counts(is_compared, levels.index, used, factor)
+        return MainEffect(levels.names, runs, mean, half, effect, effect_half, *reasons_and_counts)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.comparison_weights(first, second)
+        is_compared, over, weights = self.model.comparison_weights(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
-        compared = self._count_combinations(combinations, first, second)
-        unused = self._count_combinations(np.ones(1), first, second) - compared
+        why, used, unused, fitted = self._reasons_and_counts(is_compared, cell, over, first, second)
         fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
-        return PairMeans(fields, names, mean.reshape(shape), why, compared, unused, self.is_fitted)
+        reasons = np.array(why).reshape(shape)
+        return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
-    @property
-    def is_fitted(self) -> bool:
-        return not isinstance(self.model, Factorial)
-
-    def _count_combinations(self, combinations: NDArray[Any], *shown: int) -> int:
-        others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
-        return round(np.mean(combinations) * math.prod(others))
-
-    def _missing_value_reasons(self, compared: BooleanArray, cell: NDArray[np.int64]) -> list[str]:
-        runs = np.bincount(cell, minlength=len(compared))
-        return missing_value_reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
+    def _reasons_and_counts(
+        self, compared: BooleanArray, cell: NDArray[np.int64], over: BooleanArray, *shown: int
+    ) -> tuple[list[str], int, int, bool]:
+        # The last four fields of `MainEffect`; `over` flags the used combinations.
+        points, runs = (np.bincount(cell, each, len(compared)) for each in (None, self.runs))
+        why = missing_value_reasons(compared, points, runs)
+        why = [TOO_FEW_POINTS] * len(compared) if self.model is None else why
+        total = math.prod(len(f.names) for k, f in enumerate(self.levels) if k not in shown)
+        used = round(np.mean(over) * total)
+        return why, used, total - used, not isinstance(self.model, Factorial)
 
 
 def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array:

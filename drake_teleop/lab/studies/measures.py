@@ -16,46 +16,34 @@ if TYPE_CHECKING:
     from drake_teleop.station.scenario import Scenario
 
 
-def _largest_force_norm(forces: Array) -> float:
-    return float(np.linalg.norm(forces, axis=1).max(initial=0.0))
+def _force_norms(result: SimulationResult, signal: str) -> Array:
+    return np.linalg.norm(result[signal][:, :3], axis=1) if signal in result else np.zeros(1)
 
 
-def _force_to_master(result: SimulationResult) -> Array:
-    return result["force_to_master"][:, :3]
-
-
-def _peak_contact_force(result: SimulationResult, threshold: float) -> float:
-    if "true_contact_wrench_W" not in result:
-        return 0.0
-    return _largest_force_norm(result["true_contact_wrench_W"][:, :3])
-
-
-def _work_of_hand_on_device(result: SimulationResult, threshold: float) -> float:
+def _work_of_hand(result: SimulationResult) -> float:
     power = np.sum(result["hand_wrench_E"] * result["twist_master"], axis=1)
     return float(np.trapezoid(power, result.t))
 
 
 def _time_of_rendered_force_above(result: SimulationResult, threshold: float) -> float:
-    above = np.linalg.norm(_force_to_master(result), axis=1) > threshold
+    above = _force_norms(result, "force_to_master") > threshold
     return float(np.trapezoid(above.astype(float), result.t))
 
 
 #: Measures of every run, from its signals and the study's `force_threshold` [N].
 _MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
     # Largest displayed force.
-    "peak_force_to_master_N": lambda result, _: _largest_force_norm(_force_to_master(result)),
-    "rms_force_to_master_N": lambda result, _: float(
-        np.sqrt(np.mean(np.sum(_force_to_master(result) ** 2, axis=1)))
+    "peak_force_to_master_N": lambda result, _: _force_norms(result, "force_to_master").max(),
+    "rms_force_to_master_N": lambda result, _: np.sqrt(
+        np.mean(np.sum(result["force_to_master"][:, :3] ** 2, axis=1))
     ),
     # Largest true force between tool and environment.
-    "peak_contact_force_N": _peak_contact_force,
+    "peak_contact_force_N": lambda result, _: _force_norms(result, "true_contact_wrench_W").max(),
     # Work of the hand on the stylus: integral of F.v + tau.omega.
-    "hand_work_J": _work_of_hand_on_device,
+    "hand_work_J": lambda result, _: _work_of_hand(result),
     # Time of a displayed force above the threshold.
     "time_above_force_s": _time_of_rendered_force_above,
 }
-
-
 #: Names of all measures; for those of tasks see `task_measures.py`.
 MEASURES = (*_MEASURES_OF_EVERY_RUN, *TASK_MEASURE_NAMES)
 
@@ -74,7 +62,7 @@ def evaluate_measures(
         remedy = "give the operator an intent or a task, or set load_estimator.enabled: false"
         raise DrakeTeleopError(what, where="operator.intent", remedy=remedy)
     own = [name for name in names if name in _MEASURES_OF_EVERY_RUN]
-    found = {name: _MEASURES_OF_EVERY_RUN[name](result, force_threshold) for name in own}
+    found = {name: float(_MEASURES_OF_EVERY_RUN[name](result, force_threshold)) for name in own}
     if len(own) < len(names):
         from drake_teleop.station.task_measures import task_measures
 

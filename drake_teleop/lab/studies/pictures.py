@@ -161,7 +161,11 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO_MEASURES[1:], strict=True):
             axes.plot(points[name], points[PARETO_MEASURES[0]], "o", ms=3, color=GREY, alpha=0.5)
-            _draw_pareto_intervals(axes, on_front, name)
+            half = [np.nan_to_num(on_front[f"{key}_half"]) for key in (PARETO_MEASURES[0], name)]
+            axes.errorbar(
+                on_front[name], on_front[PARETO_MEASURES[0]], *half,
+                color=VERMILION, marker="o", ms=4, lw=0, elinewidth=0.9, capsize=2,
+            )  # fmt: skip
             axes.set_xlabel(name)
             axes.set_ylabel(PARETO_MEASURES[0])
         if on_front.height <= 24:  # more labels would overlap
@@ -178,14 +182,6 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         title = f"Pareto front of all three (red){_interval_caption(study, 'of the mean')}{words}"
         figure.suptitle(title, x=0.01, ha="left")
     return figure
-
-
-def _draw_pareto_intervals(axes: Axes, points: pl.DataFrame, name: str) -> None:
-    half = [np.nan_to_num(points[f"{key}_half"].to_numpy()) for key in (name, PARETO_MEASURES[0])]
-    axes.errorbar(
-        points[name], points[PARETO_MEASURES[0]], half[1], half[0],
-        color=VERMILION, marker="o", ms=4, lw=0, elinewidth=0.9, capsize=2,
-    )  # fmt: skip
 
 
 def _effects_caption(study: Study, fitted: bool) -> str:

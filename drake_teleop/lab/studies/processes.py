@@ -17,13 +17,9 @@ from typing import Any, TypeAlias
 
 from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 from drake_teleop.common.version import __version__
-from drake_teleop.lab.studies.store import Store
+from drake_teleop.lab.studies.store import Chunk, Store
 
-Chunk: TypeAlias = list[dict[str, Any]]
-"""Rows that one process runs together."""
 RunRows: TypeAlias = Callable[[Chunk], Chunk]
-
-
 RunChunks: TypeAlias = Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
 """Function that runs chunks in parallel and yields each one when it is finished."""
 PROCESS_ENDED_ERROR = "the run has ended its process"

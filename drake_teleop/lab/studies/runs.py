@@ -21,9 +21,8 @@ from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.design import FactorValues, Study
-from drake_teleop.lab.studies.processes import Chunk, open_executor
-from drake_teleop.lab.studies.shards import merge_shards, parse_shard
-from drake_teleop.lab.studies.store import Store, open_store
+from drake_teleop.lab.studies.processes import open_executor
+from drake_teleop.lab.studies.store import Chunk, Store, merge_shards, open_store, parse_shard
 
 if TYPE_CHECKING:
     import polars as pl

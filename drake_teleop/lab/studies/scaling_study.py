@@ -170,21 +170,19 @@ def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
     import polars as pl
 
     sigmas, gammas = _sigmas_and_gammas()
-    rows = [
+    tables = [
         {
-            "way": selection,
-            "sigma": sigma,
-            "gamma": gamma,
-            "merit": found.merit[i, j],
-            "low": found.merit_low[i, j],
-            "high": found.merit_high[i, j],
-            "best_in": found.best_share[i, j],
+            "way": [selection] * found.merit.size,
+            "sigma": np.repeat(sigmas, len(gammas)),
+            "gamma": np.tile(gammas, len(sigmas)),
+            "merit": found.merit.ravel(),
+            "low": found.merit_low.ravel(),
+            "high": found.merit_high.ravel(),
+            "best_in": found.best_share.ravel(),
         }
         for selection, found in answers.items()
-        for i, sigma in enumerate(sigmas)
-        for j, gamma in enumerate(gammas)
     ]
-    return pl.DataFrame(rows)
+    return pl.concat(map(pl.DataFrame, tables))
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Storage of a study's rows on disk; after a crash, each file is complete or absent.
 
-The folder `runs.parquet` is one table, with a file for each chunk of runs.
+The folder `runs.parquet` is one table, with a file for each chunk of runs. Shard K/N, for computers
+that share only a file system, runs every N-th chunk into the folder `shards/K-of-N` of the study.
 """
 
 from __future__ import annotations
@@ -8,20 +9,25 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator
+import re
+import shutil
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
-from drake_teleop.common.files import make_folder, wrap_write_errors, write_table, write_text
 from drake_teleop.common.parquet_sizes import check_parquet
 
 if TYPE_CHECKING:
     import polars as pl
 
+Chunk: TypeAlias = list[dict[str, Any]]
+"""Rows that one process runs together."""
 _PART_FILE_NAME = "run_{:08d}.parquet"
+_MAX_SHARDS_IN_MESSAGE = 20
 
 
 @dataclass(frozen=True)
@@ -45,11 +51,22 @@ class Store:
 
     def write(self, rows: pl.DataFrame) -> None:
         path = self.folder / _PART_FILE_NAME.format(rows["run"][0])
-        write_table(path, rows, temporary_base=self.folder)
+        files.write_table(path, rows, temporary_base=self.folder)
+
+    def add_part(self, part: Path) -> None:
+        """Link a part of another store, unless this store has this part."""
+        path = self.folder / part.name
+        if path.exists():
+            return
+        with files.replace_file_on_success(path, temporary_base=self.folder) as temporary:
+            try:
+                os.link(part, temporary)
+            except OSError:  # a file system without links
+                shutil.copyfile(part, temporary)
 
     def count_chunk_start(self, first_run: int) -> None:
         path = self._start_counts_folder / str(first_run)
-        with wrap_write_errors(path):
+        with files.wrap_write_errors(path):
             self._start_counts_folder.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
@@ -99,7 +116,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     `identity` is JSON data of all inputs of the rows; rows of other inputs raise an error.
     """
     store = Store(out / "runs.parquet")
-    make_folder(store.folder)
+    files.make_folder(store.folder)
     with locked_folder(out, identity):
         store.remove_damaged_parts()
         yield store
@@ -128,8 +145,58 @@ def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():
-        write_text(path, text)
+        files.write_text(path, text)
     elif path.read_bytes() != text.encode():
         what = "contains runs of another study, or of another version of this one"
         remedy = "give another folder, or remove this one"
+        raise DrakeTeleopError(what, where=str(out), remedy=remedy)
+
+
+class Shard(NamedTuple):
+    """One of `total` shards of a study, with its `number` from 1."""
+
+    number: int
+    total: int
+
+    def folder(self, out: Path) -> Path:
+        return out / "shards" / f"{self.number}-of-{self.total}"
+
+    def chunks(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+        if self.total > len(chunks):
+            what = f"the study has only {len(chunks)} chunks of runs (one for each shard)"
+            remedy = f"give at most {len(chunks)} shards"
+            raise DrakeTeleopError(what, where=f"shard {self.number}/{self.total}", remedy=remedy)
+        return list(chunks[self.number - 1 :: self.total])
+
+
+def parse_shard(text: str) -> Shard:
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
+    if not found or not 1 <= int(found[1]) <= int(found[2]):
+        what = f"{text!r} is not K/N with 1 <= K <= N"
+        raise DrakeTeleopError(what, where="shard", remedy="give one, such as 3/8")
+    return Shard(int(found[1]), int(found[2]))
+
+
+def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
+    """Link the result files of all shards in `out` into its table; raise if runs are missing."""
+    names = (re.fullmatch(r"([1-9]\d*)-of-([1-9]\d*)", p.name) for p in out.glob("shards/*"))
+    shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
+    if not shards:
+        raise DrakeTeleopError("has no shards", where=str(out), remedy="run study --shard K/N")
+    for shard in sorted(shards):
+        folder = shard.folder(out)
+        write_or_check_identity(folder, identity)
+        for part in Store(folder / "runs.parquet").part_files():
+            store.add_part(part)
+    store.remove_damaged_parts()
+    finished = store.first_runs_of_finished_chunks()
+    missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
+    if missing:
+        count = max(shard.total for shard in shards)
+        numbers = sorted({k % count + 1 for k in missing})
+        listed = ",".join(map(str, numbers[:_MAX_SHARDS_IN_MESSAGE]))
+        more = ",..." if len(numbers) > _MAX_SHARDS_IN_MESSAGE else ""
+        runs = sum(len(chunks[k]) for k in missing)
+        what = f"{runs} of {sum(map(len, chunks))} runs are missing"
+        remedy = f"run shards {listed}{more} of {count} again, then merge"
         raise DrakeTeleopError(what, where=str(out), remedy=remedy)

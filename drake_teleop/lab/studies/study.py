@@ -20,16 +20,8 @@ from drake_teleop.lab.studies.design import FactorValues, Study
 from drake_teleop.lab.studies.effects import effects_table
 from drake_teleop.lab.studies.measures import evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, run_study
-from drake_teleop.lab.studies.shards import parse_shard
-from drake_teleop.station.scenario import (
-    ReadScenarioData,
-    Scenario,
-    ScenarioFromData,
-    ScenarioNames,
-    find_shipped_file,
-    referenced_files,
-    settings_without_range_check,
-)
+from drake_teleop.lab.studies.store import parse_shard
+from drake_teleop.station import scenario as scenarios
 
 if TYPE_CHECKING:
     import polars as pl
@@ -50,9 +42,11 @@ class StationRunFunction:
     measures: Sequence[str]
     force_threshold_N: float
 
-    def scenario(self, values: FactorValues, seed: int) -> Scenario:
+    def scenario(self, values: FactorValues, seed: int) -> scenarios.Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_set_fields(self.scenario_data, changes), self.scenario_file)
+        return scenarios.ScenarioFromData(
+            _set_fields(self.scenario_data, changes), self.scenario_file
+        )
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
@@ -90,22 +84,24 @@ def study_command(
         if both:
             what = f"the options {first} and {second} cannot be combined"
             raise DrakeTeleopError(what, where="study", remedy="remove one of them")
-    study, path = LoadStudy(path), find_shipped_file("study", path, studies_dir())
+    study, path = LoadStudy(path), scenarios.find_shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_num_runs(str(path), yes)
-    known = study.scenario in ScenarioNames()
-    data, where = ReadScenarioData(study.scenario if known else path.parent / study.scenario)
-    scenario = ScenarioFromData(data, where)
-    files = [*scenario.slave.model_files(), *referenced_files(scenario)]
+    known = study.scenario in scenarios.ScenarioNames()
+    data, where = scenarios.ReadScenarioData(
+        study.scenario if known else path.parent / study.scenario
+    )
+    scenario = scenarios.ScenarioFromData(data, where)
+    files = [*scenario.slave.model_files(), *scenarios.referenced_files(scenario)]
     packages = {"slave": {"package_paths": scenario.slave.package_paths}}
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
             changed = _set_fields(packages, {factor.field: value})
             place = f"{path}:factors[{index}]"
-            config = settings_without_range_check(Scenario, changed, place)
+            config = scenarios.settings_without_range_check(scenarios.Scenario, changed, place)
             check_all_field_values(config, place)
-            files += referenced_files(with_absolute_paths(config, Path(where).parent))
+            files += scenarios.referenced_files(with_absolute_paths(config, Path(where).parent))
     digests = [sha256(file.read_bytes()).hexdigest() for file in dict.fromkeys(files)]
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
@@ -129,8 +125,8 @@ def study_command(
 
 def LoadStudy(path: str | Path) -> Study:
     """Load a study file and check everything that does not depend on the scenario."""
-    path = find_shipped_file("study", path, studies_dir())
-    study = settings_without_range_check(Study, read_yaml(path), str(path))
+    path = scenarios.find_shipped_file("study", path, studies_dir())
+    study = scenarios.settings_without_range_check(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
 
