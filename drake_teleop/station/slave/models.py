@@ -17,14 +17,14 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
 from drake_teleop.station.slave import chain_joints, drake_errors
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
-from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model.repair_report import (
-    RepairedModel,
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_repair import (
+    ModelPurpose,
+    ModelRepair,
     describe_frame_fault,
-    merge_repaired_models,
 )
 from drake_teleop.station.slave.model.sdf_repair import repair_sdf
-from drake_teleop.station.slave.model.urdf_repair import ModelPurpose, repair_urdf
+from drake_teleop.station.slave.model.urdf_repair import repair_urdf
 
 _XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
@@ -33,11 +33,8 @@ _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": 
 
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
-) -> tuple[list[ModelInstanceIndex], RepairedModel]:
-    """Repair the text of a model file, and parse it into a plant.
-
-    Return the added instances, and the repair, with text "" if a part was not repaired.
-    """
+) -> tuple[list[ModelInstanceIndex], ModelRepair]:
+    """Repair the text of a model file, and parse it into a plant; return the added instances."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
@@ -58,64 +55,57 @@ def repair_and_parse_model(
     forces = plant.num_force_elements()
     robot, scene = drake_errors.ROBOT_ERROR_TEXTS, drake_errors.SCENE_ERROR_TEXTS
     expected = scene if purpose.is_scene else robot
+    model = ModelRepair(path, files, purpose, Path(folder.name))
     with drake_errors.translate_drake_errors(path, expected, folder.name):
-        read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
-        instances, repaired = read(parser, path, files, purpose, Path(folder.name))
+        instances = (_add_files_of_directives if kind == ".yaml" else _add_file)(parser, model)
         chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         what = "the model has springs or other force elements, which are not supported"
         remedy = "remove them; only motors, gravity and contact move the arm"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-    text = "".join(each.text for each in repaired) if all(e.text for e in repaired) else ""
-    return instances, merge_repaired_models(text, repaired)
+    return instances, model
 
 
-def _add_repaired_file(
-    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    repaired = _repair_file(path, files, purpose, folder)
+def _add_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceIndex]:
+    _repair_text(model)
     with drake_errors.raise_logged_errors():
-        if repaired.text:
-            kind = path.suffix.lower().removeprefix(".")
-            instances = parser.AddModelsFromString(repaired.text, kind)
-        else:
-            instances = parser.AddModels(str(path))
-    return instances, [repaired]
+        if model.text:
+            kind = model.path.suffix.lower().removeprefix(".")
+            return parser.AddModelsFromString(model.text, kind)
+        return parser.AddModels(str(model.path))
 
 
 def _add_files_of_directives(
-    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
+    parser: parsing.Parser, model: ModelRepair
+) -> list[ModelInstanceIndex]:
     with drake_errors.raise_logged_errors():
-        directives = parsing.FlattenModelDirectives(
-            parsing.LoadModelDirectives(str(path)), parser.package_map()
-        )
-    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
+        loaded = parsing.LoadModelDirectives(str(model.path))
+        directives = parsing.FlattenModelDirectives(loaded, parser.package_map())
+    parts = dict[Path, ModelRepair]()
     for added in (each.add_model for each in directives.directives if each.add_model):
-        file = files.find_file(added.file)
+        file = model.files.find_file(added.file)
         if file is None:
             continue  # Drake reports it
-        if file not in repaired:
-            repaired[file] = _repair_file(file, files, purpose, folder)
-        if repaired[file].text:
-            copy = folder / f"{len(repaired)}_{file.name}"
-            copy.write_text(repaired[file].text, encoding="utf-8")
-            added.file = f"file://{copy}"
+        if file not in parts:
+            parts[file] = model.make_part(file)
+            _repair_text(parts[file])
+            model.add_results_of(parts[file])
+        if parts[file].text:
+            added.file = f"file://{model.write_file(file.name, parts[file].text)}"
+    texts = [part.text for part in parts.values()]
+    model.text = "".join(texts) if all(texts) else ""
     with drake_errors.raise_logged_errors():
         models = parsing.ProcessModelDirectives(directives, parser)
-    return [each.model_instance for each in models], list(repaired.values())
+    return [each.model_instance for each in models]
 
 
-def _repair_file(
-    path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> RepairedModel:
-    kind = path.suffix.lower()
-    if kind not in _REPAIR_FUNCTION_OF_SUFFIX:
-        return RepairedModel("", [], {})
-    root = read_xml(path)
-    if any(element.tag.startswith("xacro:") for element in root.iter()):
-        raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=_XACRO_REMEDY)
-    return _REPAIR_FUNCTION_OF_SUFFIX[kind](root, path, files, purpose, folder)
+def _repair_text(model: ModelRepair) -> None:
+    repair = _REPAIR_FUNCTION_OF_SUFFIX.get(model.path.suffix.lower())
+    if repair is None:
+        return
+    if any(element.tag.startswith("xacro:") for element in model.root.iter()):
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(model.path), remedy=_XACRO_REMEDY)
+    repair(model)
 
 
 class ParsedArm(NamedTuple):
@@ -142,27 +132,26 @@ def ParseModel(
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
-    added_instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
-    frame = _find_sensor_frame(plant, added_instances, sensor_frame, where)
-    added = set(plant.GetJointIndices()) - before
-    held = chain_joints.weld_held_joints(plant, hold, added)
+    instances, model = repair_and_parse_model(plant, path, package_paths, purpose)
+    frame = _find_sensor_frame(plant, instances, sensor_frame, where)
+    held = chain_joints.weld_held_joints(plant, hold, set(plant.GetJointIndices()) - before)
     chain = chain_joints.weld_base_and_find_chain(plant, frame, X_WBase, where)
-    chain_joints.check_chain(plant, chain, repaired.dependence_reasons, where)
-    free = chain_joints.weld_free_bodies(plant, added_instances)
+    chain_joints.check_chain(chain, model.dependence_reasons, where)
+    free = chain_joints.weld_free_bodies(plant, instances)
+    moving = [joint for joint in chain if joint.num_velocities() > 0]
     with drake_errors.translate_drake_errors(path):
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
-        limits = repaired.effort_limits if repaired.text else None
-        chain_joints.set_one_actuator_per_joint(plant, chain, limits)
-        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
-    moving = [k for k in chain if chain_joints.is_joint_moving(plant, k)]
-    instances = {plant.get_joint(index).model_instance() for index in moving}
-    if len(instances) > 1:
-        names = sorted(map(plant.GetModelInstanceName, instances))
+        limits = model.effort_limits if model.text else None
+        chain_joints.set_one_actuator_per_joint(plant, moving, limits)
+        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)
+    of_chain = {joint.model_instance() for joint in moving}
+    if len(of_chain) > 1:
+        names = sorted(map(plant.GetModelInstanceName, of_chain))
         what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
         remedy = "write the chain up to the sensor as one model"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
-    instance = next(iter(instances), frame.model_instance())
-    return ParsedArm(instance, frame, [*repaired.assumptions, *free, *held, *rotors])
+    instance = next(iter(of_chain), frame.model_instance())
+    return ParsedArm(instance, frame, [*model.assumptions, *free, *held, *rotors])
 
 
 def ParseTool(
@@ -173,8 +162,8 @@ def ParseTool(
     Return the root link, and texts about assumed or repaired data.
     """
     before, purpose = set(plant.GetJointIndices()), ModelPurpose(is_tool=True)
-    instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
-    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    instances, model = repair_and_parse_model(plant, path, package_paths, purpose)
+    held = chain_joints.joints_by_child(plant)
     bodies = [index for instance in instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
@@ -186,13 +175,13 @@ def ParseTool(
         held_joints = chain_joints.weld_joints_outside_chain(plant, before, [])
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
-    return roots[0], [*repaired.assumptions, *held_joints]
+    return roots[0], [*model.assumptions, *held_joints]
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> None:
     """Parse the surroundings of an arm."""
-    _, repaired = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
-    for name, what in repaired.dependence_reasons.items():
+    _, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
+    for name, what in model.dependence_reasons.items():
         remedy = "correct it; every object that the tool could touch must be readable"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
 

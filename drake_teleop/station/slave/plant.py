@@ -28,7 +28,7 @@ from drake_teleop.station.slave.arm_from_plant import (
     fill_missing_joint_limits,
     values_per_joint,
 )
-from drake_teleop.station.slave.chain_joints import set_torque_limits
+from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
@@ -250,13 +250,6 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
         on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame
     AddPayload(plant, holder, slave.payload)
     return ParsedSlave(slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions))
-
-
-def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
-    """Return the bodies that a body carries through joints, the nearest first."""
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
-    return near + [far for each in near for far in bodies_carried_by(plant, each)]
 
 
 def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:

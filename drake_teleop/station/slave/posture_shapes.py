@@ -22,13 +22,12 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.model.meshes import AddSkeleton
-from drake_teleop.station.slave.model.repair_report import join_names
+from drake_teleop.station.slave.chain_joints import AddSkeleton, bodies_carried_by
+from drake_teleop.station.slave.model.model_repair import join_names
 from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,
     ParseSlave,
-    bodies_carried_by,
     finalize_without_limit_warnings,
     hull_points_of,
 )

@@ -98,24 +98,6 @@ class BodyReader:
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
-    def remove_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
-        """Remove the bodies on the world; return each with `childclass` and pose of its frame."""
-        found = []
-
-        def collect_bodies(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
-            childclass = parent.get("childclass") or childclass
-            for child in list(parent):
-                if child.tag == "body":
-                    found.append((child, childclass, X_WF))
-                    parent.remove(child)
-                elif child.tag == "frame":
-                    attributes = Attributes(child.attrib, "frame", self._mjcf.report)
-                    collect_bodies(child, childclass, X_WF @ self._mjcf.read_pose(attributes))
-
-        for element in self._mjcf.root.findall("worldbody"):
-            collect_bodies(element, "", RigidTransform())
-        return found
-
     def read_world(self) -> Body:
         """Return the world with its shapes and all bodies."""
         world = Body("world", RigidTransform())
@@ -123,10 +105,9 @@ class BodyReader:
             self._read_children(world, element, element.get("childclass", ""), RigidTransform())
         return world
 
-    def read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
-        """Return the body in `element`, with all bodies on it; X_PF is its frame in the parent."""
+    def _read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
         name = element.get("name") or self._make_unused_name("body")
-        attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
+        attributes = Attributes(element.attrib, f"body {name}", self._mjcf.model)
         body = Body(name, X_PF @ self._mjcf.read_pose(attributes))
         childclass = element.get("childclass") or childclass
         self._read_children(body, element, childclass, RigidTransform())
@@ -147,7 +128,7 @@ class BodyReader:
                 inner = child.get("childclass") or childclass
                 self._read_children(body, child, inner, X_BF @ self._mjcf.read_pose(attributes))
             elif child.tag == "body":
-                body.children.append(self.read_body(child, childclass, X_BF))
+                body.children.append(self._read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
                 joint = self._read_joint(body, attributes, child.tag)
                 body.joints.append(joint.transformed_by(X_BF))
@@ -166,7 +147,7 @@ class BodyReader:
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
         if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
-            self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
+            self._mjcf.model.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
@@ -191,25 +172,24 @@ class BodyReader:
             fault = f"shapes of type {kind} are not supported"
         elif not name and min(size[: _NUM_SIZE_VALUES_OF_SHAPE.get(kind, 0)], default=1.0) <= 0.0:
             fault = "shapes need a size above 0"
-        if fault:
-            self.lost.setdefault(fault, []).append((body, given))
-            return
-        if mesh is not None and kind != "mesh":
+        if mesh is not None and kind != "mesh" and not fault:
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
                 X_GM, size = mjcf_meshes.fit_shape_to_mesh(mesh, kind, by_box=by_box)
+                X_FG, mesh = X_FG @ X_GM, None
             except ValueError as error:
-                self.lost.setdefault(str(error), []).append((body, given))
-                return
-            X_FG, mesh = X_FG @ X_GM, None
+                fault = str(error)
+        if fault:
+            self.lost.setdefault(fault, []).append((body, given))
+            return
         if given.get("shellinertia") == "true":
-            self._mjcf.report.state_assumption("solid instead of hollow shapes of", body.name)
+            self._mjcf.model.state_assumption("solid instead of hollow shapes of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
     def _read_inertial(self, body: Body, given: Attributes) -> mjcf_meshes.MassProperties:
         mass = float(given.vector("mass", (0.0,))[0])
         if mass < 0.0:
-            self._mjcf.report.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
+            self._mjcf.model.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
         moments = given.vector("diaginertia", (0.0, 0.0, 0.0))
         inertia = np.diag(moments)
         if "fullinertia" in given:
@@ -244,7 +224,7 @@ class BodyReader:
             if geom.mesh:
                 shape = mjcf_meshes.unit_density_properties_of_mesh(geom.mesh)
         except ValueError as error:
-            self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
+            self._mjcf.model.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return mjcf_meshes.ZERO_MASS_PROPERTIES
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
@@ -12,7 +11,6 @@ from pydrake.math import RigidTransform
 from drake_teleop.station.slave.model import mjcf_bodies
 from drake_teleop.station.slave.model.mjcf_elements import Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
-from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
 
 class MjcfText:
@@ -21,9 +19,9 @@ class MjcfText:
     Contact shapes are convex hulls, as in MuJoCo, except in a scene.
     """
 
-    def __init__(self, mjcf: Mjcf, purpose: ModelPurpose, folder: Path) -> None:
-        self._mjcf, self._purpose, self._folder = mjcf, purpose, folder
-        name = mjcf.root.get("model") or mjcf.path.stem
+    def __init__(self, mjcf: Mjcf) -> None:
+        self._mjcf, self._model, self._purpose = mjcf, mjcf.model, mjcf.model.purpose
+        name = mjcf.root.get("model") or mjcf.model.path.stem
         self._root = Element("mujoco", model=name)
         SubElement(self._root, "compiler", angle="radian", autolimits="false")
         self._assets = SubElement(self._root, "asset")
@@ -75,7 +73,7 @@ class MjcfText:
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
             what = "no damping, instead of a negative one, of"
-            self._mjcf.report.state_assumption(what, joint.name)
+            self._model.state_assumption(what, joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
@@ -100,14 +98,14 @@ class MjcfText:
             hull = self._add_mesh_asset(geom.mesh, hull=True)
         except ValueError as error:
             fault = f"{error}; shapes are missing of"
-            self._mjcf.report.state_repair(fault, body.name)
+            self._model.state_repair(fault, body.name)
         else:
             SubElement(element, "geom", {**values, **felt, **hull})
 
     def _add_mesh_asset(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull
         if key not in self._meshes:
-            file = mesh.write_hull(self._folder) if hull else mesh.find_or_write_obj(self._folder)
+            file = mesh.write_hull() if hull else mesh.find_or_write_obj()
             self._meshes[key] = f"mesh_{len(self._meshes)}"
             SubElement(self._assets, "mesh", name=self._meshes[key], file=str(file))
         return {"mesh": self._meshes[key]}

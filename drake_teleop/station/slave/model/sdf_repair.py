@@ -6,12 +6,9 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model import repair_report, urdf_repair
-from drake_teleop.station.slave.model.model_references import (
-    PACKAGE_FOLDER_SETTINGS,
-    ModelFiles,
-    read_xml,
-)
+from drake_teleop.station.slave.model import urdf_repair
+from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, read_xml
+from drake_teleop.station.slave.model.model_repair import ModelRepair
 from drake_teleop.station.slave.model.model_tree import link_of_frame
 
 # Children that Drake reads; it also reads elements with its own prefix.
@@ -23,91 +20,77 @@ _CHILD_TAGS_READ_BY_DRAKE = {
 }
 
 
-def repair_sdf(
-    root: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
-) -> repair_report.RepairedModel:
-    """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
-    report = repair_report.RepairReport(strict=purpose.is_scene)
-    if not purpose.is_scene:
-        _keep_model_with_sensor(root, file, files, purpose.sensor_name, report)
-        for element in list(root.iter()):
+def repair_sdf(model: ModelRepair) -> None:
+    """Write an SDF text that Drake reads, with converted meshes and repaired included files."""
+    if not model.purpose.is_scene:
+        _keep_model_with_sensor(model)
+        for element in list(model.root.iter()):
             allowed = _CHILD_TAGS_READ_BY_DRAKE.get(element.tag)
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
-    urdf_repair.repair_links_and_joints(root, purpose, report, is_sdf=True)
-    for model in root.findall("model"):
-        model.set("name", model.get("name") or file.stem)
-    report.raise_faults(file)
-    uris = root.iterfind(".//include/uri")
-    inner = [_repair_included_file(uri, file, files, purpose, folder) for uri in uris]
-    mesh_folder = folder if purpose.plant_has_shapes else None
-    own = urdf_repair.convert_meshes_and_write_text(root, file, files, report, mesh_folder)
-    return repair_report.merge_repaired_models(own.text, [own, *filter(None, inner)])
+    urdf_repair.repair_links_and_joints(model, is_sdf=True)
+    for named in model.root.findall("model"):
+        named.set("name", named.get("name") or model.path.stem)
+    model.raise_faults()
+    for uri in model.root.iterfind(".//include/uri"):
+        _repair_included_file(uri, model)
+    urdf_repair.convert_meshes_and_write_text(model)
 
 
-def _repair_included_file(
-    uri: Element, file: Path, files: ModelFiles, purpose: urdf_repair.ModelPurpose, folder: Path
-) -> repair_report.RepairedModel | None:
-    """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
+def _repair_included_file(uri: Element, model: ModelRepair) -> None:
+    """Let an include refer to a repaired copy of its file, if that is one file."""
     address = (uri.text or "").strip()
-    included = _find_included_model_file(address, file, files)
+    included = _find_included_model_file(address, model)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
         what = f"includes {address!r}, which does not exist"
         remedy = f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}"
-        raise DrakeTeleopError(what, where=str(file), remedy=remedy)
+        raise DrakeTeleopError(what, where=str(model.path), remedy=remedy)
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {".urdf": urdf_repair.repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
-    if repair is None or not included.is_file():
-        return None
-    part = purpose._replace(is_in_directives=True)
-    repaired = repair(read_xml(included), included, files, part, folder)
-    target = folder / f"{len(list(folder.iterdir()))}_{included.name}"
-    target.write_text(repaired.text, encoding="utf-8")
-    uri.text = f"file://{target}"
-    return repaired
+    if repair is not None and included.is_file():
+        part = model.make_part(included)
+        repair(part)
+        model.add_results_of(part)
+        uri.text = f"file://{model.write_file(included.name, part.text)}"
 
 
-def _find_included_model_file(address: str, file: Path, files: ModelFiles) -> Path | None:
-    found = files.find_file(address, file.resolve().parent) or files.find_file(address)
+def _find_included_model_file(address: str, model: ModelRepair) -> Path | None:
+    find = model.files.find_file
+    found = find(address, model.path.resolve().parent) or find(address)
     if found is not None and (found / "model.config").is_file():
         named = read_xml(found / "model.config").findall("sdf")
-        inner = files.find_file((named[0].text or "").strip(), found) if len(named) == 1 else None
+        inner = find((named[0].text or "").strip(), found) if len(named) == 1 else None
         return inner or found
     return found
 
 
-def _keep_model_with_sensor(
-    root: Element, file: Path, files: ModelFiles, sensor: str, report: repair_report.RepairReport
-) -> None:
+def _keep_model_with_sensor(model: ModelRepair) -> None:
+    root = model.root
     worlds = root.findall("world")
     children = [child for scope in (root, *worlds) for child in scope]
-    models = [child for child in children if child.tag in ("model", "include")]
-    if not worlds and len(models) <= 1:
+    named = [child for child in children if child.tag in ("model", "include")]
+    if not worlds and len(named) <= 1:
         return
-    with_sensor = [each for each in models if _has_sensor_frame(each, file, files, sensor)]
+    with_sensor = [each for each in named if _has_sensor_frame(each, model)]
     if len(with_sensor) != 1:
         return  # Drake or the search for the frame reports it
     (kept,) = with_sensor
     for child in [child for child in root if child.tag in ("world", "model", "include")]:
         root.remove(child)
-    if kept.tag == "include":
-        around = SubElement(root, "model", name="model_of_world")
-        around.append(kept)
-    else:
-        root.append(kept)
-    for other in models:
+    around = root if kept.tag == "model" else SubElement(root, "model", name="model_of_world")
+    around.append(kept)
+    for other in named:
         if other is not kept:
             name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
-            report.state_repair("models beside the arm left out:", name)
+            model.state_repair("models beside the arm left out:", name)
 
 
-def _has_sensor_frame(model: Element, file: Path, files: ModelFiles, sensor: str) -> bool:
-    if model.tag == "model":
-        inner = [each for each in model.iter() if each.tag == "model"]
-        return any(link_of_frame(scope, sensor) for scope in inner)
-    included = _find_included_model_file((model.findtext("uri") or "").strip(), file, files)
-    if included is None or included.suffix.lower() not in (".urdf", ".sdf"):
-        return False
-    scopes = [each for each in read_xml(included).iter() if each.tag in ("robot", "model")]
-    return any(link_of_frame(scope, sensor) for scope in scopes)
+def _has_sensor_frame(element: Element, model: ModelRepair) -> bool:
+    if element.tag == "include":
+        included = _find_included_model_file((element.findtext("uri") or "").strip(), model)
+        if included is None or included.suffix.lower() not in (".urdf", ".sdf"):
+            return False
+        element = read_xml(included)
+    scopes = [each for each in element.iter() if each.tag in ("robot", "model")]
+    return any(link_of_frame(scope, model.purpose.sensor_name) for scope in scopes)
