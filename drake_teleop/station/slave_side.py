@@ -19,7 +19,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
-from drake_teleop.station.slave.arm import ForwardKinematics
+from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
 from drake_teleop.station.slave.joint_commands import (
     IK_METHODS,
@@ -29,7 +29,6 @@ from drake_teleop.station.slave.joint_commands import (
     ik_method_name,
 )
 from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
-from drake_teleop.station.slave.joint_friction import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event

@@ -52,11 +52,9 @@ class DrakeContact(LeafSystem):
         self._tool_ids = bodies, shapes
         results = Value[ContactResults]()
         self._contacts = self.DeclareAbstractInputPort("contact_results", results)
-        self.DeclareVectorOutputPort(
-            "true_contact_wrench_W", 6, weak_callback(self._calc_contact_wrench_W)
-        )
+        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc_wrench))
 
-    def _calc_contact_wrench_W(self, context: Context, output: BasicVector) -> None:
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._tool_ids))
 
 

@@ -96,11 +96,10 @@ class ExcitationCommand(LeafSystem):
     def __init__(self, trajectory: FourierTrajectory, start: float) -> None:
         super().__init__()
         self._trajectory, self._start = trajectory, start
-        self.DeclareVectorOutputPort(
-            "joint_command", len(trajectory.q0), weak_callback(self._calc_joint_command)
-        )
+        calc_command, n = weak_callback(self._calc_command), len(trajectory.q0)
+        self.DeclareVectorOutputPort("joint_command", n, calc_command)
 
-    def _calc_joint_command(self, context: Context, output: BasicVector) -> None:
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
         time = np.clip(context.get_time() - self._start, 0.0, self._trajectory.period)
         output.SetFromVector(self._trajectory.evaluate(time)[0])
 
@@ -121,13 +120,9 @@ class JointRangeMonitor(LeafSystem):
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            period, 0.0, self._store_status_and_check_joint_ranges
-        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_status_and_check_q)
 
-    def _store_status_and_check_joint_ranges(
-        self, context: Context, discrete_state: DiscreteValues
-    ) -> None:
+    def _store_status_and_check_q(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

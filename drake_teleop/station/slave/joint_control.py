@@ -11,13 +11,7 @@ from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.slave.arm import (
-    ArmModel,
-    forward_dynamics,
-    holding_torque,
-    inverse_dynamics,
-    jacobian,
-)
+from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics, jacobian
 from drake_teleop.station.slave.position_servo import (
     POSITION_INTERFACES,
     PositionInterface,
@@ -206,20 +200,11 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
     """Return the inertia Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W.
 
-    J must have rank 6.
-
-    Khatib, A unified approach for motion and force control of robot manipulators (1987).
+    J must have rank 6. Khatib, A unified approach for motion and force control of robot manipulators (1987).
     """
-    n = arm.num_joints
-    still, J = np.zeros(n), np.empty((6, n))
-    mobility, rates = np.empty((n, n)), np.empty(n)
-    forward_dynamics(arm.table, q, still, still, np.zeros(6), rates)
-    falling = rates.copy()
-    for i, torque in enumerate(np.eye(n)):
-        forward_dynamics(arm.table, q, still, torque, np.zeros(6), rates)
-        mobility[i] = rates - falling
+    J = np.empty((6, arm.num_joints))
     jacobian(arm.table, q, J)
-    return np.linalg.inv(J @ mobility @ J.T)
+    return np.linalg.inv(J @ np.linalg.inv(mass_matrix(arm, q)) @ J.T)
 
 
 def servo_at_tool(

@@ -23,6 +23,7 @@ from drake_teleop.common.vectors import (
     quaternion_logarithm,
     quaternion_of_matrix,
     quaternion_product,
+    solve_by_cholesky,
     vector_at,
 )
 from drake_teleop.station.slave.arm import (
@@ -31,7 +32,6 @@ from drake_teleop.station.slave.arm import (
     TRANSLATION_COLUMN,
     ArmModel,
     jacobian_and_pose,
-    solve_positive_definite,
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
@@ -63,8 +63,11 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 
 @njit(cache=True)
-def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
-    """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
+def _pose_error(table, L, pose, q, x, J, e, push):
+    """Write Jacobian J (6, n), pose error e (6,) at q and J^T e (n,) to `push`; return |e|^2.
+
+    Rotations are multiplied by L.
+    """
     jacobian_and_pose(table, q, J, x)
     a = normalized_quaternion(quaternion_at(pose, 0))
     inverse = conjugate_quaternion(quaternion_of_matrix(x[12:].reshape(3, 3)))
@@ -76,6 +79,10 @@ def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
         squared += e[i] * e[i] + e[3 + i] * e[3 + i]
         for k in range(q.shape[0]):
             J[3 + i, k] *= L
+    for k in range(q.shape[0]):
+        push[k] = 0.0
+        for i in range(6):
+            push[k] += J[i, k] * e[i]
     return squared
 
 
@@ -94,16 +101,14 @@ def _smaller_gram_matrix_into(J, H):
 @njit(cache=True)
 def _find_smallest_eigenpair(H, u):
     m = H.shape[0]
-    M = np.empty((m, m))
     for i in range(m):
         u[i] = 0.5 + (0.618 * (i + 1)) % 1.0
     growth = 1.0
     for _ in range(3):
+        M = H.copy()
         for i in range(m):
-            for k in range(m):
-                M[i, k] = H[i, k]
             M[i, i] += _MIN_STEP_DAMPING_M2
-        solve_positive_definite(M, u)
+        solve_by_cholesky(M, u, m)
         growth = 0.0
         for i in range(m):
             growth += u[i] * u[i]
@@ -137,7 +142,7 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
                 if held[k] and not held[i]:
                     d[i] -= H[i, k] * fixed[k]
             M[i, i] = 1.0 if held[i] else H[i, i] + damping
-        solve_positive_definite(M, d)
+        solve_by_cholesky(M, d, n)
         outside = False
         for i in range(n):
             if not (held[i] or lower[i] <= q[i] + d[i] <= upper[i]):
@@ -148,15 +153,6 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
         trial[i] = min(max(q[i] + d[i], lower[i]), upper[i])
         largest = max(largest, abs(d[i]))
     return largest
-
-
-@njit(cache=True)
-def _best_step_of_joint(J, e, i):
-    slope, square = 0.0, 0.0
-    for k in range(6):
-        slope += J[k, i] * e[k]
-        square += J[k, i] * J[k, i]
-    return slope / square
 
 
 @njit(cache=True)
@@ -197,24 +193,24 @@ def follow_pose(
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
+    g, push, trial, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     if towards_posture:
         if upper[n - 1] - lower[n - 1] == np.inf:
-            _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+            _pose_error(table, L, pose, q, x, J, e, push)
         for i in range(n):
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
-                # The last joint turns the tool without the links.
-                turn = pull * np.sin(posture[i] - q[i])
-                step = turn if i < n - 1 else _best_step_of_joint(J, e, i)
+                step = pull * np.sin(posture[i] - q[i])
+                if i == n - 1:  # the last joint turns the tool without the links
+                    step = push[i] / (J[:, i] ** 2).sum()
             q[i] = min(max(q[i] + step, low[i]), high[i])
-    g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+    squared = _pose_error(table, L, pose, q, x, J, e, push)
     _smaller_gram_matrix_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
-        copy_into(anchor, 0, q, 0, n)
+        anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
         for _ in range(steps):
             is_met = squared < _POSE_ROUNDING_ERROR_M * _POSE_ROUNDING_ERROR_M
@@ -223,14 +219,12 @@ def follow_pose(
             if better:
                 _smaller_gram_matrix_into(J, H)
                 for i in range(n):
-                    g[i] = damping * (anchor[i] - q[i])
-                    for k in range(6):
-                        g[i] += J[k, i] * e[k]
+                    g[i] = damping * (anchor[i] - q[i]) + push[i]
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
             largest = _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
             if largest < _POSE_ROUNDING_ERROR_M:
                 break
-            found = _jacobian_and_pose_error(table, L, pose, trial, x, J, e)
+            found = _pose_error(table, L, pose, trial, x, J, e, push)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
@@ -241,7 +235,7 @@ def follow_pose(
                 copy_into(q, 0, trial, 0, n)
             else:
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_RELATIVE_DAMPING)
-        _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+        _pose_error(table, L, pose, q, x, J, e, push)
         p, rotation = vector_at(e, 0), vector_at(e, 3)
         if (
             dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
@@ -252,7 +246,7 @@ def follow_pose(
             # The pose has priority: repeat without the posture.
             towards_posture = False
             copy_into(q, 0, start, 0, n)
-            squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+            squared = _pose_error(table, L, pose, q, x, J, e, push)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
@@ -262,11 +256,8 @@ def follow_pose(
             return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
-            push = 0.0
-            for k in range(6):
-                push += J[k, i] * e[k]
-            if not _is_joint_held_at_limit(q, low, high, i, push):
-                free += push * push
+            if not _is_joint_held_at_limit(q, low, high, i, push[i]):
+                free += push[i] * push[i]
             elif held < 0 or lower[i] < q[i] < upper[i]:
                 held = i
         if held >= 0:
@@ -286,11 +277,10 @@ def follow_pose(
             size = min(_MAX_SINGULARITY_ESCAPE_RAD_OR_M, 10.0 * np.sqrt(squared) / L)
         slope = 0.0
         for i in range(n):
-            for k in range(6):
-                slope += g[i] * J[k, i] * e[k]
+            slope += g[i] * push[i]
         for i in range(n):
             q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+        squared = _pose_error(table, L, pose, q, x, J, e, push)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
@@ -309,7 +299,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     for _ in range(30):
         ratio = (1.0 + ratio) ** (1.0 / (n + 1))
     start, status, L, smallest = reference, _OUT_OF_REACH, orientation_length(arm), np.inf
-    x, e, J = np.empty(21), np.empty(6), np.empty((6, n))
+    x, e, J, push = np.empty(21), np.empty(6), np.empty((6, n)), np.empty(n)
     for k in range(_NUM_SEARCH_STARTS):
         found = follow_pose(
             arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
@@ -317,7 +307,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
             return _nearest_joints_by_whole_turns(arm, q, reference), IkStatus(found)
-        squared = _jacobian_and_pose_error(arm.table, L, pose, q, x, J, e)
+        squared = _pose_error(arm.table, L, pose, q, x, J, e, push)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH

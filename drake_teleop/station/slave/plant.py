@@ -10,18 +10,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+)
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave import home
-from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, pose_into
+from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, dry_friction
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
@@ -30,7 +39,6 @@ from drake_teleop.station.slave.arm_from_plant import (
 )
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
@@ -45,6 +53,32 @@ _SHARED_TIP_DISTANCE_M = 1e-3
 _NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
+
+
+@njit(cache=True)
+def _friction_into(coulomb, index, state, force):
+    force[:] = 0.0
+    for i in range(coulomb.shape[0]):
+        force[index[i]] = dry_friction(coulomb[i], state[coulomb.shape[0] + i])
+
+
+class JointFriction(LeafSystem):
+    """Block that applies dry friction, which Drake's joints do not have, to the whole plant.
+
+    `index` contains the joints' indices in the plant's `num_velocities` velocities.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, coulomb: Array, index: NDArray[np.intp], num_velocities: int) -> None:
+        super().__init__()
+        self._constants = coulomb, index
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
+        calc, inputs = weak_callback(self._calc_friction_force), {self._state.ticket()}
+        self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
+
+    def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
+        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
 
 
 @dataclass(frozen=True)
@@ -194,9 +228,7 @@ def AddSlavePlant(
         force = plant.get_applied_generalized_force_input_port()
         builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
-    X_WS_start = np.empty(7) if slave.home else start_pose(slave)
-    if slave.home:
-        pose_into(arm.table, start, X_WS_start)
+    X_WS_start = arm.pose(start) if slave.home else start_pose(slave)
     tip, texts = _tip_of_tool(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
     parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
     return SlavePlant(*parts, texts, slave, environment)

@@ -145,11 +145,9 @@ class ToolContact(LeafSystem):
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         if contact.plant_state_size:
             self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_state_size)
-        self.DeclareVectorOutputPort(
-            "true_contact_wrench_W", 6, weak_callback(self._calc_contact_wrench_W)
-        )
+        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc_wrench))
 
-    def _calc_contact_wrench_W(self, context: Context, output: BasicVector) -> None:
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         state = self._state.Eval(context)
         q, v = state[: self._n], state[self._n :]
         sheet = self._nothing if self._sheet is None else self._sheet.Eval(context)
