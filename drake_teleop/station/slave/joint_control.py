@@ -200,7 +200,7 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
     """Return the inertia Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W.
 
-    J must have rank 6. Khatib, A unified approach for motion and force control of robot manipulators (1987).
+    J must have rank 6. Khatib, A unified approach for motion and force control (1987).
     """
     J = np.empty((6, arm.num_joints))
     jacobian(arm.table, q, J)

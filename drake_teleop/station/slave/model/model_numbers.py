@@ -137,7 +137,7 @@ def parse_numbers(text: str | None) -> list[float]:
 
 def replace_commas_by_blanks(root: Element) -> None:
     for element in root.iter():
-        for name in _NUMBER_LIST_ATTRIBUTES & element.keys():
+        for name in _NUMBER_LIST_ATTRIBUTES & element.attrib.keys():
             element.set(name, element.attrib[name].replace(",", " "))
         if element.tag in _NUMBER_LIST_TAGS and element.text:
             element.text = element.text.replace(",", " ")
