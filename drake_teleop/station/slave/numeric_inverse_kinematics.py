@@ -10,22 +10,10 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    copy_into,
-    cross,
-    dot,
-    normalized_quaternion,
-    quaternion_at,
-    quaternion_logarithm,
-    quaternion_of_matrix,
-    quaternion_product,
-    solve_by_cholesky,
-    vector_at,
-)
 from drake_teleop.station.slave.arm import (
     IS_PRISMATIC_COLUMN,
     PHI_COLUMN,
@@ -69,9 +57,9 @@ def _pose_error(table, L, pose, q, x, J, e, push):
     Rotations are multiplied by L.
     """
     jacobian_and_pose(table, q, J, x)
-    a = normalized_quaternion(quaternion_at(pose, 0))
-    inverse = conjugate_quaternion(quaternion_of_matrix(x[12:].reshape(3, 3)))
-    turn = quaternion_logarithm(quaternion_product(a, inverse))
+    a = vectors.normalized_quaternion(vectors.quaternion_at(pose, 0))
+    inverse = vectors.conjugate_quaternion(vectors.quaternion_of_matrix(x[12:].reshape(3, 3)))
+    turn = vectors.quaternion_logarithm(vectors.quaternion_product(a, inverse))
     squared = 0.0
     for i in range(3):
         e[i] = pose[4 + i] - x[9 + i]
@@ -108,7 +96,7 @@ def _find_smallest_eigenpair(H, u):
         M = H.copy()
         for i in range(m):
             M[i, i] += _MIN_STEP_DAMPING_M2
-        solve_by_cholesky(M, u, m)
+        vectors.solve_by_cholesky(M, u, m)
         growth = 0.0
         for i in range(m):
             growth += u[i] * u[i]
@@ -142,7 +130,7 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
                 if held[k] and not held[i]:
                     d[i] -= H[i, k] * fixed[k]
             M[i, i] = 1.0 if held[i] else H[i, i] + damping
-        solve_by_cholesky(M, d, n)
+        vectors.solve_by_cholesky(M, d, n)
         outside = False
         for i in range(n):
             if not (held[i] or lower[i] <= q[i] + d[i] <= upper[i]):
@@ -158,8 +146,12 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
 @njit(cache=True)
 def _wrist_or_shoulder_status(L, J):
     n = J.shape[1]
-    a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
-    coplanar = abs(dot(a, cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
+    a, b, c = (
+        vectors.vector_at(J[3:, n - 3], 0),
+        vectors.vector_at(J[3:, n - 2], 0),
+        vectors.vector_at(J[3:, n - 1], 0),
+    )
+    coplanar = abs(vectors.dot(a, vectors.cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
@@ -232,26 +224,26 @@ def follow_pose(
             if better:
                 stalled_steps = stalled_steps + 1 if total > 0.99 * cost else 0
                 squared, cost, relative_damping = found, total, 0.2 * relative_damping
-                copy_into(q, 0, trial, 0, n)
+                vectors.copy_into(q, 0, trial, 0, n)
             else:
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_RELATIVE_DAMPING)
         _pose_error(table, L, pose, q, x, J, e, push)
-        p, rotation = vector_at(e, 0), vector_at(e, 3)
+        p, rotation = vectors.vector_at(e, 0), vectors.vector_at(e, 3)
         if (
-            dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
-            and dot(rotation, rotation) <= L * L * POSE_TOLERANCE_M * POSE_TOLERANCE_M
+            vectors.dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
+            and vectors.dot(rotation, rotation) <= L * L * POSE_TOLERANCE_M * POSE_TOLERANCE_M
         ):
             return _STATUS_OK
         if towards_posture:
             # The pose has priority: repeat without the posture.
             towards_posture = False
-            copy_into(q, 0, start, 0, n)
+            vectors.copy_into(q, 0, start, 0, n)
             squared = _pose_error(table, L, pose, q, x, J, e, push)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
                 return _wrist_or_shoulder_status(L, J)
-            copy_into(q, 0, kept, 0, n)
+            vectors.copy_into(q, 0, kept, 0, n)
             far = before > _MAX_POSE_ERROR_AT_SINGULARITY_M**2 and expected_gain < 1e-3 * before
             return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
@@ -268,7 +260,7 @@ def follow_pose(
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
         expected_gain = 4.0 * free / max(damping, _MIN_STEP_DAMPING_M2)
-        copy_into(kept, 0, q, 0, n)
+        vectors.copy_into(kept, 0, q, 0, n)
         # Displace along the weakest direction, in proportion to the error, so that noise does not
         # move the arm.
         _find_smallest_eigenpair(H, g)
@@ -342,7 +334,7 @@ def _follow_command(
     encoder readings `position` (n,) hold the last command.
     """
     n = q.shape[0]
-    copy_into(q, 0, last, 0, n)
+    vectors.copy_into(q, 0, last, 0, n)
     if not are_finite_and_in_range(position):
         return _BAD_POSE
     reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)

@@ -305,9 +305,8 @@ def _remove_shapes_without_contact(
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
         for shape in plant.GetVisualGeometriesForBody(body):
             scene.RemoveGeometry(source, shape)
-    own = [index for index in plant.GetBodyIndices(arm) if index not in carried]
-    for body in map(plant.get_body, own):
-        for shape in plant.GetCollisionGeometriesForBody(body):
+        is_of_arm = body.model_instance() == arm and body.index() not in carried
+        for shape in plant.GetCollisionGeometriesForBody(body) if is_of_arm else ():
             scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
@@ -363,13 +362,6 @@ def _unit_sphere_points() -> Array:
     return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)
 
 
-def _farthest_hull_point_along_z(hulls: list[Array]) -> Array:
-    reach = max(float(hull[:, 2].max()) for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
-    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
-    return np.array([*np.mean(middles, axis=0), reach])
-
-
 def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
@@ -380,10 +372,16 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
             return tip.GetFixedPoseInBodyFrame().translation()
         context = plant.CreateDefaultContext()
         return tip.CalcPose(context, parsed.sensor_frame).translation()
-    reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hulls_of_carried_shapes_S(slave)):
-        return _farthest_hull_point_along_z(hulls)
-    return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
+    if slave.tool is not None:
+        end = end_of_tool_shapes(slave.tool)
+        return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
+    hulls = _hulls_of_carried_shapes_S(slave)
+    if not hulls:
+        return arm.phi_load[1:4] / arm.phi_load[0]
+    reach = max(hull[:, 2].max() for hull in hulls)
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
+    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
+    return np.array([*np.mean(middles, axis=0), reach])
 
 
 def read_arm_without_default_limits(

@@ -114,10 +114,8 @@ class BodyReader:
         return body
 
     def _make_unused_name(self, stem: str) -> str:
-        for number in self._counters.setdefault(stem, count(1)):
-            if (name := f"{stem}_{number}") not in self._names:
-                break
-        return name
+        numbers = self._counters.setdefault(stem, count(1))
+        return next(name for k in numbers if (name := f"{stem}_{k}") not in self._names)
 
     def _read_children(
         self, body: Body, element: Element, childclass: str, X_BF: RigidTransform

@@ -58,13 +58,12 @@ def combine_mass_properties(parts: list[MassProperties]) -> MassProperties:
 def unit_density_properties_of_primitive(kind: str, size: list[float]) -> MassProperties:
     """Return the mass properties of a shape of density 1 in its own axes."""
     a, b, c = size
-    if kind == "box":
-        volume, moments = 8 * a * b * c, np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / 3
-    elif kind == "ellipsoid":
-        volume = 4 / 3 * np.pi * a * b * c
-        moments = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / 5
-    elif kind == "sphere":
-        volume, moments = 4 / 3 * np.pi * a**3, np.full(3, 0.4 * a**2)
+    if kind == "sphere":
+        b = c = a
+    if kind in ("box", "ellipsoid", "sphere"):
+        factor, divisor = (8, 3) if kind == "box" else (4 / 3 * np.pi, 5)
+        volume = factor * a * b * c
+        moments = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / divisor
     elif kind in ("cylinder", "capsule"):
         middle = 2 * np.pi * a**2 * b
         ends = 4 / 3 * np.pi * a**3 if kind == "capsule" else 0.0

@@ -21,8 +21,7 @@ class MjcfText:
 
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf, self._model, self._purpose = mjcf, mjcf.model, mjcf.model.purpose
-        name = mjcf.root.get("model") or mjcf.model.path.stem
-        self._root = Element("mujoco", model=name)
+        self._root = Element("mujoco", model=mjcf.root.get("model") or mjcf.model.path.stem)
         SubElement(self._root, "compiler", angle="radian", autolimits="false")
         self._assets = SubElement(self._root, "asset")
         self._meshes: dict[tuple[int, bool], str] = {}
@@ -72,8 +71,7 @@ class MjcfText:
             values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            what = "no damping, instead of a negative one, of"
-            self._model.state_assumption(what, joint.name)
+            self._model.state_assumption("no damping, instead of a negative one, of", joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
@@ -84,23 +82,21 @@ class MjcfText:
             values["friction"] = repr(given.numbers("friction", (1.0,))[0])
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
-        seen, felt = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
+        without_contact, invisible = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
         has_contact = mjcf_bodies.takes_part_in_contacts(given)
-        if geom.mesh is None or self._purpose.is_scene or not has_contact:
-            values |= ({} if has_contact else seen) | ({} if geom.is_visible else felt)
+        contact_mesh = geom.mesh if has_contact and not self._purpose.is_scene else None
+        if geom.is_visible or contact_mesh is None:
             size = {"size": _format_numbers(geom.size)}
             shape = size if geom.mesh is None else self._add_mesh_asset(geom.mesh)
-            SubElement(element, "geom", {**values, **shape})
-            return
-        if geom.is_visible:
-            SubElement(element, "geom", {**values, **seen, **self._add_mesh_asset(geom.mesh)})
-        try:
-            hull = self._add_mesh_asset(geom.mesh, hull=True)
-        except ValueError as error:
-            fault = f"{error}; shapes are missing of"
-            self._model.state_repair(fault, body.name)
-        else:
-            SubElement(element, "geom", {**values, **felt, **hull})
+            shape |= without_contact if contact_mesh or not has_contact else {}
+            shape |= {} if geom.is_visible else invisible
+            SubElement(element, "geom", values | shape)
+        if contact_mesh is not None:
+            try:
+                hull = self._add_mesh_asset(contact_mesh, hull=True)
+                SubElement(element, "geom", values | invisible | hull)
+            except ValueError as error:
+                self._model.state_repair(f"{error}; shapes are missing of", body.name)
 
     def _add_mesh_asset(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull

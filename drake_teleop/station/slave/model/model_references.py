@@ -156,9 +156,7 @@ class ModelFiles:
         Call `check_referenced_files` first.
         """
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
-        for mesh in [
-            mesh for path in texts for mesh in self._referenced_files(path, with_meshes=True)
-        ]:
+        for mesh in [m for path in texts for m in self._referenced_files(path, with_meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):
                 yield from filter(os.path.isfile, self.sizes)
 
