@@ -20,7 +20,6 @@ from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, ForwardKinematics
-from drake_teleop.station.slave.drake_contact import DrakeContact
 from drake_teleop.station.slave.joint_commands import (
     IK_METHODS,
     ExcitationCommand,
@@ -30,7 +29,7 @@ from drake_teleop.station.slave.joint_commands import (
 )
 from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
-from drake_teleop.station.slave.plant_dynamics import ToolContact
+from drake_teleop.station.slave.plant_dynamics import DrakeContact, ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
 from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_matching_inputs, connect_ports, export_outputs

@@ -18,7 +18,6 @@ from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.model_numbers import (
     check_lengths_and_inertias,
     nearest_possible_inertia,
@@ -26,7 +25,7 @@ from drake_teleop.station.slave.model.model_numbers import (
 )
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
 from drake_teleop.station.slave.model.urdf_repair import _has_valid_colour, find_dependence_reasons
-from drake_teleop.station.slave.models import ParseModel, ParseScene
+from drake_teleop.station.slave.models import ParseModel, ParseScene, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -13,9 +17,9 @@ from pydrake.multibody import parsing
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoint
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError, silent_stderr
 from drake_teleop.common.texts import read_text, read_yaml
-from drake_teleop.station.slave import chain_joints, drake_errors
+from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_repair import (
@@ -29,6 +33,14 @@ from drake_teleop.station.slave.model.urdf_repair import repair_urdf
 _XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
+# Expected kind of file, and the remedy for missing packages.
+ROBOT_ERROR_TEXTS = "robot", "with --package-path for package://"
+SCENE_ERROR_TEXTS = "scene", "its package:// addresses in folders around it"
+# Places in Drake's source and in repaired texts, which the user does not have.
+_DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
+_PLACE_IN_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
+_NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 
 
 def repair_and_parse_model(
@@ -53,10 +65,9 @@ def repair_and_parse_model(
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
-    robot, scene = drake_errors.ROBOT_ERROR_TEXTS, drake_errors.SCENE_ERROR_TEXTS
-    expected = scene if purpose.is_scene else robot
+    expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
     model = ModelRepair(path, files, purpose, Path(folder.name))
-    with drake_errors.translate_drake_errors(path, expected, folder.name):
+    with translate_drake_errors(path, expected, folder.name):
         instances = (_add_files_of_directives if kind == ".yaml" else _add_file)(parser, model)
         chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
@@ -68,7 +79,7 @@ def repair_and_parse_model(
 
 def _add_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceIndex]:
     _repair_text(model)
-    with drake_errors.raise_logged_errors():
+    with raise_logged_errors():
         if model.text:
             kind = model.path.suffix.lower().removeprefix(".")
             return parser.AddModelsFromString(model.text, kind)
@@ -78,7 +89,7 @@ def _add_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceI
 def _add_files_of_directives(
     parser: parsing.Parser, model: ModelRepair
 ) -> list[ModelInstanceIndex]:
-    with drake_errors.raise_logged_errors():
+    with raise_logged_errors():
         loaded = parsing.LoadModelDirectives(str(model.path))
         directives = parsing.FlattenModelDirectives(loaded, parser.package_map())
     parts = dict[Path, ModelRepair]()
@@ -94,7 +105,7 @@ def _add_files_of_directives(
             added.file = f"file://{model.write_file(file.name, parts[file].text)}"
     texts = [part.text for part in parts.values()]
     model.text = "".join(texts) if all(texts) else ""
-    with drake_errors.raise_logged_errors():
+    with raise_logged_errors():
         models = parsing.ProcessModelDirectives(directives, parser)
     return [each.model_instance for each in models]
 
@@ -139,7 +150,7 @@ def ParseModel(
     chain_joints.check_chain(chain, model.dependence_reasons, where)
     free = chain_joints.weld_free_bodies(plant, instances)
     moving = [joint for joint in chain if joint.num_velocities() > 0]
-    with drake_errors.translate_drake_errors(path):
+    with translate_drake_errors(path):
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
         limits = model.effort_limits if model.text else None
         chain_joints.set_one_actuator_per_joint(plant, moving, limits)
@@ -171,7 +182,7 @@ def ParseTool(
         what = f"the tool must have one root link, but has {len(roots)}: {names}"
         remedy = "give one tree of links; its root is welded to the sensor frame"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-    with drake_errors.translate_drake_errors(path):
+    with translate_drake_errors(path):
         held_joints = chain_joints.weld_joints_outside_chain(plant, before, [])
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
@@ -198,3 +209,51 @@ def _find_sensor_frame(
     named = {each for each in names if not each.endswith(ends)}
     what, remedy = describe_frame_fault(len(with_frame), name, named)
     raise DrakeTeleopError(what, where=where, remedy=remedy)
+
+
+@contextmanager
+def translate_drake_errors(
+    path: Path, expected: tuple[str, str] = ROBOT_ERROR_TEXTS, folder: str = ""
+) -> Iterator[None]:
+    """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
+
+    Messages name the original files instead of repaired copies in `folder`.
+    """
+    try:
+        yield
+    except DrakeTeleopError:
+        raise
+    # SystemExit: failed condition in Drake; LookupError: from C++ containers.
+    except (RuntimeError, SystemExit, ValueError, LookupError) as error:
+        reason = _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
+        reason = _PLACE_IN_REPAIRED_TEXT_PATTERN.sub("", reason)
+        if folder:
+            reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
+        what = f"cannot be read as a {expected[0]}"
+        remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
+        room = MAX_ERROR_LINE_LENGTH - _NUM_SEPARATOR_CHARS - len(f"{path}{what}{remedy}")
+        if len(reason) > room:
+            reason = f"{reason[:room]} ..."
+        raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None
+
+
+@contextmanager
+def raise_logged_errors() -> Iterator[None]:
+    """Raise RuntimeError if Drake logs an error, or a warning about an inertia."""
+    errors: list[str] = []
+
+    def collect_error_message(record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno >= logging.ERROR or "inertia" in message:
+            errors.append(" ".join(message.split()))
+        return False
+
+    log = logging.getLogger("drake")
+    log.addFilter(collect_error_message)
+    try:
+        with silent_stderr():  # the parsers below Drake write to stderr
+            yield
+    finally:
+        log.removeFilter(collect_error_message)
+    if errors:
+        raise RuntimeError("; ".join(dict.fromkeys(errors)))

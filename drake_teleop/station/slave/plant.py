@@ -38,8 +38,7 @@ from drake_teleop.station.slave.arm_from_plant import (
     values_per_joint,
 )
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.models import ParseModel
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
