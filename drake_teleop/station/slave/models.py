@@ -22,11 +22,7 @@ from drake_teleop.common.texts import read_text, read_yaml
 from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles
-from drake_teleop.station.slave.model.model_repair import (
-    ModelPurpose,
-    ModelRepair,
-    describe_frame_fault,
-)
+from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
 from drake_teleop.station.slave.model.sdf_repair import repair_sdf
 from drake_teleop.station.slave.model.urdf_repair import repair_urdf
 
@@ -144,7 +140,7 @@ def ParseModel(
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
     instances, model = repair_and_parse_model(plant, path, package_paths, purpose)
-    frame = _find_sensor_frame(plant, instances, sensor_frame, where)
+    frame = _find_sensor_frame(plant, instances, model)
     held = chain_joints.weld_held_joints(plant, hold, set(plant.GetJointIndices()) - before)
     chain = chain_joints.weld_base_and_find_chain(plant, frame, X_WBase, where)
     chain_joints.check_chain(chain, model.dependence_reasons, where)
@@ -198,17 +194,17 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> None:
 
 
 def _find_sensor_frame(
-    plant: MultibodyPlant, instances: list[ModelInstanceIndex], name: str, where: str
+    plant: MultibodyPlant, instances: list[ModelInstanceIndex], model: ModelRepair
 ) -> Frame:
+    name = model.purpose.sensor_name
     with_frame = [index for index in instances if plant.HasFrameNamed(name, index)]
     if len(with_frame) == 1:
         return plant.GetFrameByName(name, with_frame[0])
     names = {plant.get_frame(k).name() for each in instances for k in plant.GetFrameIndices(each)}
     # Without names that Drake creates for joints.
-    ends = ("_parent", "_child", "__model__")
-    named = {each for each in names if not each.endswith(ends)}
-    what, remedy = describe_frame_fault(len(with_frame), name, named)
-    raise DrakeTeleopError(what, where=where, remedy=remedy)
+    named = {each for each in names if not each.endswith(("_parent", "_child", "__model__"))}
+    what, remedy = model.describe_frame_fault(len(with_frame), named)
+    raise DrakeTeleopError(what, where=str(model.path), remedy=remedy)
 
 
 @contextmanager

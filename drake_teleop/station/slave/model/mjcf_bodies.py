@@ -60,10 +60,6 @@ class Geom:
         return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GEOM_GROUP
 
 
-def takes_part_in_contacts(shape: Attributes) -> bool:
-    return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
-
-
 @dataclass(eq=False)
 class Body:
     """Body with pose X_PB in its parent; `generator_tags` are tags that are not supported."""

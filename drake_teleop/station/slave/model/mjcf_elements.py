@@ -62,6 +62,11 @@ class Attributes(dict[str, str]):
     def number(self, name: str, default: float) -> float:
         return self.numbers(name, (default,))[0]
 
+    @property
+    def has_contact(self) -> bool:
+        """Whether a shape with these attributes takes part in contacts."""
+        return any(self.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
+
     def read_range(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
         """Return the range in attribute `name`, or None if attribute `flag` switches it off.
 

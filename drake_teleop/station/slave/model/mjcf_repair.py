@@ -15,20 +15,11 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.station.slave.model import model_numbers
-from drake_teleop.station.slave.model.mjcf_bodies import (
-    Body,
-    BodyReader,
-    Joint,
-    takes_part_in_contacts,
-)
+from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
-from drake_teleop.station.slave.model.model_repair import (
-    ModelRepair,
-    describe_frame_fault,
-    join_names,
-)
+from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
 
 _DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 # Dynamics whose output has no range.
@@ -71,7 +62,7 @@ def repair_mjcf(model: ModelRepair) -> None:
     model.effort_limits = _effort_limits(mjcf, with_motor)
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
-            if takes_part_in_contacts(shape) or not body.geoms:
+            if shape.has_contact or not body.geoms:
                 model.state_repair(f"{fault}; shapes are missing of", body.name)
     model.auxiliary_bodies = {body.name for body in bodies if body.is_auxiliary}
     model.raise_faults()
@@ -89,7 +80,7 @@ def _read_world_with_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
     if len(carriers) != 1:
         names = [_names_of_elements(top, tag) for tag in ("body", "site") for _, top in tops]
         known = set[str]().union(*names) - {""}
-        what = "; ".join(describe_frame_fault(len(carriers), sensor, known))
+        what = "; ".join(model.describe_frame_fault(len(carriers), known))
         for fault in (what, *reader.meshes.inaccessible):
             model.add_fault(fault)
         model.raise_faults()

@@ -48,7 +48,7 @@ class MjcfText:
         for joint in body.joints:
             self._write_joint(element, joint)
         for geom in body.geoms if self._purpose.plant_has_shapes else ():
-            if mjcf_bodies.takes_part_in_contacts(geom.attributes) or geom.is_visible:
+            if geom.attributes.has_contact or geom.is_visible:
                 self._write_geom(element, geom, body)
         for child in body.children:
             inner = SubElement(element, "body", {"name": child.name, **_format_pose(child.X_PB)})
@@ -83,12 +83,11 @@ class MjcfText:
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
         without_contact, invisible = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
-        has_contact = mjcf_bodies.takes_part_in_contacts(given)
-        contact_mesh = geom.mesh if has_contact and not self._purpose.is_scene else None
+        contact_mesh = geom.mesh if given.has_contact and not self._purpose.is_scene else None
         if geom.is_visible or contact_mesh is None:
             size = {"size": _format_numbers(geom.size)}
             shape = size if geom.mesh is None else self._add_mesh_asset(geom.mesh)
-            shape |= without_contact if contact_mesh or not has_contact else {}
+            shape |= without_contact if contact_mesh or not given.has_contact else {}
             shape |= {} if geom.is_visible else invisible
             SubElement(element, "geom", values | shape)
         if contact_mesh is not None:

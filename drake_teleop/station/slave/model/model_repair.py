@@ -100,6 +100,13 @@ class ModelRepair:
         own = [f"{what} {join_names(names)}" for what, names in self._names.items()]
         return list(dict.fromkeys([*own, *self._assumptions_of_parts]))
 
+    def describe_frame_fault(self, count: int, known: set[str]) -> tuple[str, str]:
+        """Return fault and remedy if `count` frames, not one, have the name of the sensor frame."""
+        name = self.purpose.sensor_name
+        near = get_close_matches(name, sorted(known), n=_MAX_JOINED_NAMES, cutoff=0.0)
+        remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
+        return f"{count or 'no'} frames are named {name!r}", remedy
+
     def raise_faults(self) -> None:
         """Raise one DrakeTeleopError about all faults, if there are any."""
         if not self._causes:
@@ -113,13 +120,6 @@ class ModelRepair:
             texts[shown:] = [f"and {count - shown} more"] if shown < count else []
             what = f"the model has {count} faults: {'; '.join(texts)}"
         raise DrakeTeleopError(what, where=str(self.path))
-
-
-def describe_frame_fault(count: int, name: str, known: set[str]) -> tuple[str, str]:
-    """Return fault and remedy if `count` frames, not one, have the sensor frame's `name`."""
-    near = get_close_matches(name, sorted(known), n=_MAX_JOINED_NAMES, cutoff=0.0)
-    remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
-    return f"{count or 'no'} frames are named {name!r}", remedy
 
 
 def join_names(names: Iterable[str]) -> str:
