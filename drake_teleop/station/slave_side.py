@@ -27,7 +27,7 @@ from drake_teleop.station.slave.joint_commands import (
     LeaderJointFollower,
     ik_method_name,
 )
-from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
+from drake_teleop.station.slave.joint_control import HeldTorque, JointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import DrakeContact, ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
@@ -219,7 +219,7 @@ def _add_slave_blocks(
     elif samples > 1:
         servo = SampledServo(slave, scenario.joint_control, period, samples)
     else:
-        servo = MakeJointControl(arm, scenario.joint_control, period, start)
+        servo = JointControl(arm, scenario.joint_control, period, start)
     control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
     _check_friction_time_step(slave, min(held, scenario.simulation.max_step))
