@@ -16,11 +16,11 @@ from test_model_repairs import pose, read, written
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import DAMPING_COLUMN, PHI_COLUMN, ROTOR_COLUMN
+from drake_teleop.station.slave.model.meshes import Triangles
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh, fit_shape_to_mesh
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
-from drake_teleop.station.slave.model.triangles import Triangles
 from drake_teleop.station.slave.models import ParseScene, ParseTool
 
 INERTIAL = '<inertial pos="0 0 0" mass="2" diaginertia="0.02 0.02 0.02"/>'

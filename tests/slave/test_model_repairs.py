@@ -24,7 +24,10 @@ from drake_teleop.station.slave.model.model_numbers import (
     repair_inertia_and_detect_missing,
 )
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
-from drake_teleop.station.slave.model.urdf_repair import _has_valid_colour, find_dependence_reasons
+from drake_teleop.station.slave.model.urdf_and_sdf_repair import (
+    _has_valid_colour,
+    find_dependence_reasons,
+)
 from drake_teleop.station.slave.models import ParseModel, ParseScene, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave

@@ -23,8 +23,7 @@ from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
-from drake_teleop.station.slave.model.sdf_repair import repair_sdf
-from drake_teleop.station.slave.model.urdf_repair import repair_urdf
+from drake_teleop.station.slave.model.urdf_and_sdf_repair import repair_sdf, repair_urdf
 
 _XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"

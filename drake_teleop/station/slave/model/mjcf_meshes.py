@@ -13,14 +13,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import model_references
-from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.triangles import (
+from drake_teleop.station.slave.model.meshes import (
     Triangles,
     check_triangle_vertices,
     convex_hull,
     obj_text,
     read_triangles,
 )
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
 
 class MassProperties(NamedTuple):

@@ -15,10 +15,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.station.slave.model import model_numbers
-from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
+from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint, MjcfText
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
-from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
 
 _DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]

@@ -6,16 +6,25 @@ Faults of links and joints that the arm does not need are repaired. Every repair
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model import model_numbers, model_tree
 from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
+from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, read_xml
 from drake_teleop.station.slave.model.model_repair import ModelRepair
-from drake_teleop.station.slave.model.model_tree import joint_end, list_joints
+from drake_teleop.station.slave.model.model_tree import joint_end, link_of_frame, list_joints
 
-_URDF_TAGS_READ_BY_DRAKE = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
-_URDF_TAGS_READ_BY_DRAKE |= {"drake:collision_filter_group"}
+# Children that Drake reads; it also reads elements with its own prefix.
+_CHILD_TAGS_READ_BY_DRAKE = {
+    "robot": {"link", "joint", "material", "frame", "transmission"},
+    "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
+    "link": {"pose", "inertial", "collision", "visual"},
+    "collision": {"pose", "geometry", "surface"},
+    "visual": {"pose", "geometry", "material"},
+}
 _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
@@ -24,17 +33,37 @@ def repair_urdf(model: ModelRepair) -> None:
     root = model.root
     root.set("name", root.get("name") or model.path.stem)
     if not model.purpose.is_scene:
-        for child in [child for child in root if child.tag not in _URDF_TAGS_READ_BY_DRAKE]:
-            if not child.tag.endswith(("_constraint", "_bushing_rpy")):
-                root.remove(child)
+        _remove_children_ignored_by_drake([root])
         _keep_one_material_per_name(root)
-    repair_links_and_joints(model, is_sdf=False)
+    _repair_links_and_joints(model, is_sdf=False)
     if not model.purpose.is_scene:
         _remove_references_to_missing_parts(model)
-    convert_meshes_and_write_text(model)
+    _convert_meshes_and_write_text(model)
 
 
-def repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
+def repair_sdf(model: ModelRepair) -> None:
+    """Write an SDF text that Drake reads, with converted meshes and repaired included files."""
+    if not model.purpose.is_scene:
+        _keep_model_with_sensor(model)
+        _remove_children_ignored_by_drake(list(model.root.iter()))
+    _repair_links_and_joints(model, is_sdf=True)
+    for named in model.root.findall("model"):
+        named.set("name", named.get("name") or model.path.stem)
+    model.raise_faults()
+    for uri in model.root.iterfind(".//include/uri"):
+        _repair_included_file(uri, model)
+    _convert_meshes_and_write_text(model)
+
+
+def _remove_children_ignored_by_drake(elements: list[Element]) -> None:
+    for element in elements:
+        allowed = _CHILD_TAGS_READ_BY_DRAKE.get(element.tag, {child.tag for child in element})
+        for child in list(element):
+            if child.tag not in allowed and not child.tag.startswith("drake:"):
+                element.remove(child)
+
+
+def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
     """Repair links and joints of a robot, or of a model and its nested models."""
     model_numbers.replace_commas_by_blanks(model.root)
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
@@ -57,7 +86,7 @@ def repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
                 model.state_assumption("no inertia of", name)
 
 
-def convert_meshes_and_write_text(model: ModelRepair) -> None:
+def _convert_meshes_and_write_text(model: ModelRepair) -> None:
     """Convert meshes and write the text, or raise one DrakeTeleopError about all faults."""
     model.raise_faults()
     remove_unusable_shapes(model)
@@ -95,7 +124,7 @@ def _reduce_model_to_arm(
         return None
     if len(scopes) != 1 or purpose.is_in_directives or scopes[0].find("include") is not None:
         return None
-    link = model_tree.link_of_frame(scopes[0], purpose.sensor_name) if purpose.sensor_name else ""
+    link = link_of_frame(scopes[0], purpose.sensor_name) if purpose.sensor_name else ""
     return model_tree.reduce_to_chain(scopes[0], link, model) if link else None
 
 
@@ -164,3 +193,61 @@ def _remove_references_to_missing_parts(model: ModelRepair) -> None:
         model_numbers.check_lengths_and_inertias(motor, f"motor of {names[0]}", model)
         for actuator in motor.findall("actuator"):
             actuator.set("name", names[0])
+
+
+def _repair_included_file(uri: Element, model: ModelRepair) -> None:
+    """Let an include refer to a repaired copy of its file, if that is one file."""
+    address = (uri.text or "").strip()
+    included = _find_included_model_file(address, model)
+    if included is None:  # Drake searches in more places, and crashes on a circle through them
+        what = f"includes {address!r}, which does not exist"
+        remedy = f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}"
+        raise DrakeTeleopError(what, where=str(model.path), remedy=remedy)
+    uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
+    repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
+    if repair is not None and included.is_file():
+        part = model.make_part(included)
+        repair(part)
+        model.add_results_of(part)
+        uri.text = f"file://{model.write_file(included.name, part.text)}"
+
+
+def _find_included_model_file(address: str, model: ModelRepair) -> Path | None:
+    find = model.files.find_file
+    found = find(address, model.path.resolve().parent) or find(address)
+    if found is not None and (found / "model.config").is_file():
+        named = read_xml(found / "model.config").findall("sdf")
+        inner = find((named[0].text or "").strip(), found) if len(named) == 1 else None
+        return inner or found
+    return found
+
+
+def _keep_model_with_sensor(model: ModelRepair) -> None:
+    root = model.root
+    worlds = root.findall("world")
+    children = [child for scope in (root, *worlds) for child in scope]
+    named = [child for child in children if child.tag in ("model", "include")]
+    if not worlds and len(named) <= 1:
+        return
+    with_sensor = [each for each in named if _has_sensor_frame(each, model)]
+    if len(with_sensor) != 1:
+        return  # Drake or the search for the frame reports it
+    (kept,) = with_sensor
+    for child in [child for child in root if child.tag in ("world", "model", "include")]:
+        root.remove(child)
+    around = root if kept.tag == "model" else SubElement(root, "model", name="model_of_world")
+    around.append(kept)
+    for other in named:
+        if other is not kept:
+            name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
+            model.state_repair("models beside the arm left out:", name)
+
+
+def _has_sensor_frame(element: Element, model: ModelRepair) -> bool:
+    if element.tag == "include":
+        included = _find_included_model_file((element.findtext("uri") or "").strip(), model)
+        if included is None or included.suffix.lower() not in (".urdf", ".sdf"):
+            return False
+        element = read_xml(included)
+    scopes = [each for each in element.iter() if each.tag in ("robot", "model")]
+    return any(link_of_frame(scope, model.purpose.sensor_name) for scope in scopes)
