@@ -49,9 +49,8 @@ from drake_teleop.station.slave.plant_dynamics import (
     tool_proximity,
 )
 from drake_teleop.station.slave.scene import Scene
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
-from drake_teleop.station.slave.tool import Block as ToolBox
+from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
+from drake_teleop.station.slave.slave_config import Block as ToolBox
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 SOFT_PAD = """

@@ -30,8 +30,7 @@ from drake_teleop.station.slave.model.urdf_and_sdf_repair import (
 )
 from drake_teleop.station.slave.models import ParseModel, ParseScene, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Slave, Tool
 
 
 def read(path, sensor="l6", hold=None, shapes=False):

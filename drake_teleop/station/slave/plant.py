@@ -39,13 +39,12 @@ from drake_teleop.station.slave.arm_from_plant import (
 )
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
-from drake_teleop.station.slave.slave_config import AddPayload, Slave
+from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, end_of_tool_shapes
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
     ToolContactModel,
 )
-from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
 _SHARED_TIP_DISTANCE_M = 1e-3
