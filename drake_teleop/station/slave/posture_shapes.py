@@ -58,7 +58,7 @@ class PostureShapes:
 
     Attributes:
         assumptions: texts about data that the models do not have.
-        tool_bodies: indices of the bodies beyond the sensor.
+        tool_body, tool_bodies: indices of the body on the sensor, and of all bodies beyond it.
         surroundings: indices of the bodies of the environment.
     """
 
@@ -68,13 +68,15 @@ class PostureShapes:
         builder = DiagramBuilder()
         self.plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         self._parsed = ParseSlave(self.plant, slave)
-        of_slave = self.plant.num_bodies()
+        self.tool_body, of_slave = self._parsed.tool, self.plant.num_bodies()
         if environment is not None:
             AddEnvironment(self.plant, environment)
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
         beyond = bodies_carried_by(self.plant, self._parsed.sensor_frame.body())
         self.tool_bodies = {body.index() for body in beyond}
-        if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
+        links = [self.plant.get_body(k) for k in self.moving_bodies() - self.tool_bodies]
+        shapes = self.plant.GetCollisionGeometriesForBody, self.plant.GetVisualGeometriesForBody
+        if sticks and not any(find(link) for find in shapes for link in links):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
         _complete_and_bound_collision_shapes(self.plant, self._scene_graph)
         finalize_without_limit_warnings(self.plant)
@@ -107,10 +109,6 @@ class PostureShapes:
     def X_WS(self) -> RigidTransform:
         return self._parsed.sensor_frame.CalcPoseInWorld(self.context)
 
-    @property
-    def tool_body(self) -> BodyIndex:
-        return self._parsed.tool
-
     def bodies_welded_to_sensor(self) -> set[BodyIndex]:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
@@ -140,11 +138,6 @@ class PostureShapes:
     def moving_bodies(self) -> set[BodyIndex]:
         every = set(map(BodyIndex, range(self.plant.num_bodies())))
         return every - self.surroundings - self.anchored_bodies()
-
-    def _has_shapes(self, index: BodyIndex) -> bool:
-        body, plant = self.plant.get_body(index), self.plant
-        shapes = plant.GetCollisionGeometriesForBody(body)
-        return bool(shapes or plant.GetVisualGeometriesForBody(body))
 
     def _body_pair_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)

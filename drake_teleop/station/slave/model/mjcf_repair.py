@@ -169,15 +169,21 @@ def _weld_other_joints_and_list_moving(
 def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
     """Report couplings between `joints` as faults; report other couplings as left out."""
     model, moving = mjcf.model, {joint.name for joint in joints}
-    carriers = dict(_names_of_bodies_and_moving_bodies(arm, chain, "world"))
+    # Moving body of the chain that carries each body.
+    carriers = dict.fromkeys((body.name for body in arm.with_descendants()), "world")
+    for moved in (body for body in chain if body.joints):
+        carriers |= dict.fromkeys((body.name for body in moved.with_descendants()), moved.name)
     for element in mjcf.elements_in("equality"):
         given = mjcf.attributes_of(element, "", element.tag)
         ends = [given.get(name, "") for name in ("joint1", "joint2")]
+        bodies = [given.get(name, "world") for name in ("body1", "body2")]
+        is_of_arm = "site1" not in given and carriers.keys() >= set(bodies)
+        closes_loop = is_of_arm and carriers[bodies[0]] != carriers[bodies[1]]
         if given.get("active") == "false":
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             model.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in ("connect", "weld", "distance") and _closes_loop(given, carriers):
+        elif element.tag in ("connect", "weld", "distance") and closes_loop:
             model.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
@@ -202,24 +208,6 @@ def _report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
             what = "no spring, which Drake does not read from MJCF, of"
             mjcf.model.state_repair(what, joint.name)
-
-
-def _names_of_bodies_and_moving_bodies(
-    body: Body, chain: list[Body], carrier: str
-) -> Iterator[tuple[str, str]]:
-    """Yield the name of each body, and of the nearest moving body of the chain that carries it."""
-    carrier = body.name if body in chain and body.joints else carrier
-    yield body.name, carrier
-    for child in body.children:
-        yield from _names_of_bodies_and_moving_bodies(child, chain, carrier)
-
-
-def _closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
-    ends = [given.get("body1", "world"), given.get("body2", "world")]
-    if "site1" in given or not all(end == "world" or end in carriers for end in ends):
-        return False  # a free or mocap body, another arm
-    first, second = (carriers.get(end, "world") for end in ends)
-    return first != second
 
 
 def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
@@ -288,28 +276,23 @@ def _set_mass_properties_of_bodies(
     model, total = mjcf.model, mjcf.compiler.number("settotalmass", -1.0)
     factor = total / _sum_of_masses_in_file(model) if total > 0.0 else 1.0
 
-    def set_masses_of_subtree(body: Body, is_moved: bool) -> None:
-        has_joint = not moving.isdisjoint(body.joints)
-        is_moved |= has_joint
-        if not body.is_auxiliary:
-            given = reader.mass_properties_of_body(body)
-            body.inertial = ZERO_MASS_PROPERTIES
-            if given.mass > 0.0:
-                scaled = given.with_mass(factor * given.mass)
-                inertia = model_numbers.nearest_possible_inertia(scaled.inertia)[0]
-                if is_moved:
-                    correct = model_numbers.correct_impossible_inertia
-                    inertia = correct(scaled.inertia, body.name, model)
-                body.inertial = scaled._replace(inertia=inertia)
-            elif is_moved and given.inertia.any():
-                model.state_repair("an inertia without a mass left out of", body.name)
-            if has_joint and body.inertial is ZERO_MASS_PROPERTIES:
-                model.state_assumption("no inertia of", body.name)
-        for child in body.children:
-            set_masses_of_subtree(child, is_moved)
-
-    for body in world.children:
-        set_masses_of_subtree(body, is_moved=False)
+    bodies = world.with_descendants()[1:]
+    driven = {body for body in bodies if not moving.isdisjoint(body.joints)}
+    moved = {each for body in driven for each in body.with_descendants()}
+    for body in (body for body in bodies if not body.is_auxiliary):
+        given = reader.mass_properties_of_body(body)
+        body.inertial = ZERO_MASS_PROPERTIES
+        if given.mass > 0.0:
+            scaled = given.with_mass(factor * given.mass)
+            inertia = model_numbers.nearest_possible_inertia(scaled.inertia)[0]
+            if body in moved:
+                correct = model_numbers.correct_impossible_inertia
+                inertia = correct(scaled.inertia, body.name, model)
+            body.inertial = scaled._replace(inertia=inertia)
+        elif body in moved and given.inertia.any():
+            model.state_repair("an inertia without a mass left out of", body.name)
+        if body in driven and body.inertial is ZERO_MASS_PROPERTIES:
+            model.state_assumption("no inertia of", body.name)
 
 
 def _sum_of_masses_in_file(model: ModelRepair) -> float:
