@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import (
@@ -150,8 +150,8 @@ class SlavePlant:
     def start_tip(self) -> Array:
         """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
-        R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
-        return start[4:] + R_WS.matrix() @ self.tip
+        X_WS = RigidTransform(Quaternion(start[:4] / np.linalg.norm(start[:4])), start[4:])
+        return X_WS @ self.tip
 
 
 def start_pose(slave: Slave) -> Array:

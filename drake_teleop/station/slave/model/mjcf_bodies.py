@@ -11,16 +11,12 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model import mjcf_meshes
+from drake_teleop.station.slave.model import mjcf_meshes, model_numbers
 from drake_teleop.station.slave.model.mjcf_elements import (
     MIN_DIRECTION_VECTOR_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
-)
-from drake_teleop.station.slave.model.model_numbers import (
-    MAX_MODEL_VALUE_SI,
-    nearest_possible_inertia,
 )
 
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
@@ -77,13 +73,6 @@ class Body:
 
     def with_descendants(self) -> list[Body]:
         return [self, *(body for child in self.children for body in child.with_descendants())]
-
-    def bodies_on_path_to(self, name: str) -> list[Body]:
-        """Return the bodies from this one to the carried body `name`, or an empty list."""
-        if self.name == name:
-            return [self]
-        paths = (child.bodies_on_path_to(name) for child in self.children)
-        return next(([self, *path] for path in paths if path), [])
 
 
 class BodyReader:
@@ -155,7 +144,7 @@ class BodyReader:
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
         X_FG = self._mjcf.read_pose(given)
-        size = given.numbers("size", (0.0, 0.0, 0.0), MAX_MODEL_VALUE_SI)
+        size = given.numbers("size", (0.0, 0.0, 0.0), model_numbers.MAX_MODEL_VALUE_SI)
         if "fromto" in given and kind in (*_ROUND_ROD_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
@@ -205,7 +194,8 @@ class BodyReader:
         if bound > 0.0:
             moments, axes = np.linalg.eigh(inertia)
             inertia = (axes * np.maximum(moments, bound)) @ axes.T
-        if compiler.get("balanceinertia") == "true" and nearest_possible_inertia(inertia)[1]:
+        is_impossible = model_numbers.nearest_possible_inertia(inertia)[1] > 0.0
+        if compiler.get("balanceinertia") == "true" and is_impossible:
             inertia = np.eye(3) * np.trace(inertia) / 3
         mass = max(mass, compiler.number("boundmass", 0.0))
         return mjcf_meshes.MassProperties(mass, centre, inertia)

@@ -43,18 +43,18 @@ def repair_mjcf(model: ModelRepair) -> None:
         world = _split_into_one_joint_bodies(reader.read_world())
     else:
         world = _read_world_with_arm(mjcf, reader)
+    bodies, sensor = world.with_descendants(), purpose.sensor_name
     if is_complete:
-        moving = [joint for body in world.with_descendants() for joint in body.joints]
+        moving = [joint for body in bodies for joint in body.joints]
         _report_lost_couplings(moving, mjcf)
     else:
-        chain = world.bodies_on_path_to(purpose.sensor_name) if purpose.sensor_name else []
+        chain = [body for body in bodies if sensor in {x.name for x in body.with_descendants()}]
         moving = _weld_other_joints_and_list_moving(world, chain, model)
         _check_joint_couplings(world, chain, moving, mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
         what = "left out, because the tool does not carry them: shapes of"
         model.state_assumption(what, "the world")
-    bodies = world.with_descendants()
     _check_names_and_generators(bodies, model)
     _set_mass_properties_of_bodies(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
