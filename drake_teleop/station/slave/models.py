@@ -28,9 +28,9 @@ from drake_teleop.station.slave.model.urdf_and_sdf_repair import repair_sdf, rep
 _XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
-# Expected kind of file, and the remedy for missing packages.
-ROBOT_ERROR_TEXTS = "robot", "with --package-path for package://"
-SCENE_ERROR_TEXTS = "scene", "its package:// addresses in folders around it"
+# Remedies for missing packages.
+_ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
+_SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
 # Places in Drake's source and in repaired texts, which the user does not have.
 _DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
 _PLACE_IN_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
@@ -60,9 +60,8 @@ def repair_and_parse_model(
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
-    expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
     model = ModelRepair(path, files, purpose, Path(folder.name))
-    with translate_drake_errors(path, expected, folder.name):
+    with translate_drake_errors(path, folder.name, is_scene=purpose.is_scene):
         instances = (_add_files_of_directives if kind == ".yaml" else _add_file)(parser, model)
         chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
@@ -208,7 +207,7 @@ def _find_sensor_frame(
 
 @contextmanager
 def translate_drake_errors(
-    path: Path, expected: tuple[str, str] = ROBOT_ERROR_TEXTS, folder: str = ""
+    path: Path, folder: str = "", *, is_scene: bool = False
 ) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
 
@@ -224,8 +223,9 @@ def translate_drake_errors(
         reason = _PLACE_IN_REPAIRED_TEXT_PATTERN.sub("", reason)
         if folder:
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
-        what = f"cannot be read as a {expected[0]}"
-        remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
+        what = f"cannot be read as a {'scene' if is_scene else 'robot'}"
+        packages = _SCENE_PACKAGE_REMEDY if is_scene else _ROBOT_PACKAGE_REMEDY
+        remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {packages}"
         room = MAX_ERROR_LINE_LENGTH - _NUM_SEPARATOR_CHARS - len(f"{path}{what}{remedy}")
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
