@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import numpy as np
 from pydrake import geometry
@@ -40,14 +39,6 @@ _MAX_COLLISION_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or 
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
 _MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
-
-
-class Overlap(NamedTuple):
-    """Two overlapping bodies and the distance of their shapes [m], negative by the depth."""
-
-    first: RigidBody
-    second: RigidBody
-    distance: float
 
 
 class PostureShapes:
@@ -113,11 +104,14 @@ class PostureShapes:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
-    def overlaps(self) -> list[Overlap]:
-        """Return the pairs of overlapping bodies, except those that nearly always overlap."""
-        found, body = self._body_pair_distances(), self.plant.get_body
+    def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
+        """Return pairs of overlapping bodies with their distance [m], negative by the depth.
+
+        Pairs that nearly always overlap are left out.
+        """
+        body, found = self.plant.get_body, self._body_pair_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
-        return [Overlap(body(first), body(second), found[first, second]) for first, second in pairs]
+        return [(body(first), body(second), found[first, second]) for first, second in pairs]
 
     def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
         hulls = [hull for body in bodies for hull in self.hull_points_W(body)]
@@ -164,20 +158,16 @@ class PostureShapes:
             joined = bodies_of_link(joint.parent_body()) | bodies_of_link(joint.child_body())
             if isinstance(joint, PrismaticJoint):
                 R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
-                axis, others = R_WF @ joint.translation_axis(), telescopes
-                telescopes = []
-                for other, bodies in others:
+                axis = R_WF @ joint.translation_axis()
+                for other, bodies in telescopes:
                     if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_TELESCOPE_AXES:
                         joined |= bodies
-                    else:
-                        telescopes.append((other, bodies))
                 telescopes.append((axis, joined))
             together.append(joined)
         for bodies in together:
             shapes = [shape for each in bodies for shape in self.contact_shapes_of(each)]
-            manager.Apply(
-                geometry.CollisionFilterDeclaration().ExcludeWithin(geometry.GeometrySet(shapes))
-            )
+            within = geometry.GeometrySet(shapes)
+            manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(within))
 
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
