@@ -8,6 +8,7 @@ d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -257,7 +258,7 @@ def _interface_constants_and_memory(
     acceleration = np.minimum(arm.acceleration_limit, interface.max_acceleration)
     limits = np.array([speed, acceleration]), arm.effort_limit
     constants = np.array([period, *gains, drives, every, queued]), *limits, np.zeros((6, n))
-    memory = [[0.0, 0.0], q_start, q_start, np.zeros(n), *(queued * [q_start])]
+    memory = [np.zeros(2), q_start, q_start, np.zeros(n), *(queued * [q_start])]
     return constants, np.concatenate(memory)
 
 
@@ -292,7 +293,10 @@ class JointControl(LeafSystem):
         self._arm, self._groups = arm.table, range(1)
         if interface is None:
             self._servo = computed_torque_into
-            self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
+            self._constants: tuple[Any, ...] = (
+                *servo_gains_and_limits(arm, config),
+                np.zeros(3 * n),
+            )
         else:
             self._servo, self._groups = position_servo_torque_into, range(2)
             constants = _interface_constants_and_memory(arm, interface, period, q_start)
