@@ -85,14 +85,13 @@ def ArmModelFromPlant(
         about_Lo = M_L.CalcRotationalInertia().CopyToFullMatrix3()[np.triu_indices(3)]
         table[row, PHI_COLUMN:ROTOR_COLUMN] = [M_L.get_mass(), *M_L.CalcComMoment(), *about_Lo]
         frame_P, R_MP = frame_M, R
-    lower, upper, speed, acceleration = np.array(
-        [_joint_limits(joint) for joint in joints]
-    ).T.copy()
-    limits = lower, upper, speed, acceleration, np.array(efforts)
+    limits = np.array([_joint_limits(joint) for joint in joints]).T.copy()
+    lower, upper, speed, acceleration = limits
+    rates = speed, acceleration, np.array(efforts)
     q_index = np.array([j.position_start() for j in joints], dtype=np.intp)
     v_index = np.array([j.velocity_start() for j in joints], dtype=np.intp)
     names = tuple(joint.name() for joint in joints)
-    return ArmModel(names, table, *limits, q_index, v_index)
+    return ArmModel(names, table, lower, upper, *rates, q_index, v_index)
 
 
 def _joint_limits(

@@ -290,17 +290,14 @@ class JointControl(LeafSystem):
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joint_torque)
-        self._arm, self._groups = arm.table, range(1)
+        self._arm, self._groups, self._constants = arm.table, range(1), tuple[Any, ...]()
         if interface is None:
             self._servo = computed_torque_into
-            self._constants: tuple[Any, ...] = (
-                *servo_gains_and_limits(arm, config),
-                np.zeros(3 * n),
-            )
+            self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
         else:
             self._servo, self._groups = position_servo_torque_into, range(2)
-            constants = _interface_constants_and_memory(arm, interface, period, q_start)
-            self._constants, memory = constants
+            arguments = _interface_constants_and_memory(arm, interface, period, q_start)
+            self._constants, memory = arguments
             self.DeclareDiscreteState(memory)
 
     def _update_joint_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
