@@ -92,9 +92,7 @@ def _add_files_of_directives(
         if file is None:
             continue  # Drake reports it
         if file not in parts:
-            parts[file] = model.make_part(file)
-            _repair_text(parts[file])
-            model.add_results_of(parts[file])
+            parts[file] = model.repair_part(file, _repair_text)
         if parts[file].text:
             added.file = f"file://{model.write_file(file.name, parts[file].text)}"
     texts = [part.text for part in parts.values()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import accumulate
@@ -63,16 +63,16 @@ class ModelRepair:
         """Root element of the file, which the repair changes."""
         return read_xml(self.path)
 
-    def make_part(self, path: Path) -> ModelRepair:
-        """Return the repair of a file that this one includes or adds."""
+    def repair_part(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
+        """Repair a file that this one includes or adds; this repair has its results too."""
         purpose = self.purpose._replace(is_in_directives=True)
-        return ModelRepair(path, self.files, purpose, self.folder)
-
-    def add_results_of(self, part: ModelRepair) -> None:
+        part = ModelRepair(path, self.files, purpose, self.folder)
+        repair(part)
         self.effort_limits |= part.effort_limits
         self.dependence_reasons |= part.dependence_reasons
         self.auxiliary_bodies |= part.auxiliary_bodies
         self._assumptions_of_parts += part.assumptions
+        return part
 
     def write_file(self, name: str, text: str) -> Path:
         """Write a new file, whose name ends with `name`, to the folder; return its path."""

@@ -206,10 +206,8 @@ def _repair_included_file(uri: Element, model: ModelRepair) -> None:
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is not None and included.is_file():
-        part = model.make_part(included)
-        repair(part)
-        model.add_results_of(part)
-        uri.text = f"file://{model.write_file(included.name, part.text)}"
+        text = model.repair_part(included, repair).text
+        uri.text = f"file://{model.write_file(included.name, text)}"
 
 
 def _find_included_model_file(address: str, model: ModelRepair) -> Path | None:
