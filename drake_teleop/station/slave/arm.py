@@ -408,3 +408,29 @@ class ForwardKinematics(LeafSystem):
 
     def _calc_slave_pose(self, context: Context, output: BasicVector) -> None:
         pose_into(self._arm, self._state.Eval(context)[: self._n], output.get_mutable_value())
+
+
+@njit(cache=True)
+def _friction_into(coulomb, index, state, force):
+    force[:] = 0.0
+    for i in range(coulomb.shape[0]):
+        force[index[i]] = dry_friction(coulomb[i], state[coulomb.shape[0] + i])
+
+
+class JointFriction(LeafSystem):
+    """Block that applies dry friction, which Drake's joints do not have, to the whole plant.
+
+    `index` contains the joints' indices in the plant's `num_velocities` velocities.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, coulomb: Array, index: NDArray[np.intp], num_velocities: int) -> None:
+        super().__init__()
+        self._constants = coulomb, index
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
+        calc, inputs = weak_callback(self._calc_friction_force), {self._state.ticket()}
+        self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
+
+    def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
+        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())

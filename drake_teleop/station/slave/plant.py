@@ -10,27 +10,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiagramBuilder,
-    LeafSystem,
-    OutputPort,
-)
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
-from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave import home
-from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, dry_friction
+from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, JointFriction
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
@@ -51,32 +42,6 @@ _SHARED_TIP_DISTANCE_M = 1e-3
 _NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
-
-
-@njit(cache=True)
-def _friction_into(coulomb, index, state, force):
-    force[:] = 0.0
-    for i in range(coulomb.shape[0]):
-        force[index[i]] = dry_friction(coulomb[i], state[coulomb.shape[0] + i])
-
-
-class JointFriction(LeafSystem):
-    """Block that applies dry friction, which Drake's joints do not have, to the whole plant.
-
-    `index` contains the joints' indices in the plant's `num_velocities` velocities.
-    """
-
-    __slots__ = ONE_DICT
-
-    def __init__(self, coulomb: Array, index: NDArray[np.intp], num_velocities: int) -> None:
-        super().__init__()
-        self._constants = coulomb, index
-        self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
-        calc, inputs = weak_callback(self._calc_friction_force), {self._state.ticket()}
-        self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
-
-    def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
-        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
 
 
 @dataclass(frozen=True)
