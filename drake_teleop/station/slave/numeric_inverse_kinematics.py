@@ -89,11 +89,12 @@ def _smaller_gram_matrix_into(J, H):
 @njit(cache=True)
 def _find_smallest_eigenpair(H, u):
     m = H.shape[0]
+    M = np.empty((m, m))
     for i in range(m):
         u[i] = 0.5 + (0.618 * (i + 1)) % 1.0
     growth = 1.0
     for _ in range(3):
-        M = H.copy()
+        M[:] = H
         for i in range(m):
             M[i, i] += _MIN_STEP_DAMPING_M2
         vectors.solve_by_cholesky(M, u, m)
