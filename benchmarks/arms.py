@@ -46,8 +46,7 @@ from drake_teleop.lab.run import run_command
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, PHI_COLUMN, ArmModel, pose_into
 from drake_teleop.station.slave.plant import ParseSlave, finalize_without_limit_warnings
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Slave, Tool
 
 STAGES = ("read", "plan", "run")
 #: Time limit of a stage [s].

@@ -40,8 +40,7 @@ from drake_teleop.robots import lines
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import CompensatedWrench, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.models import ParseModel
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 
 _SECRET = b"what is in no model's folder, and in no page"
 _NAMES = (

@@ -56,8 +56,7 @@ from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData
 from drake_teleop.station.scenario_reference import to_commented_yaml
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.models import ParseModel
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave

@@ -66,8 +66,7 @@ from drake_teleop.station.simulation import (
 )
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
+from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]

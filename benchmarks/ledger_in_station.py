@@ -52,8 +52,7 @@ from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.joint_friction import dry_friction
+from drake_teleop.station.slave.arm import dry_friction, jacobian
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation

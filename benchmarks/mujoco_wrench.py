@@ -32,8 +32,7 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Slave, Tool
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 _TOOL = Tool(mass=1.5, com=[0.01, -0.02, 0.06], inertia=[4e-3, 3e-4, -2e-4, 5e-3, 1e-4, 2e-3])

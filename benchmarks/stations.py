@@ -40,8 +40,7 @@ from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
+from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 
 _SIGMA, _PUSHED = 0.5, 1.3  # Hz
 _DEEP = 0.005  # m, depth of the tip's lower turning point in the leaf, as in Fig. 8

@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Tool
 
 # Load close to the tool's, with numbers that have no short decimal form.
 RNG = np.random.default_rng(1)

@@ -40,9 +40,8 @@ from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
-from drake_teleop.station.slave.joint_control import JointControlConfig
+from drake_teleop.station.slave.joint_control import JointControlConfig, PositionInterface
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.position_servo import PositionInterface
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.station import MakeTeleopStation
 

@@ -99,10 +99,7 @@ WRITING = {
     ("common/compiled.py", ".touch"), ("common/compiled.py", ".write_bytes"),
     ("common/compiled.py", "os.replace"),
     ("lab/identified_load.py", 'open("wb'), ("lab/identified_load.py", "np.savez"),
-    ("station/slave/model/meshes.py", ".write_text"),
-    ("station/slave/model/mjcf_meshes.py", ".write_text"),
-    ("station/slave/model/sdf_repair.py", ".write_text"),
-    ("station/slave/models.py", ".write_text"),
+    ("station/slave/model/model_repair.py", ".write_text"),
     # One line for each change of a drive's inputs; it remains after a crash.
     ("live/record.py", 'open("x'),
     # Written to memory, then to the file after the earlier wrenches.

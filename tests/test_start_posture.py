@@ -275,7 +275,8 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft", tool=plain[1].stand_in_tool))
     shapes.move_to(np.full(6, 0.3))
     assert not any(
-        {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.overlaps()
+        {first.name(), second.name()} == {"link3", "link5"}
+        for first, second, _ in shapes.overlaps()
     )
     (said,) = [text for text in shapes.assumptions if "overlaps left out" in text]
     assert "link3 and link5" in said and "link1" not in said
@@ -295,7 +296,7 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
     counts = []
     for q in random:
         shapes.move_to(q)
-        near = [{each.first.name(), each.second.name()} for each in shapes.overlaps()]
+        near = [{first.name(), second.name()} for first, second, _ in shapes.overlaps()]
         counts.append({"link2", "link4"} in near)
     assert 0.6 < np.mean(counts) < 0.95
     assert start_overlap_texts(slave_of(plan, path), plan.wall)[0] == () == plan.overlap_warnings
@@ -332,7 +333,7 @@ def test_links_of_a_telescope_may_overlap_and_a_gantry_may_not(tmp_path):
         path.write_text(text.replace('xyz="0 0 0.4"', 'xyz="0 0 -0.2"'))
         shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft"))
         shapes.move_to(np.zeros(6))
-        near = [f"{each.first.name()} and {each.second.name()}" for each in shapes.overlaps()]
+        near = [f"{first.name()} and {second.name()}" for first, second, _ in shapes.overlaps()]
         return [*near, *(text for text in shapes.assumptions if "overlaps left out" in text)]
 
     assert not any("link1 and link3" in text for text in arm("0 0 1"))

@@ -9,7 +9,7 @@ of 1.8 kg. Their load is identified before the run.
 import matplotlib.pyplot as plt
 
 import drake_teleop as dt
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Tool
 
 scenario = dt.LoadScenario("free_motion_force")
 scenario.slave.model = "arm.urdf"

@@ -27,7 +27,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave import surroundings
-from drake_teleop.station.slave.model.meshes import AddSkeleton
+from drake_teleop.station.slave.chain_joints import AddSkeleton
 from drake_teleop.station.slave.plant import (
     NominalSlave,
     ParseSlave,

@@ -42,9 +42,8 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfi
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.joint_control import JointControlConfig
+from drake_teleop.station.slave.joint_control import POSITION_INTERFACES, JointControlConfig
 from drake_teleop.station.slave.model.model_references import list_model_files
-from drake_teleop.station.slave.position_servo import POSITION_INTERFACES
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 

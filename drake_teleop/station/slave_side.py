@@ -19,8 +19,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
-from drake_teleop.station.slave.arm import ForwardKinematics
-from drake_teleop.station.slave.drake_contact import DrakeContact
+from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, ForwardKinematics
 from drake_teleop.station.slave.joint_commands import (
     IK_METHODS,
     ExcitationCommand,
@@ -28,10 +27,9 @@ from drake_teleop.station.slave.joint_commands import (
     LeaderJointFollower,
     ik_method_name,
 )
-from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
-from drake_teleop.station.slave.joint_friction import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
+from drake_teleop.station.slave.joint_control import HeldTorque, JointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
-from drake_teleop.station.slave.plant_dynamics import ToolContact
+from drake_teleop.station.slave.plant_dynamics import DrakeContact, ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
 from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_matching_inputs, connect_ports, export_outputs
@@ -221,7 +219,7 @@ def _add_slave_blocks(
     elif samples > 1:
         servo = SampledServo(slave, scenario.joint_control, period, samples)
     else:
-        servo = MakeJointControl(arm, scenario.joint_control, period, start)
+        servo = JointControl(arm, scenario.joint_control, period, start)
     control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
     _check_friction_time_step(slave, min(held, scenario.simulation.max_step))

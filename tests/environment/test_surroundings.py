@@ -38,19 +38,19 @@ from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.drake_contact import ContactPlantCopy, contact_wrench_W
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
+    ContactPlantCopy,
+    contact_wrench_W,
     environment_wrench_about_Wo_into,
     tool_proximity,
 )
 from drake_teleop.station.slave.scene import Scene
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
-from drake_teleop.station.slave.tool import Block as ToolBox
+from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
+from drake_teleop.station.slave.slave_config import Block as ToolBox
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 SOFT_PAD = """

@@ -23,8 +23,7 @@ from drake_teleop.station.slave.arm import jacobian, pose_into
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.joint_commands import LeaderJointFollower
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Slave, Tool
 from drake_teleop.station.station import MakeTeleopStation
 
 HOME = [0.2, -0.6, 1.9, 0.3, 0.5, -0.2]

@@ -25,12 +25,11 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR_COLUMN
+from drake_teleop.station.slave.chain_joints import AddSkeleton
 from drake_teleop.station.slave.joint_commands import JointRangeMonitor, ik_method_name
-from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Block, Tool
+from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HOME = [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]

@@ -22,8 +22,7 @@ from drake_teleop.station.slave.plant import (
     ParseSlave,
     finalize_without_limit_warnings,
 )
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Slave, Tool
 
 AXES = ["0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1"]
 HOME = [0.1, 0.4, 1.2, 0.2, 1.4, 0.3]

@@ -7,8 +7,11 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import LoadScenario, replace
-from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.station.slave.joint_friction import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
+from drake_teleop.station.slave.arm import (
+    ARM_FRICTION_TANH_SPEED_RAD_OR_M_S,
+    forward_dynamics,
+    inverse_dynamics,
+)
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation

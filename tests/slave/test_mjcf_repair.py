@@ -16,11 +16,11 @@ from test_model_repairs import pose, read, written
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import DAMPING_COLUMN, PHI_COLUMN, ROTOR_COLUMN
+from drake_teleop.station.slave.model.meshes import Triangles
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh, fit_shape_to_mesh
-from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model.repair_report import RepairReport
-from drake_teleop.station.slave.model.triangles import Triangles
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
 from drake_teleop.station.slave.models import ParseScene, ParseTool
 
 INERTIAL = '<inertial pos="0 0 0" mass="2" diaginertia="0.02 0.02 0.02"/>'
@@ -256,9 +256,9 @@ def test_primitive_replaces_a_mesh_with_its_pose_and_size(kind, by_box, expected
     ],
 )
 def test_mesh_that_drake_can_read_is_recognized(tmp_path, attributes, file, expected):
-    path, report = written(tmp_path, mjcf(""), "a.xml"), RepairReport()
-    reader = Mjcf(read_xml(path), path, ModelFiles(path, ()), report)
-    mesh = Mesh(reader, Attributes(attributes, "mesh", report), Path(file))
+    path = written(tmp_path, mjcf(""), "a.xml")
+    model = ModelRepair(path, ModelFiles(path, ()), ModelPurpose(), tmp_path)
+    mesh = Mesh(Mjcf(model), Attributes(attributes, "mesh", model), Path(file))
     assert mesh.is_readable_by_drake == expected
 
 

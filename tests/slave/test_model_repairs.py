@@ -18,18 +18,19 @@ from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.model_numbers import (
     check_lengths_and_inertias,
     nearest_possible_inertia,
     repair_inertia_and_detect_missing,
 )
-from drake_teleop.station.slave.model.repair_report import RepairReport
-from drake_teleop.station.slave.model.urdf_repair import _has_valid_colour, find_dependence_reasons
-from drake_teleop.station.slave.models import ParseModel, ParseScene
+from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
+from drake_teleop.station.slave.model.urdf_and_sdf_repair import (
+    _has_valid_colour,
+    find_dependence_reasons,
+)
+from drake_teleop.station.slave.models import ParseModel, ParseScene, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.slave_config import Slave, Tool
 
 
 def read(path, sensor="l6", hold=None, shapes=False):
@@ -448,15 +449,15 @@ def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
     inertial = '<inertial><mass value="{}"/><inertia ixx="1e6" iyy="1e6" izz="1e6" ixy="{}"/>'
     texts += [inertial.format(value, 0.0), inertial.format(1, value)]
     for k, text in enumerate(texts):
-        report = RepairReport()
+        model = ModelRepair(tmp_path, None, ModelPurpose(), tmp_path)
         link = ElementTree.fromstring(f'<link name="l">{text}{"</inertial>" * (k > 1)}</link>')
-        check_lengths_and_inertias(link, "link l", report)
-        repair_inertia_and_detect_missing(link, report, is_sdf=False, at_rest=False)
+        check_lengths_and_inertias(link, "link l", model)
+        repair_inertia_and_detect_missing(link, model, is_sdf=False, at_rest=False)
         if allowed and not (k == 2 and value[0] == "-"):
-            report.raise_faults(tmp_path)
+            model.raise_faults()
         else:
             with pytest.raises(DrakeTeleopError, match="link l"):
-                report.raise_faults(tmp_path)
+                model.raise_faults()
 
 
 @pytest.mark.parametrize(
@@ -478,7 +479,7 @@ def test_colours_have_four_numbers_from_0_to_1(rgba, kept):
 
 @pytest.mark.parametrize("izz", [0.04, 0.09])
 @pytest.mark.parametrize("is_sdf", [False, True])
-def test_products_of_inertia_are_kept(izz, is_sdf):
+def test_products_of_inertia_are_kept(tmp_path, izz, is_sdf):
     """The nearest possible inertia is written for 0.09."""
     inertia = np.array([[0.03, 4e-3, -5e-3], [4e-3, 0.035, 6e-3], [-5e-3, 6e-3, izz]])
     entries = {f"i{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)}
@@ -488,7 +489,8 @@ def test_products_of_inertia_are_kept(izz, is_sdf):
         words = " ".join(f'{name}="{value}"' for name, value in entries.items())
         text = f'<mass value="2"/><inertia {words}/>'
     link = ElementTree.fromstring(f'<link name="l"><inertial>{text}</inertial></link>')
-    repair_inertia_and_detect_missing(link, RepairReport(), is_sdf=is_sdf, at_rest=False)
+    model = ModelRepair(tmp_path, None, ModelPurpose(), tmp_path)
+    repair_inertia_and_detect_missing(link, model, is_sdf=is_sdf, at_rest=False)
     element = link.find("inertial/inertia")
     nearest, change = nearest_possible_inertia(inertia)
     assert (change > 0.0) == (izz == 0.09)

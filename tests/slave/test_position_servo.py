@@ -11,9 +11,13 @@ import pytest
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import Scenario, ScenarioFromData, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.station.slave.joint_control import MakeJointControl, servo_at_tool
+from drake_teleop.station.slave.joint_control import (
+    POSITION_INTERFACES,
+    JointControl,
+    PositionInterface,
+    servo_at_tool,
+)
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.position_servo import POSITION_INTERFACES, PositionInterface
 
 HOME = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 PERIOD = 5e-4
@@ -31,7 +35,7 @@ def follow(arm, interface, command, steps):
     Integrates with semi-implicit steps.
     """
     config = dataclasses.replace(Scenario().joint_control, servo="position", interface=interface)
-    block = MakeJointControl(arm, config, PERIOD, HOME)
+    block = JointControl(arm, config, PERIOD, HOME)
     context, q, v = block.CreateDefaultContext(), HOME.copy(), np.zeros(6)
     states, torques, vdot = [], [], np.empty(6)
     for k in range(steps):
@@ -102,7 +106,7 @@ def test_torque_with_invalid_command_or_encoders(arm, bad):
     held, _ = follow(arm, UR, lambda t: HOME if t < 0.01 else np.full(6, bad), 60)
     np.testing.assert_allclose(held[-1, :6], HOME, atol=1e-6)
     config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
-    block = MakeJointControl(arm, config, PERIOD, HOME)
+    block = JointControl(arm, config, PERIOD, HOME)
     context, weight = block.CreateDefaultContext(), np.empty(6)
     block.GetInputPort("joint_command").FixValue(context, HOME)
     block.GetInputPort("slave_state").FixValue(context, np.full(12, bad))

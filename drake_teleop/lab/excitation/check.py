@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.collision import CollisionScene
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.slave.plant import bodies_carried_by
+from drake_teleop.station.slave.chain_joints import bodies_carried_by
 
 CHECK_RATE_HZ = 1000.0  #: sample rate of the check [Hz]
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.

@@ -21,8 +21,7 @@ from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import check_arm_lengths, fill_missing_joint_limits
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.models import ParseModel
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.plant import (
     NominalSlave,
     ParseSlave,

@@ -17,8 +17,7 @@ from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.slave.arm import ArmModel, holding_torque
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
+from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
 _PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08

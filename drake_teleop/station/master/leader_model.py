@@ -18,8 +18,7 @@ from drake_teleop.station.master.leader import LeaderDevice, make_leader_joint_t
 from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, values_per_joint
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.models import ParsedArm, ParseModel
+from drake_teleop.station.slave.models import ParsedArm, ParseModel, translate_drake_errors
 
 JOINT_MODE = "joints"
 

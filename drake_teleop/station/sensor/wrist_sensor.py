@@ -54,14 +54,15 @@ from drake_teleop.station.slave.arm import (
     forward_kinematics,
     sensor_motion,
 )
-from drake_teleop.station.slave.drake_contact import ContactPlantCopy, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
+    ContactPlantCopy,
     assemble_plant_state,
     contact_and_plant_rates_into,
+    contact_wrench_W,
     environment_wrench_about_Wo_into,
     plant_rates_under_wrench_into,
     tool_proximity,

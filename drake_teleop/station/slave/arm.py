@@ -15,7 +15,6 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.common.vectors import (
     add_cross_product,
     add_vector_into,
@@ -27,16 +26,18 @@ from drake_teleop.common.vectors import (
     plus,
     quaternion_of_matrix,
     scale_vector,
+    solve_by_cholesky,
     symmetric_matrix_at,
     transposed,
     vector_at,
 )
-from drake_teleop.station.slave.joint_friction import dry_friction
 
 # Columns of ArmModel.table.
 ROTATION_COLUMN, TRANSLATION_COLUMN, PHI_COLUMN, ROTOR_COLUMN = 0, 9, 12, 22
 DAMPING_COLUMN, DRY_FRICTION_COLUMN, IS_PRISMATIC_COLUMN = 23, 24, 25
 NUM_TABLE_COLUMNS = 26
+ARM_FRICTION_TANH_SPEED_RAD_OR_M_S = 2e-3
+"""Speed v_0 of the dry friction tau = -tau_C tanh(v / v_0) [rad/s, m/s], estimate."""
 LAST_ROW_GRAVITY_COLUMN = 22  # first of three columns with gravity, in the last row only
 
 SENSOR_MOTION_SIZE = 21
@@ -96,9 +97,9 @@ class ArmModel:
 
     def pose(self, q: Array) -> Array:
         """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
-        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-        forward_kinematics(self.table, q, R_WS, p_WS)
-        return np.concatenate([quaternions_from_matrices(R_WS[None])[0], p_WS])
+        pose = np.empty(7)
+        pose_into(self.table, q, pose)
+        return pose
 
     def with_load(self, phi: Array) -> ArmModel:
         table = self.table.copy()
@@ -339,7 +340,7 @@ def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array)
         # Momentum about Wo of all outboard links for unit speed of this joint.
         linear = add_cross_product(scale_vector(c[0], v), w, h)
         angular = add_cross_product(apply_matrix(symmetric_matrix_at(c, 4), w), h, v)
-        # `solve_positive_definite` reads the lower half only.
+        # `solve_by_cholesky` reads the lower half only.
         for i in range(row + 1):
             v, w = vector_at(link[i], 6), vector_at(link[i], 9)
             M[row, i] = dot(w, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
@@ -347,23 +348,9 @@ def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array)
 
 
 @njit(cache=True)
-def solve_positive_definite(M: Array, x: Array) -> None:
-    """Replace x by M^-1 x (Cholesky); overwrite the lower half of M."""
-    n = x.shape[0]
-    for j in range(n):
-        for k in range(j):
-            for i in range(j, n):
-                M[i, j] -= M[i, k] * M[j, k]
-        pivot = np.sqrt(M[j, j])
-        for i in range(j, n):
-            M[i, j] /= pivot
-        for k in range(j):
-            x[j] -= M[j, k] * x[k]
-        x[j] /= M[j, j]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= M[k, i] * x[k]
-        x[i] /= M[i, i]
+def dry_friction(coulomb: float, speed: float) -> float:
+    """Return the friction torque [N m] at a speed [rad/s]; `coulomb` is its limit [N m]."""
+    return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
 
 
 @njit(cache=True)
@@ -394,7 +381,7 @@ def forward_dynamics(
         if table[row, DRY_FRICTION_COLUMN] != 0.0:
             vdot_out[row] += dry_friction(table[row, DRY_FRICTION_COLUMN], v[row])
     _lower_mass_matrix_into(table, link, inertia, M)
-    solve_positive_definite(M, vdot_out)
+    solve_by_cholesky(M, vdot_out, n)
 
 
 @njit(cache=True)
@@ -421,3 +408,29 @@ class ForwardKinematics(LeafSystem):
 
     def _calc_slave_pose(self, context: Context, output: BasicVector) -> None:
         pose_into(self._arm, self._state.Eval(context)[: self._n], output.get_mutable_value())
+
+
+@njit(cache=True)
+def _friction_into(coulomb, index, state, force):
+    force[:] = 0.0
+    for i in range(coulomb.shape[0]):
+        force[index[i]] = dry_friction(coulomb[i], state[coulomb.shape[0] + i])
+
+
+class JointFriction(LeafSystem):
+    """Block that applies dry friction, which Drake's joints do not have, to the whole plant.
+
+    `index` contains the joints' indices in the plant's `num_velocities` velocities.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, coulomb: Array, index: NDArray[np.intp], num_velocities: int) -> None:
+        super().__init__()
+        self._constants = coulomb, index
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
+        calc, inputs = weak_callback(self._calc_friction_force), {self._state.ticket()}
+        self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
+
+    def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
+        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RotationMatrix
 from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     IS_PRISMATIC_COLUMN,
@@ -50,9 +52,7 @@ def ArmModelFromPlant(
         remedy = "name the frame or link at which the sensor measures"
         raise DrakeTeleopError(f"{what} {sensor_frame_name!r}", where=where, remedy=remedy)
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
-    all_joints = map(plant.get_joint, plant.GetJointIndices())
-    inboard_joints = {joint.child_body().index(): joint for joint in all_joints}
-    joints = _moving_joints_to_sensor(inboard_joints, frame_S)
+    joints = _moving_joints_to_sensor(plant, frame_S)
     actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
     motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
     efforts = [min((motor.effort_limit() for motor in each), default=np.inf) for each in motors]
@@ -69,90 +69,78 @@ def ArmModelFromPlant(
     context = plant.CreateDefaultContext()
     sliding = tree.PrismaticJoint
     axes = [j.translation_axis() if isinstance(j, sliding) else j.revolute_axis() for j in joints]
-    # C rotates the joint's axis to z.
-    C = [RigidTransform(RotationMatrix.MakeFromOneVector(axis, 2)) for axis in axes]
-    X_WS, pairs = frame_S.CalcPoseInWorld(context), list(zip(joints, C, strict=True))
-    X_WJ = [*(j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
-    X_WL = [*(j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in pairs), X_WS]
-    for row, X_WP in enumerate([RigidTransform(), *X_WL[:-1]]):
-        X_PJ = X_WP.InvertAndCompose(X_WJ[row])
-        table[row, ROTATION_COLUMN:TRANSLATION_COLUMN] = X_PJ.rotation().matrix().ravel()
-        table[row, TRANSLATION_COLUMN:PHI_COLUMN] = X_PJ.translation()
-    rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
-    for index in inboard_joints:
-        body = plant.get_body(index)
-        body_row = _table_row_of_body(body, inboard_joints, rows, frame_S.body())
-        if body_row is not None:
-            X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
-            M_B = body.CalcSpatialInertiaInBodyFrame(context)
-            table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_about_link_origin(M_B, X_LB)
-    lower, upper = np.array([_joint_position_limits(j) for j in joints]).T.copy()
-    speed = np.array([j.velocity_upper_limits()[0] for j in joints])
-    acceleration = np.array([j.acceleration_upper_limits()[0] for j in joints])
-    limits = lower, upper, speed, acceleration, np.array(efforts)
+    # Frame L of a link is frame M of its joint, rotated so that the joint's axis becomes z.
+    R_ML = [*(RotationMatrix.MakeFromOneVector(axis, 2) for axis in axes), RotationMatrix()]
+    frames_M = [*(joint.frame_on_child() for joint in joints), frame_S]
+    frames_F = [*(joint.frame_on_parent() for joint in joints), frame_S]
+    bodies_of_rows = _bodies_moved_by_joints(plant, joints, frame_S.body())
+    frame_P, R_MP = plant.world_frame(), RotationMatrix()
+    for row, (frame_M, frame_F) in enumerate(zip(frames_M, frames_F, strict=True)):
+        X_MpF, R = plant.CalcRelativeTransform(context, frame_P, frame_F), R_ML[row]
+        rotation = R_MP.inverse() @ X_MpF.rotation() @ R
+        table[row, ROTATION_COLUMN:TRANSLATION_COLUMN] = rotation.matrix().ravel()
+        table[row, TRANSLATION_COLUMN:PHI_COLUMN] = R_MP.inverse() @ X_MpF.translation()
+        M_M = plant.CalcSpatialInertia(context, frame_M, bodies_of_rows[row])
+        M_L = M_M.ReExpress(R.inverse())
+        about_Lo = M_L.CalcRotationalInertia().CopyToFullMatrix3()[np.triu_indices(3)]
+        table[row, PHI_COLUMN:ROTOR_COLUMN] = [M_L.get_mass(), *M_L.CalcComMoment(), *about_Lo]
+        frame_P, R_MP = frame_M, R
+    limits = np.array([_joint_limits(joint) for joint in joints]).T.copy()
+    lower, upper, speed, acceleration = limits
+    rates = speed, acceleration, np.array(efforts)
     q_index = np.array([j.position_start() for j in joints], dtype=np.intp)
     v_index = np.array([j.velocity_start() for j in joints], dtype=np.intp)
-    return ArmModel(tuple(joint.name() for joint in joints), table, *limits, q_index, v_index)
+    names = tuple(joint.name() for joint in joints)
+    return ArmModel(names, table, lower, upper, *rates, q_index, v_index)
 
 
-def _joint_position_limits(joint: tree.RevoluteJoint | tree.PrismaticJoint) -> tuple[float, float]:
+def _joint_limits(
+    joint: tree.RevoluteJoint | tree.PrismaticJoint,
+) -> tuple[float, float, float, float]:
+    """Return limits of position (lower, upper), speed and acceleration, infinite for none."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-    # Exporters write 0 to 0 for unknown limits.
-    if isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0:
-        return -np.inf, np.inf
     limit = _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M
-    return -np.inf if lower < -limit else lower, np.inf if upper > limit else upper
+    # Exporters write 0 to 0 for unknown limits.
+    is_unknown = isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0
+    lower = -np.inf if is_unknown or lower < -limit else lower
+    upper = np.inf if is_unknown or upper > limit else upper
+    return lower, upper, joint.velocity_upper_limits()[0], joint.acceleration_upper_limits()[0]
 
 
 def _moving_joints_to_sensor(
-    inboard_joints: dict[tree.BodyIndex, tree.Joint], frame_S: tree.Frame
+    plant: MultibodyPlant, frame_S: tree.Frame
 ) -> list[tree.RevoluteJoint | tree.PrismaticJoint]:
-    body, joints = frame_S.body(), list[tree.RevoluteJoint | tree.PrismaticJoint]()
-    while body.index() in inboard_joints:
-        joint = inboard_joints[body.index()]
+    joints = list[tree.RevoluteJoint | tree.PrismaticJoint]()
+    for joint in chain_joints.find_chain(plant, frame_S.body()):
         if isinstance(joint, (tree.RevoluteJoint, tree.PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, tree.WeldJoint):
             what = f"the arm up to the sensor contains an unsupported {joint.type_name()} joint"
             remedy = "weld the arm's base to the world; up to the sensor, use joints of one axis"
             raise DrakeTeleopError(what, where=joint.name(), remedy=remedy)
-        body = joint.parent_body()
     if not joints:
         what = f"no moving joint is between the world and {frame_S.name()}"
         remedy = "name a frame or link that the arm moves"
         raise DrakeTeleopError(what, where="sensor_frame", remedy=remedy)
-    return joints[::-1]
+    return joints
 
 
-def _table_row_of_body(
-    body: tree.RigidBody,
-    inboard_joints: dict[tree.BodyIndex, tree.Joint],
-    rows: dict[tree.BodyIndex, int],
-    sensor_body: tree.RigidBody,
-) -> int | None:
-    moving, outermost = None, body
-    while True:
-        if body.index() == sensor_body.index() and outermost.index() != body.index():
-            return len(rows)
-        if body.index() in rows:
-            break
-        if body.index() not in inboard_joints:
-            return None
-        joint = inboard_joints[body.index()]
-        if not isinstance(joint, tree.WeldJoint):
-            moving = joint
-        body = joint.parent_body()
-    if moving is not None:
-        what = f"the joint moves on link {body.name()}, but is not between the world and the sensor"
-        raise DrakeTeleopError(what, where=moving.name(), remedy="weld that joint")
-    return rows[body.index()]
-
-
-def _phi_about_link_origin(M_BBo_B: tree.SpatialInertia, X_LB: RigidTransform) -> Array:
-    M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
-    M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
-    I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
-    return np.array([M_BLo_L.get_mass(), *M_BLo_L.CalcComMoment(), *I_BLo_L[np.triu_indices(3)]])
+def _bodies_moved_by_joints(
+    plant: MultibodyPlant, joints: list[tree.Joint], sensor_body: tree.RigidBody
+) -> list[list[tree.BodyIndex]]:
+    """Return the bodies that move with each joint, without those of the next, then the load."""
+    outboard = [set(plant.GetBodiesKinematicallyAffectedBy([j.index()])) for j in joints]
+    load = {body.index() for body in chain_joints.bodies_carried_by(plant, sensor_body)}
+    rows = [inner - outer - load for inner, outer in pairwise([*outboard, set()])]
+    inboard = chain_joints.joints_by_child(plant)
+    for link, bodies in zip((joint.child_body() for joint in joints), rows, strict=True):
+        loose = bodies - {body.index() for body in plant.GetBodiesWeldedTo(link)}
+        moving = [inboard[k] for k in loose if inboard[k].parent_body().index() not in loose]
+        if moving:
+            where, name = moving[0].name(), link.name()
+            what = f"the joint moves on link {name}, but is not between the world and the sensor"
+            raise DrakeTeleopError(what, where=where, remedy="weld that joint")
+    return [*map(list, rows), list(load)]
 
 
 def values_per_joint(
@@ -179,7 +167,7 @@ def fill_missing_joint_limits(
     assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
-    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_position_limits`
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_limits`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
@@ -187,13 +175,12 @@ def fill_missing_joint_limits(
         what = f"{name} cannot move: both of its limits are {limit:g} {unit}"
         remedy = "correct the limits, or make the joint a fixed one"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
-    reach = _DEFAULT_JOINT_HALF_RANGE_M
+    reach = np.where(slides, _DEFAULT_JOINT_HALF_RANGE_M, np.pi)
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
-    width = np.where(slides, 2 * reach, 2 * np.pi)
-    lowest = np.where(half_limited & np.isinf(lower), upper - width, lower)
-    lower, upper = lowest, np.where(half_limited & np.isinf(upper), lower + width, upper)
+    lowest = np.where(half_limited & np.isinf(lower), upper - 2 * reach, lower)
+    lower, upper = lowest, np.where(half_limited & np.isinf(upper), lower + 2 * reach, upper)
     speed = np.where(slides, _DEFAULT_SPEED_LIMIT_M_S, _DEFAULT_SPEED_LIMIT_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
@@ -204,13 +191,14 @@ def fill_missing_joint_limits(
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
+    half_range, only_limit = _DEFAULT_JOINT_HALF_RANGE_M, "a range of one turn from the only limit"
     turning_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s"
     sliding_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s"
     in_rad = f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,"
     rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
-        (unlimited, "turns without end", f"a range of +-{reach:g} m"),
-        (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
+        (unlimited, "turns without end", f"a range of +-{half_range:g} m"),
+        (half_limited, only_limit, f"a range of {2 * half_range:g} m"),
         (~_is_positive_and_finite(arm.velocity_limit), turning_speed, sliding_speed),
         (~_is_positive_and_finite(specified), rate_text, rate_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),

@@ -1,12 +1,17 @@
-"""Edits of a parsed plant: welds of base and held joints, motors of the joints up to the sensor."""
+"""Search and edits of joints in a parsed plant: welds, motors, and sticks for arms without shapes.
+
+The chain is the list of joints that carry the sensor, also welds, from the base outwards.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import dropwhile
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.math import RigidTransform
+from pydrake.geometry import Capsule
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -21,17 +26,37 @@ from pydrake.multibody.tree import (
 )
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model.model_repair import join_names
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME
-from drake_teleop.station.slave.model.repair_report import join_names
 
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
 _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG = 0.14
 _SLIDER_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
+_SKELETON_STICK_RADIUS_M = 0.035
+_SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
-def is_joint_moving(plant: MultibodyPlant, index: JointIndex) -> bool:
-    return plant.get_joint(index).num_velocities() > 0
+def joints_by_child(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
+    joints = map(plant.get_joint, plant.GetJointIndices())
+    return {joint.child_body().index(): joint for joint in joints}
+
+
+def find_chain(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
+    """Return the joints that carry a body, also welds, from the base outwards."""
+    inboard, chain = joints_by_child(plant), list[Joint]()
+    while body.index() in inboard:
+        chain.append(inboard[body.index()])
+        body = chain[-1].parent_body()
+    return chain[::-1]
+
+
+def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
+    """Return the bodies that a body carries through joints, the nearest first."""
+    joints = joints_by_child(plant).values()
+    near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
+    return near + [far for each in near for far in bodies_carried_by(plant, each)]
 
 
 def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
@@ -60,29 +85,25 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
 
 def weld_base_and_find_chain(
     plant: MultibodyPlant, frame: Frame, X_WBase: RigidTransform | None, where: str
-) -> list[JointIndex]:
-    """Weld a free base to the world at `X_WBase`; return the joints from the base to `frame`.
+) -> list[Joint]:
+    """Weld a free base to the world at `X_WBase`; return the chain to `frame`.
 
     A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
     """
-    inboard = {j.child_body().index(): j for j in map(plant.get_joint, plant.GetJointIndices())}
-    body, chain = frame.body(), list[Joint]()
-    while body.index() in inboard:
-        chain.append(inboard[body.index()])
-        body = inboard[body.index()].parent_body()
-    if body.index() != plant.world_body().index():
-        X_WB = RigidTransform() if X_WBase is None else X_WBase
-        plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
-    elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
-        what = f"the model already welds its base {chain[-1].child_body().name()} to the world"
+    chain, X_WB = find_chain(plant, frame.body()), X_WBase or RigidTransform()
+    base = chain[0].parent_body() if chain else frame.body()
+    if base.index() != plant.world_body().index():
+        plant.WeldFrames(plant.world_frame(), base.body_frame(), X_WB)
+    elif not X_WB.IsExactlyIdentity():
+        what = f"the model already welds its base {chain[0].child_body().name()} to the world"
         remedy = "leave slave.base_pose out, or remove that joint from the model"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
-    return [joint.index() for joint in reversed(chain)]
+    return chain
 
 
 def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
     """Weld bodies without a joint to the world; return a list with at most one note on them."""
-    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    held = joints_by_child(plant)
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
     for body in free:
@@ -92,18 +113,15 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
     return [note] if names else []
 
 
-def check_chain(
-    plant: MultibodyPlant, chain: list[JointIndex], dependence_reasons: dict[str, str], where: str
-) -> None:
+def check_chain(chain: list[Joint], dependence_reasons: dict[str, str], where: str) -> None:
     """Raise DrakeTeleopError if a joint of the chain has several axes or moves with another."""
-    for joint in (plant.get_joint(index) for index in chain):
+    for joint in chain:
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependence_reasons:
                 what = f"{name} {dependence_reasons[name]}"
                 remedy = "the arm up to the sensor has to be a chain of independent joints"
                 raise DrakeTeleopError(what, where=where, remedy=remedy)
-        one_axis = isinstance(joint, (RevoluteJoint, PrismaticJoint))
-        if joint.num_velocities() > 0 and not one_axis:
+        if not isinstance(joint, (RevoluteJoint, PrismaticJoint)) and joint.num_velocities() > 0:
             what = f"{joint.name()} is a {joint.type_name()} joint, which has several axes"
             remedy = "up to the sensor, use joints that turn about one axis or slide along it"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
@@ -113,8 +131,7 @@ def weld_held_joints(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
     """Weld the joints named in `hold` at its positions [rad, m]; return notes for the user."""
-    moving = [plant.get_joint(k) for k in joints if is_joint_moving(plant, k)]
-    known = {joint.name(): joint for joint in moving}
+    known = {j.name(): j for j in map(plant.get_joint, joints) if j.num_velocities() > 0}
     for name, position in hold.items():
         joint = known.get(name)
         if joint is None:
@@ -134,16 +151,17 @@ def weld_held_joints(
 
 
 def weld_joints_outside_chain(
-    plant: MultibodyPlant, joints_before: set[JointIndex], chain: list[JointIndex]
+    plant: MultibodyPlant, joints_before: set[JointIndex], chain: list[Joint]
 ) -> list[str]:
     """Weld moving joints in neither `joints_before` nor `chain`; return notes for the user."""
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
-    added = set(plant.GetJointIndices()) - joints_before - set(chain)
-    joints = [plant.get_joint(index) for index in added if is_joint_moving(plant, index)]
-    names = sorted(joint.name() for joint in joints)
-    for joint in joints:
-        _replace_joint_by_weld(plant, joint)
+    kept, names = joints_before | {joint.index() for joint in chain}, list[str]()
+    for joint in map(plant.get_joint, set(plant.GetJointIndices()) - kept):
+        if joint.num_velocities() > 0:
+            names.append(joint.name())
+            _replace_joint_by_weld(plant, joint)
+    names.sort()
     return [f"held: {join_names(names)}"] if names else []
 
 
@@ -168,23 +186,21 @@ def _default_joint_pose(joint: Joint) -> RigidTransform:
 
 
 def set_one_actuator_per_joint(
-    plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, float] | None
+    plant: MultibodyPlant, moving: list[Joint], limits: dict[str, float] | None
 ) -> None:
-    """Give each moving joint of the chain one actuator, in the order of the chain.
+    """Give each of the joints `moving` one actuator, in this order.
 
     `limits` contains effort limits by joint; joints without an entry are unlimited. None keeps
     the limits of existing actuators.
     """
-    moving = [index for index in chain if is_joint_moving(plant, index)]
-    data = dict[JointIndex, tuple[float, float, float]]()
+    data = {joint.index(): (np.inf, 0.0, 1.0) for joint in moving}
     for motor in list(map(plant.get_joint_actuator, plant.GetJointActuatorIndices())):
-        if motor.joint().index() in moving:
+        if (index := motor.joint().index()) in data:
             drive = motor.default_rotor_inertia(), motor.default_gear_ratio()
-            data[motor.joint().index()] = motor.effort_limit(), *drive
+            data[index] = motor.effort_limit(), *drive
             plant.RemoveJointActuator(motor)
-    for index in moving:
-        joint = plant.get_joint(index)
-        effort, rotor, gear = data.get(index, (np.inf, 0.0, 1.0))
+    for joint in moving:
+        effort, rotor, gear = data[joint.index()]
         if limits is not None:
             effort = limits.get(joint.name(), np.inf)
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
@@ -207,25 +223,23 @@ def set_torque_limits(
 
 
 def assume_rotor_inertias(
-    plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary_bodies: frozenset[str]
+    plant: MultibodyPlant, chain: list[Joint], frame: Frame, auxiliary_bodies: set[str]
 ) -> list[str]:
     """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
 
     Links beyond the next joint count too if only `auxiliary_bodies`, not of the model, are between.
     """
-    joints = [plant.get_joint(index) for index in chain]
-    inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(joints, frame) ** 2
+    inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(chain, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    motor = {each.joint().index(): each for each in actuators}
+    motors = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
-    for joint in (joint for joint in joints if joint.index() in motor):
-        has_rotor = motor[joint.index()].default_reflected_inertia() > 0.0
-        if has_rotor or _carries_inertia(plant, joint, auxiliary_bodies):
-            continue
-        slides = isinstance(joint, PrismaticJoint)
-        (sliding if slides else turning).append(joint.name())
-        motor[joint.index()].set_default_rotor_inertia(_SLIDER_DRIVE_MASS_KG if slides else inertia)
-        motor[joint.index()].set_default_gear_ratio(1.0)
+    for joint in (joint for joint in chain if joint.index() in motors):
+        motor, slides = motors[joint.index()], isinstance(joint, PrismaticJoint)
+        has_rotor = motor.default_reflected_inertia() > 0.0
+        if not has_rotor and not _carries_inertia(plant, joint, auxiliary_bodies):
+            (sliding if slides else turning).append(joint.name())
+            motor.set_default_rotor_inertia(_SLIDER_DRIVE_MASS_KG if slides else inertia)
+            motor.set_default_gear_ratio(1.0)
     notes = {
         f"a rotor inertia of {inertia:.3g} kg m^2": turning,
         f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg": sliding,
@@ -234,8 +248,8 @@ def assume_rotor_inertias(
     return [f"{what}, {reason}, for {join_names(names)}" for what, names in notes.items() if names]
 
 
-def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: frozenset[str]) -> bool:
-    ahead, joints = [joint.child_body()], [plant.get_joint(k) for k in plant.GetJointIndices()]
+def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: set[str]) -> bool:
+    ahead, joints = [joint.child_body()], joints_by_child(plant).values()
     while ahead:
         body: RigidBody = ahead.pop()
         moments = body.default_rotational_inertia().get_moments()
@@ -248,13 +262,41 @@ def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: froz
 
 
 def _length_of_moving_chain_m(chain: list[Joint], frame: Frame) -> float:
-    while chain and chain[0].num_velocities() == 0:
-        chain = chain[1:]
-    ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]
-    way = 0.0
-    for joint, end in zip(chain, ends, strict=True):
-        start = joint.frame_on_child().GetFixedPoseInBodyFrame().translation()
-        way += float(np.linalg.norm(end.GetFixedPoseInBodyFrame().translation() - start))
+    joints = list(dropwhile(lambda joint: joint.num_velocities() == 0, chain))
+    length, ends = 0.0, [*(joint.frame_on_parent() for joint in joints[1:]), frame]
+    for joint, end in zip(joints, ends, strict=False):
+        way = _origin_in_body(end) - _origin_in_body(joint.frame_on_child())
+        length += float(np.linalg.norm(way))
         if isinstance(joint, WeldJoint):
-            way += float(np.linalg.norm(joint.X_FM().translation()))
-    return way
+            length += float(np.linalg.norm(joint.X_FM().translation()))
+    return length
+
+
+def _origin_in_body(frame: Frame) -> Array:
+    return frame.GetFixedPoseInBodyFrame().translation()
+
+
+def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
+    """Add a stick as visual shape to links without visuals, from joint to joint or to S."""
+    p_BEnd = _origin_in_body(sensor_frame)
+    for joint in reversed(find_chain(plant, sensor_frame.body())):
+        start, frame = _origin_in_body(joint.frame_on_child()), joint.frame_on_parent()
+        if not isinstance(joint, WeldJoint):
+            _add_stick(plant, joint.child_body(), start, p_BEnd)
+            p_BEnd = _origin_in_body(frame)
+            continue
+        if joint.parent_body().index() == plant.world_body().index():
+            _add_stick(plant, joint.child_body(), np.zeros(3), p_BEnd)
+        X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+        p_BEnd = frame.GetFixedPoseInBodyFrame() @ joint.X_FM() @ X_MB @ p_BEnd
+
+
+def _add_stick(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
+    if plant.GetVisualGeometriesForBody(body):
+        return
+    length = float(np.linalg.norm(end - start))
+    is_long = length > _SKELETON_STICK_RADIUS_M
+    along = (end - start) / length if is_long else np.array([0.0, 0.0, 1.0])
+    pose = RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), (start + end) / 2)
+    stick = Capsule(_SKELETON_STICK_RADIUS_M, max(length, 1e-3))
+    plant.RegisterVisualGeometry(body, pose, stick, f"stick_of_{body.name()}", _SKELETON_COLOUR)

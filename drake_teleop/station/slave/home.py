@@ -75,14 +75,13 @@ def check_inertia_and_holding_torque(arm: ArmModel, q: Array) -> None:
         remedy = "give masses and inertias of the links, or rotor inertias of the joints"
         raise DrakeTeleopError(what, where="slave.model", remedy=remedy)
     torque = holding_torque(arm, q)
-    share = np.abs(torque) / arm.effort_limit
-    k = int(share.argmax())
-    if share[k] > 1.0:
+    k = int((np.abs(torque) / arm.effort_limit).argmax())
+    needed, limit = abs(torque[k]), arm.effort_limit[k]
+    if needed > limit:
         unit = "N" if arm.table[k, IS_PRISMATIC_COLUMN] else "N m"
-        raise DrakeTeleopError(
-            f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {arm.joint_names[k]} "
-            f"needs {abs(torque[k]):.3g} {unit}, but its limit is {arm.effort_limit[k]:.3g} {unit}",
-            where="slave.tool",
-            remedy="give a lighter tool or payload, start nearer to the base, or set"
-            " slave.torque_limits if the model's limits are wrong",
-        )
+        what = f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start"
+        needs = f"needs {needed:.3g} {unit}, but its limit is {limit:.3g} {unit}"
+        remedy = "give a lighter tool or payload, start nearer to the base, or set"
+        remedy = f"{remedy} slave.torque_limits if the model's limits are wrong"
+        what = f"{what}: {arm.joint_names[k]} {needs}"
+        raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)

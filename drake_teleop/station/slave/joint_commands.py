@@ -43,11 +43,11 @@ def ik_method_name(name: str, arm: ArmModel) -> str:
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
-        raise DrakeTeleopError(
-            "the closed form requires the geometry of an RX90 with its base at the world's origin",
-            where="slave.inverse_kinematics",
-            remedy=f"set it to {AUTOMATIC_IK_METHOD} or numeric",
+        what = (
+            "the closed form requires the geometry of an RX90 with its base at the world's origin"
         )
+        remedy = f"set it to {AUTOMATIC_IK_METHOD} or numeric"
+        raise DrakeTeleopError(what, where="slave.inverse_kinematics", remedy=remedy)
     return name
 
 
@@ -96,11 +96,10 @@ class ExcitationCommand(LeafSystem):
     def __init__(self, trajectory: FourierTrajectory, start: float) -> None:
         super().__init__()
         self._trajectory, self._start = trajectory, start
-        self.DeclareVectorOutputPort(
-            "joint_command", len(trajectory.q0), weak_callback(self._calc_joint_command)
-        )
+        calc_command, n = weak_callback(self._calc_command), len(trajectory.q0)
+        self.DeclareVectorOutputPort("joint_command", n, calc_command)
 
-    def _calc_joint_command(self, context: Context, output: BasicVector) -> None:
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
         time = np.clip(context.get_time() - self._start, 0.0, self._trajectory.period)
         output.SetFromVector(self._trajectory.evaluate(time)[0])
 
@@ -121,13 +120,9 @@ class JointRangeMonitor(LeafSystem):
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            period, 0.0, self._store_status_and_check_joint_ranges
-        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_status_and_check_q)
 
-    def _store_status_and_check_joint_ranges(
-        self, context: Context, discrete_state: DiscreteValues
-    ) -> None:
+    def _store_status_and_check_q(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]
@@ -137,12 +132,10 @@ class JointRangeMonitor(LeafSystem):
             return
         joint = int(inside.argmin())
         unit = "m" if self._arm.table[joint, IS_PRISMATIC_COLUMN] else "rad"
+        limits = f"{self._arm.lower[joint]:.3f} to {self._arm.upper[joint]:.3f} {unit}"
+        what = f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s"
+        remedy = "command a smaller or slower motion, start elsewhere (slave.position or home), or"
+        remedy = f"{remedy} limit joint accelerations (joint_control.servo: position)"
         # Returning EventStatus.Failed crashes for systems written in Python.
-        raise DrakeTeleopError(
-            f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "
-            f"{q[joint]:.3f} {unit} is outside {self._arm.lower[joint]:.3f} to "
-            f"{self._arm.upper[joint]:.3f} {unit}",
-            where="simulation",
-            remedy="command a smaller or slower motion, start elsewhere (slave.position or home)"
-            ", or limit joint accelerations (joint_control.servo: position)",
-        )
+        what = f"{what}: {q[joint]:.3f} {unit} is outside {limits}"
+        raise DrakeTeleopError(what, where="simulation", remedy=remedy)

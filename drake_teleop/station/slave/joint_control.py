@@ -1,6 +1,14 @@
-"""Joint control of the slave: computed torque with position and velocity loop (paper, VI-A)."""
+"""Joint control of the slave: computed torque with position and velocity loop (paper, VI-A), or
+the position interface of a commercial arm (docs/station.md):
 
+command --[dead time, held]--> target --[generator]--> reference r --[drives]--> torque
+
+d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))
+d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
+
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -11,20 +19,70 @@ from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.slave.arm import (
-    ArmModel,
-    forward_dynamics,
-    holding_torque,
-    inverse_dynamics,
-    jacobian,
-)
-from drake_teleop.station.slave.position_servo import (
-    POSITION_INTERFACES,
-    PositionInterface,
-    PositionServo,
-)
+from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics, jacobian
 
+# Memory of a position interface: periods since the last command, index of the oldest command in
+# the queue; then target, r and dr/dt (n each), and the queue of commands.
+_PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
+_TWICE_BRAKING_SHARE = 2 * 0.8  # braking v^2 = 2 a d with 80 % of the largest acceleration
 COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
+
+
+@settings
+@dataclass
+class PositionInterface:
+    """Settings of the position interface of an arm; m instead of rad for prismatic joints."""
+
+    command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time; whole periods of command_hz")
+    acceleration_per_error: float = quantity(
+        300.0, "1/s^2", 1.0, 1e7, "acceleration per position error"
+    )
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a steady motion")
+    max_speed: float = quantity(
+        math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
+    )
+    max_acceleration: float = quantity(
+        40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
+    )
+    drive_bandwidth_hz: float = quantity(
+        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"
+    )
+
+    def check(self, where: str, rate: float) -> None:
+        """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
+        periods = rate / self.command_hz
+        if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
+            commands = f"command_hz, {self.command_hz:g} Hz"
+            what = f"rates.joint_control_hz, {rate:g} Hz, is no multiple of {commands}"
+            remedy = "choose a rate of the joint control that is a multiple of it"
+            raise DrakeTeleopError(what, where=f"{where}.command_hz", remedy=remedy)
+        damping = self.acceleration_per_error * self.lookahead / rate
+        if damping + 0.5 * self.acceleration_per_error / rate**2 > 1.5:  # unstable from 2
+            limits = f"a lookahead of {self.lookahead:g} s and control steps of {1e3 / rate:g} ms"
+            what = f"{self.acceleration_per_error:g} 1/s^2 is too high for {limits}"
+            remedy = "lower it or lookahead, or raise rates.joint_control_hz"
+            raise DrakeTeleopError(what, where=f"{where}.acceleration_per_error", remedy=remedy)
+        if self.drive_bandwidth_hz > 0.1 * rate:
+            control = f"joint control at {rate:g} Hz"
+            what = f"the bandwidth, {self.drive_bandwidth_hz:g} Hz, is too high for {control}"
+            remedy = "choose at most a tenth of rates.joint_control_hz"
+            raise DrakeTeleopError(what, where=f"{where}.drive_bandwidth_hz", remedy=remedy)
+
+
+#: Interfaces by name; docs/station.md lists the sources.
+POSITION_INTERFACES: dict[str, PositionInterface] = {
+    "ur_servoj": PositionInterface(),
+    "franka_position": PositionInterface(
+        command_hz=1000.0,
+        dead_time=0.002,
+        acceleration_per_error=(200 * math.pi) ** 2,
+        lookahead=1 / (100 * math.pi),
+        max_speed=2.175,
+        max_acceleration=7.5,
+        drive_bandwidth_hz=20.0,
+    ),
+}
 
 
 @settings
@@ -125,8 +183,87 @@ def servo_gains_and_limits(
     return kp, kv, arm.velocity_limit, arm.effort_limit
 
 
+@njit(cache=True)
+def _advance_joint_reference(command, interface, limits, memory, reference):
+    """Accept the command (n,) [rad] if one is due, and advance the reference by one period.
+
+    Args:
+        interface: (6,) period [s], acceleration per error [1/s^2], lookahead [s], drive bandwidth
+            [rad/s], periods per command, length of the command queue.
+        limits: (2, n) speed and acceleration limits.
+        memory: updated, see `_PERIODS_SINCE_COMMAND_INDEX`.
+        reference: (3, n) output: reference position, velocity, acceleration.
+    """
+    period, gain, lookahead, _, every, queued = interface
+    n = command.shape[0]
+    target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
+    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and are_finite_and_in_range(command):
+        if queued > 0.0:
+            place = 2 + 3 * n + int(memory[_OLDEST_QUEUED_INDEX]) * n
+            copy_into(target, 0, memory, place, n)
+            copy_into(memory, place, command, 0, n)
+            memory[_OLDEST_QUEUED_INDEX] = (memory[_OLDEST_QUEUED_INDEX] + 1.0) % queued
+        else:
+            copy_into(target, 0, command, 0, n)
+    memory[_PERIODS_SINCE_COMMAND_INDEX] = (memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0) % every
+    for i in range(n):
+        away = target[i] - r[i]
+        fastest = min(limits[0, i], math.sqrt(_TWICE_BRAKING_SHARE * limits[1, i] * abs(away)))
+        towards = min(max(away / lookahead, -fastest), fastest)
+        wanted = gain * lookahead * (towards - speed[i])
+        wanted = min(max(wanted, -limits[1, i]), limits[1, i])
+        faster = min(max(speed[i] + period * wanted, -limits[0, i]), limits[0, i])
+        reference[0, i], reference[1, i] = r[i], speed[i]
+        reference[2, i] = (faster - speed[i]) / period
+        speed[i] = faster
+        r[i] += period * faster
+
+
+@njit(cache=True)
+def position_servo_torque_into(
+    table, command, state, interface, limits, effort_limit, scratch, memory, torque
+):  # fmt: skip
+    """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
+
+    `state` is [q; v], `scratch` (6, n). An invalid command is replaced by the last one. If encoder
+    readings are invalid, the torque compensates gravity.
+    """
+    n = torque.shape[0]
+    _advance_joint_reference(command, interface, limits, memory, scratch)
+    q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
+    if are_finite_and_in_range(state):
+        copy_into(q, 0, state, 0, n)
+        copy_into(v, 0, state, n, n)
+        for i in range(n):
+            wanted[i] = scratch[2, i]
+            wanted[i] += 2.0 * w * (scratch[1, i] - v[i]) + w * w * (scratch[0, i] - q[i])
+    else:
+        copy_into(q, 0, scratch[0], 0, n)
+        v[:] = 0.0
+        wanted[:] = 0.0
+    inverse_dynamics(table, q, v, wanted, torque)
+    for i in range(n):
+        torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
+
+
+def _interface_constants_and_memory(
+    arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
+) -> tuple[tuple[Array, ...], Array]:
+    """Return the last arguments of `position_servo_torque_into`; `period` is the drives' [s]."""
+    n, queued = arm.num_joints, round(interface.dead_time * interface.command_hz)
+    gains = interface.acceleration_per_error, interface.lookahead
+    drives = 2 * np.pi * interface.drive_bandwidth_hz
+    every = round(1 / (interface.command_hz * period))
+    speed = np.minimum(arm.velocity_limit, interface.max_speed)
+    acceleration = np.minimum(arm.acceleration_limit, interface.max_acceleration)
+    limits = np.array([speed, acceleration]), arm.effort_limit
+    constants = np.array([period, *gains, drives, every, queued]), *limits, np.zeros((6, n))
+    memory = [np.zeros(2), q_start, q_start, np.zeros(n), *(queued * [q_start])]
+    return constants, np.concatenate(memory)
+
+
 class JointControl(LeafSystem):
-    """Block that controls joint positions by computed torque, at a fixed period.
+    """Block that controls joint positions by the servo of the settings, at a fixed period [s].
 
     While encoder readings are invalid, the motors only compensate gravity. `q_start` is the posture
     held before the first sample.
@@ -147,19 +284,26 @@ class JointControl(LeafSystem):
         self, arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
     ) -> None:
         super().__init__()
-        n = arm.num_joints
-        self._arm = arm.table
-        self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
+        n, interface = arm.num_joints, config.position_interface
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joint_torque)
+        self._arm, self._groups, self._constants = arm.table, range(1), tuple[Any, ...]()
+        if interface is None:
+            self._servo = computed_torque_into
+            self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
+        else:
+            self._servo, self._groups = position_servo_torque_into, range(2)
+            arguments = _interface_constants_and_memory(arm, interface, period, q_start)
+            self._constants, memory = arguments
+            self.DeclareDiscreteState(memory)
 
     def _update_joint_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
         inputs = self._command.Eval(context), self._state.Eval(context)
-        torque = discrete_state.get_mutable_value(0)
-        computed_torque_into(self._arm, *inputs, *self._constants, torque)
+        torque, *memory = [discrete_state.get_mutable_value(group) for group in self._groups]
+        self._servo(self._arm, *inputs, *self._constants, *memory, torque)
 
 
 class HeldTorque(LeafSystem):
@@ -184,15 +328,6 @@ class HeldTorque(LeafSystem):
             discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))
 
 
-def MakeJointControl(
-    arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
-) -> LeafSystem:
-    interface = config.position_interface
-    if interface is None:
-        return JointControl(arm, config, period, q_start)
-    return PositionServo(arm, interface, period, q_start)
-
-
 def mass_matrix(arm: ArmModel, q: Array) -> Array:
     """Return the mass matrix M(q) (n, n) of the arm with rotors and tool."""
     zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
@@ -206,20 +341,11 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
     """Return the inertia Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W.
 
-    J must have rank 6.
-
-    Khatib, A unified approach for motion and force control of robot manipulators (1987).
+    J must have rank 6. Khatib, A unified approach for motion and force control (1987).
     """
-    n = arm.num_joints
-    still, J = np.zeros(n), np.empty((6, n))
-    mobility, rates = np.empty((n, n)), np.empty(n)
-    forward_dynamics(arm.table, q, still, still, np.zeros(6), rates)
-    falling = rates.copy()
-    for i, torque in enumerate(np.eye(n)):
-        forward_dynamics(arm.table, q, still, torque, np.zeros(6), rates)
-        mobility[i] = rates - falling
+    J = np.empty((6, arm.num_joints))
     jacobian(arm.table, q, J)
-    return np.linalg.inv(J @ mobility @ J.T)
+    return np.linalg.inv(J @ np.linalg.inv(mass_matrix(arm, q)) @ J.T)
 
 
 def servo_at_tool(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -13,31 +17,31 @@ from pydrake.multibody import parsing
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoint
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError, silent_stderr
 from drake_teleop.common.texts import read_text, read_yaml
-from drake_teleop.station.slave import chain_joints, drake_errors
+from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
-from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model.repair_report import (
-    RepairedModel,
-    describe_frame_fault,
-    merge_repaired_models,
-)
-from drake_teleop.station.slave.model.sdf_repair import repair_sdf
-from drake_teleop.station.slave.model.urdf_repair import ModelPurpose, repair_urdf
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
+from drake_teleop.station.slave.model.urdf_and_sdf_repair import repair_sdf, repair_urdf
 
 _XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
+# Remedies for missing packages.
+_ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
+_SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
+# Places in Drake's source and in repaired texts, which the user does not have.
+_DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
+_PLACE_IN_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
+_NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 
 
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
-) -> tuple[list[ModelInstanceIndex], RepairedModel]:
-    """Repair the text of a model file, and parse it into a plant.
-
-    Return the added instances, and the repair, with text "" if a part was not repaired.
-    """
+) -> tuple[list[ModelInstanceIndex], ModelRepair]:
+    """Repair the text of a model file, and parse it into a plant; return the added instances."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
@@ -56,66 +60,55 @@ def repair_and_parse_model(
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
-    robot, scene = drake_errors.ROBOT_ERROR_TEXTS, drake_errors.SCENE_ERROR_TEXTS
-    expected = scene if purpose.is_scene else robot
-    with drake_errors.translate_drake_errors(path, expected, folder.name):
-        read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
-        instances, repaired = read(parser, path, files, purpose, Path(folder.name))
+    model = ModelRepair(path, files, purpose, Path(folder.name))
+    with translate_drake_errors(path, folder.name, is_scene=purpose.is_scene):
+        instances = (_add_files_of_directives if kind == ".yaml" else _add_file)(parser, model)
         chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         what = "the model has springs or other force elements, which are not supported"
         remedy = "remove them; only motors, gravity and contact move the arm"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-    text = "".join(each.text for each in repaired) if all(e.text for e in repaired) else ""
-    return instances, merge_repaired_models(text, repaired)
+    return instances, model
 
 
-def _add_repaired_file(
-    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    repaired = _repair_file(path, files, purpose, folder)
-    with drake_errors.raise_logged_errors():
-        if repaired.text:
-            kind = path.suffix.lower().removeprefix(".")
-            instances = parser.AddModelsFromString(repaired.text, kind)
-        else:
-            instances = parser.AddModels(str(path))
-    return instances, [repaired]
+def _add_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceIndex]:
+    _repair_text(model)
+    with raise_logged_errors():
+        if model.text:
+            kind = model.path.suffix.lower().removeprefix(".")
+            return parser.AddModelsFromString(model.text, kind)
+        return parser.AddModels(str(model.path))
 
 
 def _add_files_of_directives(
-    parser: parsing.Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    with drake_errors.raise_logged_errors():
-        directives = parsing.FlattenModelDirectives(
-            parsing.LoadModelDirectives(str(path)), parser.package_map()
-        )
-    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
+    parser: parsing.Parser, model: ModelRepair
+) -> list[ModelInstanceIndex]:
+    with raise_logged_errors():
+        loaded = parsing.LoadModelDirectives(str(model.path))
+        directives = parsing.FlattenModelDirectives(loaded, parser.package_map())
+    parts = dict[Path, ModelRepair]()
     for added in (each.add_model for each in directives.directives if each.add_model):
-        file = files.find_file(added.file)
+        file = model.files.find_file(added.file)
         if file is None:
             continue  # Drake reports it
-        if file not in repaired:
-            repaired[file] = _repair_file(file, files, purpose, folder)
-        if repaired[file].text:
-            copy = folder / f"{len(repaired)}_{file.name}"
-            copy.write_text(repaired[file].text, encoding="utf-8")
-            added.file = f"file://{copy}"
-    with drake_errors.raise_logged_errors():
+        if file not in parts:
+            parts[file] = model.repair_part(file, _repair_text)
+        if parts[file].text:
+            added.file = f"file://{model.write_file(file.name, parts[file].text)}"
+    texts = [part.text for part in parts.values()]
+    model.text = "".join(texts) if all(texts) else ""
+    with raise_logged_errors():
         models = parsing.ProcessModelDirectives(directives, parser)
-    return [each.model_instance for each in models], list(repaired.values())
+    return [each.model_instance for each in models]
 
 
-def _repair_file(
-    path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
-) -> RepairedModel:
-    kind = path.suffix.lower()
-    if kind not in _REPAIR_FUNCTION_OF_SUFFIX:
-        return RepairedModel("", [], {})
-    root = read_xml(path)
-    if any(element.tag.startswith("xacro:") for element in root.iter()):
-        raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=_XACRO_REMEDY)
-    return _REPAIR_FUNCTION_OF_SUFFIX[kind](root, path, files, purpose, folder)
+def _repair_text(model: ModelRepair) -> None:
+    repair = _REPAIR_FUNCTION_OF_SUFFIX.get(model.path.suffix.lower())
+    if repair is None:
+        return
+    if any(element.tag.startswith("xacro:") for element in model.root.iter()):
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(model.path), remedy=_XACRO_REMEDY)
+    repair(model)
 
 
 class ParsedArm(NamedTuple):
@@ -142,27 +135,26 @@ def ParseModel(
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
-    added_instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
-    frame = _find_sensor_frame(plant, added_instances, sensor_frame, where)
-    added = set(plant.GetJointIndices()) - before
-    held = chain_joints.weld_held_joints(plant, hold, added)
+    instances, model = repair_and_parse_model(plant, path, package_paths, purpose)
+    frame = _find_sensor_frame(plant, instances, model)
+    held = chain_joints.weld_held_joints(plant, hold, set(plant.GetJointIndices()) - before)
     chain = chain_joints.weld_base_and_find_chain(plant, frame, X_WBase, where)
-    chain_joints.check_chain(plant, chain, repaired.dependence_reasons, where)
-    free = chain_joints.weld_free_bodies(plant, added_instances)
-    with drake_errors.translate_drake_errors(path):
+    chain_joints.check_chain(chain, model.dependence_reasons, where)
+    free = chain_joints.weld_free_bodies(plant, instances)
+    moving = [joint for joint in chain if joint.num_velocities() > 0]
+    with translate_drake_errors(path):
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
-        limits = repaired.effort_limits if repaired.text else None
-        chain_joints.set_one_actuator_per_joint(plant, chain, limits)
-        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
-    moving = [k for k in chain if chain_joints.is_joint_moving(plant, k)]
-    instances = {plant.get_joint(index).model_instance() for index in moving}
-    if len(instances) > 1:
-        names = sorted(map(plant.GetModelInstanceName, instances))
+        limits = model.effort_limits if model.text else None
+        chain_joints.set_one_actuator_per_joint(plant, moving, limits)
+        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)
+    of_chain = {joint.model_instance() for joint in moving}
+    if len(of_chain) > 1:
+        names = sorted(map(plant.GetModelInstanceName, of_chain))
         what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
         remedy = "write the chain up to the sensor as one model"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
-    instance = next(iter(instances), frame.model_instance())
-    return ParsedArm(instance, frame, [*repaired.assumptions, *free, *held, *rotors])
+    instance = next(iter(of_chain), frame.model_instance())
+    return ParsedArm(instance, frame, [*model.assumptions, *free, *held, *rotors])
 
 
 def ParseTool(
@@ -173,8 +165,8 @@ def ParseTool(
     Return the root link, and texts about assumed or repaired data.
     """
     before, purpose = set(plant.GetJointIndices()), ModelPurpose(is_tool=True)
-    instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
-    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    instances, model = repair_and_parse_model(plant, path, package_paths, purpose)
+    held = chain_joints.joints_by_child(plant)
     bodies = [index for instance in instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
@@ -182,30 +174,79 @@ def ParseTool(
         what = f"the tool must have one root link, but has {len(roots)}: {names}"
         remedy = "give one tree of links; its root is welded to the sensor frame"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-    with drake_errors.translate_drake_errors(path):
+    with translate_drake_errors(path):
         held_joints = chain_joints.weld_joints_outside_chain(plant, before, [])
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
-    return roots[0], [*repaired.assumptions, *held_joints]
+    return roots[0], [*model.assumptions, *held_joints]
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> None:
     """Parse the surroundings of an arm."""
-    _, repaired = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
-    for name, what in repaired.dependence_reasons.items():
+    _, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
+    for name, what in model.dependence_reasons.items():
         remedy = "correct it; every object that the tool could touch must be readable"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
 
 
 def _find_sensor_frame(
-    plant: MultibodyPlant, instances: list[ModelInstanceIndex], name: str, where: str
+    plant: MultibodyPlant, instances: list[ModelInstanceIndex], model: ModelRepair
 ) -> Frame:
+    name = model.purpose.sensor_name
     with_frame = [index for index in instances if plant.HasFrameNamed(name, index)]
     if len(with_frame) == 1:
         return plant.GetFrameByName(name, with_frame[0])
     names = {plant.get_frame(k).name() for each in instances for k in plant.GetFrameIndices(each)}
     # Without names that Drake creates for joints.
-    ends = ("_parent", "_child", "__model__")
-    named = {each for each in names if not each.endswith(ends)}
-    what, remedy = describe_frame_fault(len(with_frame), name, named)
-    raise DrakeTeleopError(what, where=where, remedy=remedy)
+    named = {each for each in names if not each.endswith(("_parent", "_child", "__model__"))}
+    what, remedy = model.describe_frame_fault(len(with_frame), named)
+    raise DrakeTeleopError(what, where=str(model.path), remedy=remedy)
+
+
+@contextmanager
+def translate_drake_errors(
+    path: Path, folder: str = "", *, is_scene: bool = False
+) -> Iterator[None]:
+    """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
+
+    Messages name the original files instead of repaired copies in `folder`.
+    """
+    try:
+        yield
+    except DrakeTeleopError:
+        raise
+    # SystemExit: failed condition in Drake; LookupError: from C++ containers.
+    except (RuntimeError, SystemExit, ValueError, LookupError) as error:
+        reason = _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
+        reason = _PLACE_IN_REPAIRED_TEXT_PATTERN.sub("", reason)
+        if folder:
+            reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
+        what = f"cannot be read as a {'scene' if is_scene else 'robot'}"
+        packages = _SCENE_PACKAGE_REMEDY if is_scene else _ROBOT_PACKAGE_REMEDY
+        remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {packages}"
+        room = MAX_ERROR_LINE_LENGTH - _NUM_SEPARATOR_CHARS - len(f"{path}{what}{remedy}")
+        if len(reason) > room:
+            reason = f"{reason[:room]} ..."
+        raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None
+
+
+@contextmanager
+def raise_logged_errors() -> Iterator[None]:
+    """Raise RuntimeError if Drake logs an error, or a warning about an inertia."""
+    errors: list[str] = []
+
+    def collect_error_message(record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno >= logging.ERROR or "inertia" in message:
+            errors.append(" ".join(message.split()))
+        return False
+
+    log = logging.getLogger("drake")
+    log.addFilter(collect_error_message)
+    try:
+        with silent_stderr():  # the parsers below Drake write to stderr
+            yield
+    finally:
+        log.removeFilter(collect_error_message)
+    if errors:
+        raise RuntimeError("; ".join(dict.fromkeys(errors)))

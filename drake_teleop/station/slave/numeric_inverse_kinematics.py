@@ -10,28 +10,16 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    copy_into,
-    cross,
-    dot,
-    normalized_quaternion,
-    quaternion_at,
-    quaternion_logarithm,
-    quaternion_of_matrix,
-    quaternion_product,
-    vector_at,
-)
 from drake_teleop.station.slave.arm import (
     IS_PRISMATIC_COLUMN,
     PHI_COLUMN,
     TRANSLATION_COLUMN,
     ArmModel,
     jacobian_and_pose,
-    solve_positive_definite,
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
@@ -63,12 +51,15 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 
 @njit(cache=True)
-def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
-    """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
+def _pose_error(table, L, pose, q, x, J, e, push):
+    """Write Jacobian J (6, n), pose error e (6,) at q and J^T e (n,) to `push`; return |e|^2.
+
+    Rotations are multiplied by L.
+    """
     jacobian_and_pose(table, q, J, x)
-    a = normalized_quaternion(quaternion_at(pose, 0))
-    inverse = conjugate_quaternion(quaternion_of_matrix(x[12:].reshape(3, 3)))
-    turn = quaternion_logarithm(quaternion_product(a, inverse))
+    a = vectors.normalized_quaternion(vectors.quaternion_at(pose, 0))
+    inverse = vectors.conjugate_quaternion(vectors.quaternion_of_matrix(x[12:].reshape(3, 3)))
+    turn = vectors.quaternion_logarithm(vectors.quaternion_product(a, inverse))
     squared = 0.0
     for i in range(3):
         e[i] = pose[4 + i] - x[9 + i]
@@ -76,6 +67,10 @@ def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
         squared += e[i] * e[i] + e[3 + i] * e[3 + i]
         for k in range(q.shape[0]):
             J[3 + i, k] *= L
+    for k in range(q.shape[0]):
+        push[k] = 0.0
+        for i in range(6):
+            push[k] += J[i, k] * e[i]
     return squared
 
 
@@ -99,11 +94,10 @@ def _find_smallest_eigenpair(H, u):
         u[i] = 0.5 + (0.618 * (i + 1)) % 1.0
     growth = 1.0
     for _ in range(3):
+        M[:] = H
         for i in range(m):
-            for k in range(m):
-                M[i, k] = H[i, k]
             M[i, i] += _MIN_STEP_DAMPING_M2
-        solve_positive_definite(M, u)
+        vectors.solve_by_cholesky(M, u, m)
         growth = 0.0
         for i in range(m):
             growth += u[i] * u[i]
@@ -137,7 +131,7 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
                 if held[k] and not held[i]:
                     d[i] -= H[i, k] * fixed[k]
             M[i, i] = 1.0 if held[i] else H[i, i] + damping
-        solve_positive_definite(M, d)
+        vectors.solve_by_cholesky(M, d, n)
         outside = False
         for i in range(n):
             if not (held[i] or lower[i] <= q[i] + d[i] <= upper[i]):
@@ -151,19 +145,14 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
-def _best_step_of_joint(J, e, i):
-    slope, square = 0.0, 0.0
-    for k in range(6):
-        slope += J[k, i] * e[k]
-        square += J[k, i] * J[k, i]
-    return slope / square
-
-
-@njit(cache=True)
 def _wrist_or_shoulder_status(L, J):
     n = J.shape[1]
-    a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
-    coplanar = abs(dot(a, cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
+    a, b, c = (
+        vectors.vector_at(J[3:, n - 3], 0),
+        vectors.vector_at(J[3:, n - 2], 0),
+        vectors.vector_at(J[3:, n - 1], 0),
+    )
+    coplanar = abs(vectors.dot(a, vectors.cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
@@ -197,24 +186,24 @@ def follow_pose(
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
+    g, push, trial, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     if towards_posture:
         if upper[n - 1] - lower[n - 1] == np.inf:
-            _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+            _pose_error(table, L, pose, q, x, J, e, push)
         for i in range(n):
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
-                # The last joint turns the tool without the links.
-                turn = pull * np.sin(posture[i] - q[i])
-                step = turn if i < n - 1 else _best_step_of_joint(J, e, i)
+                step = pull * np.sin(posture[i] - q[i])
+                if i == n - 1:  # the last joint turns the tool without the links
+                    step = push[i] / (J[:, i] ** 2).sum()
             q[i] = min(max(q[i] + step, low[i]), high[i])
-    g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+    squared = _pose_error(table, L, pose, q, x, J, e, push)
     _smaller_gram_matrix_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
-        copy_into(anchor, 0, q, 0, n)
+        anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
         for _ in range(steps):
             is_met = squared < _POSE_ROUNDING_ERROR_M * _POSE_ROUNDING_ERROR_M
@@ -223,14 +212,12 @@ def follow_pose(
             if better:
                 _smaller_gram_matrix_into(J, H)
                 for i in range(n):
-                    g[i] = damping * (anchor[i] - q[i])
-                    for k in range(6):
-                        g[i] += J[k, i] * e[k]
+                    g[i] = damping * (anchor[i] - q[i]) + push[i]
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
             largest = _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
             if largest < _POSE_ROUNDING_ERROR_M:
                 break
-            found = _jacobian_and_pose_error(table, L, pose, trial, x, J, e)
+            found = _pose_error(table, L, pose, trial, x, J, e, push)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
@@ -238,35 +225,32 @@ def follow_pose(
             if better:
                 stalled_steps = stalled_steps + 1 if total > 0.99 * cost else 0
                 squared, cost, relative_damping = found, total, 0.2 * relative_damping
-                copy_into(q, 0, trial, 0, n)
+                vectors.copy_into(q, 0, trial, 0, n)
             else:
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_RELATIVE_DAMPING)
-        _jacobian_and_pose_error(table, L, pose, q, x, J, e)
-        p, rotation = vector_at(e, 0), vector_at(e, 3)
+        _pose_error(table, L, pose, q, x, J, e, push)
+        p, rotation = vectors.vector_at(e, 0), vectors.vector_at(e, 3)
         if (
-            dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
-            and dot(rotation, rotation) <= L * L * POSE_TOLERANCE_M * POSE_TOLERANCE_M
+            vectors.dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
+            and vectors.dot(rotation, rotation) <= L * L * POSE_TOLERANCE_M * POSE_TOLERANCE_M
         ):
             return _STATUS_OK
         if towards_posture:
             # The pose has priority: repeat without the posture.
             towards_posture = False
-            copy_into(q, 0, start, 0, n)
-            squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+            vectors.copy_into(q, 0, start, 0, n)
+            squared = _pose_error(table, L, pose, q, x, J, e, push)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
                 return _wrist_or_shoulder_status(L, J)
-            copy_into(q, 0, kept, 0, n)
+            vectors.copy_into(q, 0, kept, 0, n)
             far = before > _MAX_POSE_ERROR_AT_SINGULARITY_M**2 and expected_gain < 1e-3 * before
             return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
-            push = 0.0
-            for k in range(6):
-                push += J[k, i] * e[k]
-            if not _is_joint_held_at_limit(q, low, high, i, push):
-                free += push * push
+            if not _is_joint_held_at_limit(q, low, high, i, push[i]):
+                free += push[i] * push[i]
             elif held < 0 or lower[i] < q[i] < upper[i]:
                 held = i
         if held >= 0:
@@ -277,7 +261,7 @@ def follow_pose(
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
         expected_gain = 4.0 * free / max(damping, _MIN_STEP_DAMPING_M2)
-        copy_into(kept, 0, q, 0, n)
+        vectors.copy_into(kept, 0, q, 0, n)
         # Displace along the weakest direction, in proportion to the error, so that noise does not
         # move the arm.
         _find_smallest_eigenpair(H, g)
@@ -286,11 +270,10 @@ def follow_pose(
             size = min(_MAX_SINGULARITY_ESCAPE_RAD_OR_M, 10.0 * np.sqrt(squared) / L)
         slope = 0.0
         for i in range(n):
-            for k in range(6):
-                slope += g[i] * J[k, i] * e[k]
+            slope += g[i] * push[i]
         for i in range(n):
             q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+        squared = _pose_error(table, L, pose, q, x, J, e, push)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
@@ -309,7 +292,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     for _ in range(30):
         ratio = (1.0 + ratio) ** (1.0 / (n + 1))
     start, status, L, smallest = reference, _OUT_OF_REACH, orientation_length(arm), np.inf
-    x, e, J = np.empty(21), np.empty(6), np.empty((6, n))
+    x, e, J, push = np.empty(21), np.empty(6), np.empty((6, n)), np.empty(n)
     for k in range(_NUM_SEARCH_STARTS):
         found = follow_pose(
             arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
@@ -317,7 +300,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
             return _nearest_joints_by_whole_turns(arm, q, reference), IkStatus(found)
-        squared = _jacobian_and_pose_error(arm.table, L, pose, q, x, J, e)
+        squared = _pose_error(arm.table, L, pose, q, x, J, e, push)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
@@ -352,7 +335,7 @@ def _follow_command(
     encoder readings `position` (n,) hold the last command.
     """
     n = q.shape[0]
-    copy_into(q, 0, last, 0, n)
+    vectors.copy_into(q, 0, last, 0, n)
     if not are_finite_and_in_range(position):
         return _BAD_POSE
     reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder, OutputPort
@@ -21,24 +21,21 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave import home
-from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, pose_into
+from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, JointFriction
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
     fill_missing_joint_limits,
     values_per_joint,
 )
-from drake_teleop.station.slave.chain_joints import set_torque_limits
-from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.joint_friction import JointFriction
-from drake_teleop.station.slave.models import ParseModel
-from drake_teleop.station.slave.slave_config import AddPayload, Slave
+from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
+from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, end_of_tool_shapes
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
     ToolContactModel,
 )
-from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
 _SHARED_TIP_DISTANCE_M = 1e-3
@@ -118,8 +115,8 @@ class SlavePlant:
     def start_tip(self) -> Array:
         """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
-        R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
-        return start[4:] + R_WS.matrix() @ self.tip
+        X_WS = RigidTransform(Quaternion(start[:4] / np.linalg.norm(start[:4])), start[4:])
+        return X_WS @ self.tip
 
 
 def start_pose(slave: Slave) -> Array:
@@ -194,9 +191,7 @@ def AddSlavePlant(
         force = plant.get_applied_generalized_force_input_port()
         builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
-    X_WS_start = np.empty(7) if slave.home else start_pose(slave)
-    if slave.home:
-        pose_into(arm.table, start, X_WS_start)
+    X_WS_start = arm.pose(start) if slave.home else start_pose(slave)
     tip, texts = _tip_of_tool(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
     parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
     return SlavePlant(*parts, texts, slave, environment)
@@ -252,13 +247,6 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     return ParsedSlave(slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions))
 
 
-def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
-    """Return the bodies that a body carries through joints, the nearest first."""
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
-    return near + [far for each in near for far in bodies_carried_by(plant, each)]
-
-
 def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
     """Finalize a continuous plant without Drake's warnings about joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
@@ -280,9 +268,8 @@ def _remove_shapes_without_contact(
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
         for shape in plant.GetVisualGeometriesForBody(body):
             scene.RemoveGeometry(source, shape)
-    own = [index for index in plant.GetBodyIndices(arm) if index not in carried]
-    for body in map(plant.get_body, own):
-        for shape in plant.GetCollisionGeometriesForBody(body):
+        is_of_arm = body.model_instance() == arm and body.index() not in carried
+        for shape in plant.GetCollisionGeometriesForBody(body) if is_of_arm else ():
             scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
@@ -338,13 +325,6 @@ def _unit_sphere_points() -> Array:
     return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)
 
 
-def _farthest_hull_point_along_z(hulls: list[Array]) -> Array:
-    reach = max(float(hull[:, 2].max()) for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
-    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
-    return np.array([*np.mean(middles, axis=0), reach])
-
-
 def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
@@ -355,10 +335,16 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
             return tip.GetFixedPoseInBodyFrame().translation()
         context = plant.CreateDefaultContext()
         return tip.CalcPose(context, parsed.sensor_frame).translation()
-    reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hulls_of_carried_shapes_S(slave)):
-        return _farthest_hull_point_along_z(hulls)
-    return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
+    if slave.tool is not None:
+        end = end_of_tool_shapes(slave.tool)
+        return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
+    hulls = _hulls_of_carried_shapes_S(slave)
+    if not hulls:
+        return arm.phi_load[1:4] / arm.phi_load[0]
+    reach = max(hull[:, 2].max() for hull in hulls)
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
+    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
+    return np.array([*np.mean(middles, axis=0), reach])
 
 
 def read_arm_without_default_limits(

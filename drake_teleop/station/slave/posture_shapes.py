@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import numpy as np
 from pydrake import geometry
@@ -22,13 +21,12 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.model.meshes import AddSkeleton
-from drake_teleop.station.slave.model.repair_report import join_names
+from drake_teleop.station.slave.chain_joints import AddSkeleton, bodies_carried_by
+from drake_teleop.station.slave.model.model_repair import join_names
 from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,
     ParseSlave,
-    bodies_carried_by,
     finalize_without_limit_warnings,
     hull_points_of,
 )
@@ -43,14 +41,6 @@ _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
 _MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
 
 
-class Overlap(NamedTuple):
-    """Two overlapping bodies and the distance of their shapes [m], negative by the depth."""
-
-    first: RigidBody
-    second: RigidBody
-    distance: float
-
-
 class PostureShapes:
     """Shapes of a slave and its surroundings in a plant, for overlaps at any joint positions.
 
@@ -59,7 +49,7 @@ class PostureShapes:
 
     Attributes:
         assumptions: texts about data that the models do not have.
-        tool_bodies: indices of the bodies beyond the sensor.
+        tool_body, tool_bodies: indices of the body on the sensor, and of all bodies beyond it.
         surroundings: indices of the bodies of the environment.
     """
 
@@ -69,13 +59,15 @@ class PostureShapes:
         builder = DiagramBuilder()
         self.plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         self._parsed = ParseSlave(self.plant, slave)
-        of_slave = self.plant.num_bodies()
+        self.tool_body, of_slave = self._parsed.tool, self.plant.num_bodies()
         if environment is not None:
             AddEnvironment(self.plant, environment)
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
         beyond = bodies_carried_by(self.plant, self._parsed.sensor_frame.body())
         self.tool_bodies = {body.index() for body in beyond}
-        if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
+        links = [self.plant.get_body(k) for k in self.moving_bodies() - self.tool_bodies]
+        shapes = self.plant.GetCollisionGeometriesForBody, self.plant.GetVisualGeometriesForBody
+        if sticks and not any(find(link) for find in shapes for link in links):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
         _complete_and_bound_collision_shapes(self.plant, self._scene_graph)
         finalize_without_limit_warnings(self.plant)
@@ -108,19 +100,18 @@ class PostureShapes:
     def X_WS(self) -> RigidTransform:
         return self._parsed.sensor_frame.CalcPoseInWorld(self.context)
 
-    @property
-    def tool_body(self) -> BodyIndex:
-        return self._parsed.tool
-
     def bodies_welded_to_sensor(self) -> set[BodyIndex]:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
-    def overlaps(self) -> list[Overlap]:
-        """Return the pairs of overlapping bodies, except those that nearly always overlap."""
-        found, body = self._body_pair_distances(), self.plant.get_body
+    def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
+        """Return pairs of overlapping bodies with their distance [m], negative by the depth.
+
+        Pairs that nearly always overlap are left out.
+        """
+        body, found = self.plant.get_body, self._body_pair_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
-        return [Overlap(body(first), body(second), found[first, second]) for first, second in pairs]
+        return [(body(first), body(second), found[first, second]) for first, second in pairs]
 
     def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
         hulls = [hull for body in bodies for hull in self.hull_points_W(body)]
@@ -141,11 +132,6 @@ class PostureShapes:
     def moving_bodies(self) -> set[BodyIndex]:
         every = set(map(BodyIndex, range(self.plant.num_bodies())))
         return every - self.surroundings - self.anchored_bodies()
-
-    def _has_shapes(self, index: BodyIndex) -> bool:
-        body, plant = self.plant.get_body(index), self.plant
-        shapes = plant.GetCollisionGeometriesForBody(body)
-        return bool(shapes or plant.GetVisualGeometriesForBody(body))
 
     def _body_pair_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
@@ -172,20 +158,16 @@ class PostureShapes:
             joined = bodies_of_link(joint.parent_body()) | bodies_of_link(joint.child_body())
             if isinstance(joint, PrismaticJoint):
                 R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
-                axis, others = R_WF @ joint.translation_axis(), telescopes
-                telescopes = []
-                for other, bodies in others:
+                axis = R_WF @ joint.translation_axis()
+                for other, bodies in telescopes:
                     if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_TELESCOPE_AXES:
                         joined |= bodies
-                    else:
-                        telescopes.append((other, bodies))
                 telescopes.append((axis, joined))
             together.append(joined)
         for bodies in together:
             shapes = [shape for each in bodies for shape in self.contact_shapes_of(each)]
-            manager.Apply(
-                geometry.CollisionFilterDeclaration().ExcludeWithin(geometry.GeometrySet(shapes))
-            )
+            within = geometry.GeometrySet(shapes)
+            manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(within))
 
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()

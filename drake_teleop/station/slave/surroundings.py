@@ -92,7 +92,7 @@ def MakeToolContactModel(
     a hydroelastic model without such shapes, or a moving body without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
-    shapes = ToolShapes(plant, scene_graph, tool)
+    shapes, context = ToolShapes(plant, scene_graph, tool), plant.CreateDefaultContext()
     contact = ToolContactModel(
         # Integers, because Drake's identifiers would keep the plant alive.
         tool_bodies=frozenset(int(index) for index in shapes),
@@ -100,12 +100,19 @@ def MakeToolContactModel(
         leaf_instance=touched.leaf_instance,
         moving_bodies=MovingBodiesExceptLeaf(plant, touched),
     )
+    if contact.moving_bodies:
+        inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
+        if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
+            bodies = {name: plant.get_body(k) for name, k in contact.moving_bodies.items()}
+            names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
+            what = (
+                f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
+            )
+            raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
     for part in environment.parts:
         if part.moving_part is not None:
             gravity = plant.gravity_field().gravity_vector()[2]
             contact = contact._replace(leaf_parameters=np.array([*part.moving_part, gravity]))
-    context = plant.CreateDefaultContext()
-    _check_body_masses(plant, context, contact)
     if environment.hydroelastic:
         return contact._replace(drake_contact_reason="contact is hydroelastic")
     if contact.leaf_instance is not None and len(environment.parts) > 1:
@@ -121,26 +128,19 @@ def MakeToolContactModel(
         from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
-        pairs = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
+        compiled, monitored, reason = FindContactPairs(
+            plant, inspector, from_S, touched.instances, slip_speed, order
+        )
     except DrakeTeleopError as error:
         return contact._replace(drake_contact_reason=str(error))
-    compiled, monitored, reason = pairs
     if not len(compiled):
         return contact._replace(drake_contact_reason=reason or "no shapes can touch")
-    contact = contact._replace(compiled_pairs=compiled, monitored_pairs=monitored)
-    size = plant.num_multibody_states() if len(joints) else 0
-    return contact._replace(joint_table=joints, plant_state_size=size)
-
-
-def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
-    if not contact.moving_bodies:
-        return
-    inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
-    if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
-        bodies = {name: plant.get_body(index) for name, index in contact.moving_bodies.items()}
-        names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
-        what = f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
-        raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
+    return contact._replace(
+        compiled_pairs=compiled,
+        monitored_pairs=monitored,
+        joint_table=joints,
+        plant_state_size=plant.num_multibody_states() if len(joints) else 0,
+    )
 
 
 def MovingBodiesExceptLeaf(

@@ -1,22 +1,24 @@
-"""Removal of unusable shapes from a robot model, and sticks in place of missing visuals."""
+"""Triangle meshes of models, and removal of unusable shapes from URDF and SDF texts."""
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from pydrake.geometry import Capsule, Mesh
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
+from numpy.typing import NDArray
+from pydrake.geometry import Mesh
 
 from drake_teleop.common.errors import silent_stderr
-from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_number
-from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, ModelFiles
-from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model import model_references
+from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
+from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
 
 # Numbers of each dimension of a shape.
 _NUM_VALUES_OF_SHAPE_SIZES = {
@@ -28,40 +30,36 @@ _NUM_VALUES_OF_SHAPE_SIZES = {
     "mesh": {},
     "plane": {},
 }
-_SKELETON_STICK_RADIUS_M = 0.035
-_SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
+# Triangle of a binary STL file.
+_STL_TRIANGLE_FIELDS = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
+_STL_TRIANGLE_DTYPE = np.dtype(_STL_TRIANGLE_FIELDS)
 
 
-def remove_unusable_shapes(
-    root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
-) -> dict[str, list[str]]:
-    """Remove shapes that Drake cannot read; return the names of the affected links by fault.
+def remove_unusable_shapes(model: ModelRepair) -> None:
+    """Remove shapes that Drake cannot read, or all shapes if the plant has none.
 
-    Addresses relative to the file `model` become absolute. STL meshes are converted to convex hulls
-    in `folder`, because Drake does not read STL. Without `folder` all shapes are removed. A lost
-    visual is reported only for links without shapes, a lost collision shape only for links without
-    a visual or with other collision shapes.
+    Relative addresses of meshes become absolute. STL meshes are converted to convex hulls, because
+    Drake does not read STL. A lost visual is reported only for links without shapes, a lost
+    collision shape only for links without a visual or with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
-    for link in root.iter("link"):
+    for link in model.root.iter("link"):
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                fault = _shape_fault(shape) or _resolve_mesh_file(shape, model, files, folder)
-                if fault:
+                if fault := _shape_fault(shape) or _resolve_mesh_file(shape, model):
                     link.remove(shape)
                     removed.add(fault)
-        if link.find("collision") is not None:
-            reported = faults["collision"]
-        elif link.find("visual") is not None:
-            reported = set()
-        else:
-            reported = faults["collision"] | faults["visual"]
+        reported = faults["collision"]
+        if link.find("collision") is None:
+            reported = set() if link.find("visual") is not None else reported | faults["visual"]
         for fault in sorted(reported):
             lost.setdefault(fault, []).append(link.get("name", ""))
-        for shape in [*link.findall("collision"), *link.findall("visual")] if not folder else []:
-            link.remove(shape)
-    return lost
+        if not model.purpose.plant_has_shapes:
+            for shape in [*link.findall("collision"), *link.findall("visual")]:
+                link.remove(shape)
+    for fault, links in lost.items():
+        model.state_repair("shapes are missing of", f"{join_names(links)}: {fault}")
 
 
 def _shape_fault(shape: ElementTree.Element) -> str | None:
@@ -71,49 +69,42 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
         return f"{kind or 'empty'} shapes cannot be read"
     sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_VALUES_OF_SHAPE_SIZES[kind]
     for name, count in sizes.items():
-        values = _numbers_in_text(inner.get(name) or inner.findtext(name))
+        values = parse_numbers(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
             limits = f"not between 0 and {MAX_MODEL_VALUE_SI:g} m"
             return f"the {name} of a {kind} is incomplete or {limits}"
-    scale = _numbers_in_text(inner.get("scale") or inner.findtext("scale"))
+    scale = parse_numbers(inner.get("scale") or inner.findtext("scale"))
     valid = len(scale) in (0, 1, 3) and all(0.0 < abs(x) <= MAX_MODEL_VALUE_SI for x in scale)
     for place in (*shape.findall("origin"), *shape.findall("pose")):
         texts = place.get("xyz", "0 0 0"), place.get("rpy", "0 0 0"), place.text
         for text, counts in zip(texts, ((3,), (3,), (0, 6, 7)), strict=True):
-            values = _numbers_in_text(text)
+            values = parse_numbers(text)
             valid &= len(values) in counts and all(abs(x) <= MAX_MODEL_VALUE_SI for x in values)
     return None if valid else "a pose or scale is no list of finite numbers"
 
 
-def _numbers_in_text(text: str | None) -> list[float]:
-    return [parse_number(word) for word in (text or "").split()]
-
-
-def _resolve_mesh_file(
-    shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
-) -> str | None:
+def _resolve_mesh_file(shape: ElementTree.Element, model: ModelRepair) -> str | None:
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
     address = (mesh.get("filename") or mesh.findtext("uri") or "").strip()
-    file = files.find_file(address, model.resolve().parent)
+    file = model.files.find_file(address, model.path.resolve().parent)
     if file is None or not file.is_file():
-        return f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
-    if fault := files.file_access_fault(file, "meshes"):
+        return model_references.MESHES_NOT_FOUND_FAULT
+    if fault := model.files.file_access_fault(file, "meshes"):
         return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
     if suffix not in (".stl", ".obj", ".gltf", ".vtk"):
-        return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
+        return f"{Path(address).suffix} {model_references.MESHES_UNREADABLE_FAULT}"
     if (suffix == ".stl" or shape.tag == "collision") and not _is_mesh_readable(file, written):
         return f"{Path(address).suffix} meshes are empty or damaged"
-    if suffix == ".stl" and folder is not None:
-        target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
-        target.write_text(_obj_text_of_stl(file, written))
-        file = target
+    if suffix == ".stl" and model.purpose.plant_has_shapes:
+        file = model.write_file(f"{file.stem}.obj", _obj_text_of_stl(file, written))
+    resolved = f"file://{file.resolve()}"  # Drake does not decode %20
     if mesh.get("filename"):
-        mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
+        mesh.set("filename", resolved)
     else:
-        mesh.find("uri").text = f"file://{file.resolve()}"  # type: ignore[union-attr]
+        mesh.find("uri").text = resolved  # type: ignore[union-attr]
     return None
 
 
@@ -136,42 +127,90 @@ def _obj_text_of_stl(path: Path, _: int) -> str:
     return obj_text(triangles)
 
 
-def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
-    """Add a stick as visual shape to links without visuals, from joint to joint or to S."""
-    joints = map(plant.get_joint, plant.GetJointIndices())
-    inboard = {joint.child_body().index(): joint for joint in joints}
-    end, body = sensor_frame, sensor_frame.body()
-    while body.index() in inboard:
-        joint = inboard[body.index()]
-        parent = joint.parent_body()
-        on_world = parent.index() == plant.world_body().index()
-        if not isinstance(joint, WeldJoint):
-            _add_stick(plant, joint.frame_on_child(), _frame_pose_in_body(end, body, inboard), body)
-            end = joint.frame_on_parent()
-        elif on_world:
-            _add_stick(plant, body.body_frame(), _frame_pose_in_body(end, body, inboard), body)
-        body = parent
+class Triangles(NamedTuple):
+    """Triangle mesh: vertices (n, 3) [m] and rows (m, 3) of vertex indices."""
+
+    vertices: Array
+    faces: NDArray[np.intp]
 
 
-def _frame_pose_in_body(
-    frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]
-) -> RigidTransform:
-    pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
-    while on.index() != body.index():
-        weld = inboard[on.index()]
-        X_FB = weld.X_FM() @ weld.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-        pose = weld.frame_on_parent().GetFixedPoseInBodyFrame() @ X_FB @ pose
-        on = weld.parent_body()
-    return pose
+def read_triangles(file: Path) -> Triangles:
+    """Return the triangles of an STL, OBJ or MSH file, or raise ValueError."""
+    read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
+    try:
+        return check_triangle_vertices(read[file.suffix.lower()](file.read_bytes()))
+    except (KeyError, IndexError, OSError) as error:  # another kind, or too short
+        raise ValueError(str(error)) from None
 
 
-def _add_stick(plant: MultibodyPlant, first: Frame, last: RigidTransform, body: RigidBody) -> None:
-    if plant.GetVisualGeometriesForBody(body):
-        return
-    start = first.GetFixedPoseInBodyFrame().translation()
-    way = last.translation() - start
-    length = float(np.linalg.norm(way))
-    along = way / length if length > _SKELETON_STICK_RADIUS_M else np.array([0.0, 0.0, 1.0])
-    pose = RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), start + way / 2)
-    stick = Capsule(_SKELETON_STICK_RADIUS_M, max(length, 1e-3))
-    plant.RegisterVisualGeometry(body, pose, stick, f"stick_of_{body.name()}", _SKELETON_COLOUR)
+def check_triangle_vertices(triangles: Triangles) -> Triangles:
+    """Return `triangles`; raise ValueError unless all their vertices exist and are finite."""
+    vertices, faces = triangles
+    if not faces.size:
+        raise ValueError("a mesh has no triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError("a mesh has triangles with missing vertices")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a mesh has vertices that are not finite")
+    return triangles
+
+
+def obj_text(triangles: Triangles) -> str:
+    vertices, faces = triangles.vertices, triangles.faces + 1
+    text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel())
+    return text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel())
+
+
+def convex_hull(vertices: Array) -> Triangles:
+    """Return the convex hull, with triangles that face outwards, or raise ValueError."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError as error:
+        raise ValueError("a mesh has no volume") from error
+    faces = hull.simplices.astype(np.intp)
+    inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
+    faces[inwards] = faces[inwards, ::-1]
+    return _merge_equal_vertices(vertices[faces])
+
+
+def _merge_equal_vertices(corners: Array) -> Triangles:
+    points = corners.reshape(-1, 3).astype(float)
+    order = np.lexsort(points.T)
+    is_new = np.ones(len(points), bool)
+    is_new[1:] = (np.diff(points[order], axis=0) != 0.0).any(axis=1)
+    number = np.empty(len(points), np.intp)
+    number[order] = np.cumsum(is_new) - 1
+    return Triangles(points[order][is_new], number.reshape(-1, 3))
+
+
+def _read_stl(data: bytes) -> Triangles:
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + count * _STL_TRIANGLE_DTYPE.itemsize:
+        return _merge_equal_vertices(np.frombuffer(data, _STL_TRIANGLE_DTYPE, count, 84)["corners"])
+    lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
+    return _merge_equal_vertices(np.array(lines, dtype=float).reshape(-1, 3))
+
+
+def _read_obj(data: bytes) -> Triangles:
+    vertices, faces = list[list[float]](), list[tuple[int, int, int]]()
+    for line in data.splitlines():
+        words = line.split()
+        if words[:1] == [b"v"]:
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == [b"f"]:
+            corners = [int(word.split(b"/")[0]) for word in words[1:]]
+            corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]
+            faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
+    return Triangles(np.array(vertices).reshape(-1, 3), np.array(faces, np.intp).reshape(-1, 3))
+
+
+def _read_msh(data: bytes) -> Triangles:
+    n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
+    if min(n, normals, texture, count) < 0:
+        raise ValueError("a mesh file has a negative count")
+    vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
+    start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
+    faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)
+    return Triangles(vertices.astype(float), faces.astype(np.intp))

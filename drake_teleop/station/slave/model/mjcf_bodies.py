@@ -1,25 +1,22 @@
-"""Bodies, joints and shapes of an MJCF file, in the body's axes and SI units."""
+"""Bodies, joints and shapes of an MJCF file, in the body's axes and SI units: read and written."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import count
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model import mjcf_meshes
+from drake_teleop.station.slave.model import mjcf_meshes, model_numbers
 from drake_teleop.station.slave.model.mjcf_elements import (
     MIN_DIRECTION_VECTOR_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
-)
-from drake_teleop.station.slave.model.model_numbers import (
-    MAX_MODEL_VALUE_SI,
-    nearest_possible_inertia,
 )
 
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
@@ -60,10 +57,6 @@ class Geom:
         return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GEOM_GROUP
 
 
-def takes_part_in_contacts(shape: Attributes) -> bool:
-    return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
-
-
 @dataclass(eq=False)
 class Body:
     """Body with pose X_PB in its parent; `generator_tags` are tags that are not supported."""
@@ -81,13 +74,6 @@ class Body:
     def with_descendants(self) -> list[Body]:
         return [self, *(body for child in self.children for body in child.with_descendants())]
 
-    def bodies_on_path_to(self, name: str) -> list[Body]:
-        """Return the bodies from this one to the carried body `name`, or an empty list."""
-        if self.name == name:
-            return [self]
-        paths = (child.bodies_on_path_to(name) for child in self.children)
-        return next(([self, *path] for path in paths if path), [])
-
 
 class BodyReader:
     """Reader of the bodies in an MJCF file; joints and bodies without names get one."""
@@ -98,24 +84,6 @@ class BodyReader:
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
-    def remove_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
-        """Remove the bodies on the world; return each with `childclass` and pose of its frame."""
-        found = []
-
-        def collect_bodies(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
-            childclass = parent.get("childclass") or childclass
-            for child in list(parent):
-                if child.tag == "body":
-                    found.append((child, childclass, X_WF))
-                    parent.remove(child)
-                elif child.tag == "frame":
-                    attributes = Attributes(child.attrib, "frame", self._mjcf.report)
-                    collect_bodies(child, childclass, X_WF @ self._mjcf.read_pose(attributes))
-
-        for element in self._mjcf.root.findall("worldbody"):
-            collect_bodies(element, "", RigidTransform())
-        return found
-
     def read_world(self) -> Body:
         """Return the world with its shapes and all bodies."""
         world = Body("world", RigidTransform())
@@ -123,20 +91,17 @@ class BodyReader:
             self._read_children(world, element, element.get("childclass", ""), RigidTransform())
         return world
 
-    def read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
-        """Return the body in `element`, with all bodies on it; X_PF is its frame in the parent."""
+    def _read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
         name = element.get("name") or self._make_unused_name("body")
-        attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
+        attributes = Attributes(element.attrib, f"body {name}", self._mjcf.model)
         body = Body(name, X_PF @ self._mjcf.read_pose(attributes))
         childclass = element.get("childclass") or childclass
         self._read_children(body, element, childclass, RigidTransform())
         return body
 
     def _make_unused_name(self, stem: str) -> str:
-        for number in self._counters.setdefault(stem, count(1)):
-            if (name := f"{stem}_{number}") not in self._names:
-                break
-        return name
+        numbers = self._counters.setdefault(stem, count(1))
+        return next(name for k in numbers if (name := f"{stem}_{k}") not in self._names)
 
     def _read_children(
         self, body: Body, element: Element, childclass: str, X_BF: RigidTransform
@@ -147,7 +112,7 @@ class BodyReader:
                 inner = child.get("childclass") or childclass
                 self._read_children(body, child, inner, X_BF @ self._mjcf.read_pose(attributes))
             elif child.tag == "body":
-                body.children.append(self.read_body(child, childclass, X_BF))
+                body.children.append(self._read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
                 joint = self._read_joint(body, attributes, child.tag)
                 body.joints.append(joint.transformed_by(X_BF))
@@ -166,7 +131,7 @@ class BodyReader:
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
         if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
-            self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
+            self._mjcf.model.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
@@ -179,7 +144,7 @@ class BodyReader:
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
         X_FG = self._mjcf.read_pose(given)
-        size = given.numbers("size", (0.0, 0.0, 0.0), MAX_MODEL_VALUE_SI)
+        size = given.numbers("size", (0.0, 0.0, 0.0), model_numbers.MAX_MODEL_VALUE_SI)
         if "fromto" in given and kind in (*_ROUND_ROD_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
@@ -191,25 +156,24 @@ class BodyReader:
             fault = f"shapes of type {kind} are not supported"
         elif not name and min(size[: _NUM_SIZE_VALUES_OF_SHAPE.get(kind, 0)], default=1.0) <= 0.0:
             fault = "shapes need a size above 0"
-        if fault:
-            self.lost.setdefault(fault, []).append((body, given))
-            return
-        if mesh is not None and kind != "mesh":
+        if mesh is not None and kind != "mesh" and not fault:
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
                 X_GM, size = mjcf_meshes.fit_shape_to_mesh(mesh, kind, by_box=by_box)
+                X_FG, mesh = X_FG @ X_GM, None
             except ValueError as error:
-                self.lost.setdefault(str(error), []).append((body, given))
-                return
-            X_FG, mesh = X_FG @ X_GM, None
+                fault = str(error)
+        if fault:
+            self.lost.setdefault(fault, []).append((body, given))
+            return
         if given.get("shellinertia") == "true":
-            self._mjcf.report.state_assumption("solid instead of hollow shapes of", body.name)
+            self._mjcf.model.state_assumption("solid instead of hollow shapes of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
     def _read_inertial(self, body: Body, given: Attributes) -> mjcf_meshes.MassProperties:
         mass = float(given.vector("mass", (0.0,))[0])
         if mass < 0.0:
-            self._mjcf.report.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
+            self._mjcf.model.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
         moments = given.vector("diaginertia", (0.0, 0.0, 0.0))
         inertia = np.diag(moments)
         if "fullinertia" in given:
@@ -230,7 +194,8 @@ class BodyReader:
         if bound > 0.0:
             moments, axes = np.linalg.eigh(inertia)
             inertia = (axes * np.maximum(moments, bound)) @ axes.T
-        if compiler.get("balanceinertia") == "true" and nearest_possible_inertia(inertia)[1]:
+        is_impossible = model_numbers.nearest_possible_inertia(inertia)[1] > 0.0
+        if compiler.get("balanceinertia") == "true" and is_impossible:
             inertia = np.eye(3) * np.trace(inertia) / 3
         mass = max(mass, compiler.number("boundmass", 0.0))
         return mjcf_meshes.MassProperties(mass, centre, inertia)
@@ -244,8 +209,110 @@ class BodyReader:
             if geom.mesh:
                 shape = mjcf_meshes.unit_density_properties_of_mesh(geom.mesh)
         except ValueError as error:
-            self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
+            self._mjcf.model.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return mjcf_meshes.ZERO_MASS_PROPERTIES
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)
         return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)
+
+
+class MjcfText:
+    """Writer of MJCF text; in the text of a tool the top bodies float.
+
+    Contact shapes are convex hulls, as in MuJoCo, except in a scene.
+    """
+
+    def __init__(self, mjcf: Mjcf) -> None:
+        self._mjcf, self._model, self._purpose = mjcf, mjcf.model, mjcf.model.purpose
+        self._root = Element("mujoco", model=mjcf.root.get("model") or mjcf.model.path.stem)
+        SubElement(self._root, "compiler", angle="radian", autolimits="false")
+        self._assets = SubElement(self._root, "asset")
+        self._meshes: dict[tuple[int, bool], str] = {}
+        read = mjcf.attributes_of
+        materials = [each for each in mjcf.elements_in("asset") if each.tag == "material"]
+        self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
+
+    def write(self, world: Body, moving: list[Joint]) -> str:
+        """Return the MJCF text of a world; the joints `moving` get actuators."""
+        top = SubElement(self._root, "worldbody")
+        self._write_body_content(top, world)
+        names = {body.name for body in world.with_descendants()}
+        contact = SubElement(self._root, "contact")
+        for each in self._mjcf.elements_in("contact"):
+            ends = {name: each.get(name, "") for name in ("body1", "body2")}
+            if each.tag == "exclude" and names.issuperset(ends.values()):
+                SubElement(contact, "exclude", ends)
+        actuators = SubElement(self._root, "actuator")
+        for joint in moving:
+            SubElement(actuators, "motor", name=joint.name, joint=joint.name)
+        return tostring(self._root, encoding="unicode")
+
+    def _write_body_content(self, element: Element, body: Body) -> None:
+        for joint in body.joints:
+            self._write_joint(element, joint)
+        for geom in body.geoms if self._purpose.plant_has_shapes else ():
+            if geom.attributes.has_contact or geom.is_visible:
+                self._write_geom(element, geom, body)
+        for child in body.children:
+            inner = SubElement(element, "body", {"name": child.name, **_format_pose(child.X_PB)})
+            if child.inertial is not None and child.inertial.mass > 0.0:
+                mass, centre, inertia = child.inertial
+                entries = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+                values = {"mass": repr(mass), "fullinertia": _format_numbers(entries)}
+                SubElement(inner, "inertial", {"pos": _format_numbers(centre), **values})
+            if self._purpose.is_tool and body.name == "world":
+                SubElement(inner, "freejoint")
+            self._write_body_content(inner, child)
+
+    def _write_joint(self, element: Element, joint: Joint) -> None:
+        if joint.kind == "free":
+            SubElement(element, "freejoint", name=joint.name)
+            return
+        values = {"name": joint.name, "type": joint.kind, "pos": _format_numbers(joint.anchor)}
+        values |= {"axis": _format_numbers(joint.axis), "ref": repr(joint.ref), "limited": "false"}
+        if joint.limits is not None:
+            values |= {"limited": "true", "range": _format_numbers(joint.limits)}
+        damping = joint.attributes.number("damping", 0.0)
+        if damping < 0.0:
+            self._model.state_assumption("no damping, instead of a negative one, of", joint.name)
+        values["damping"] = repr(max(damping, 0.0))
+        values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
+        SubElement(element, "joint", values)
+
+    def _write_geom(self, element: Element, geom: Geom, body: Body) -> None:
+        given, values = geom.attributes, {"type": geom.kind, "mass": "0", **_format_pose(geom.X_BG)}
+        if "friction" in given:
+            values["friction"] = repr(given.numbers("friction", (1.0,))[0])
+        if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
+            values["rgba"] = rgba
+        without_contact, invisible = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
+        contact_mesh = geom.mesh if given.has_contact and not self._purpose.is_scene else None
+        if geom.is_visible or contact_mesh is None:
+            size = {"size": _format_numbers(geom.size)}
+            shape = size if geom.mesh is None else self._add_mesh_asset(geom.mesh)
+            shape |= without_contact if contact_mesh or not given.has_contact else {}
+            shape |= {} if geom.is_visible else invisible
+            SubElement(element, "geom", values | shape)
+        if contact_mesh is not None:
+            try:
+                hull = self._add_mesh_asset(contact_mesh, hull=True)
+                SubElement(element, "geom", values | invisible | hull)
+            except ValueError as error:
+                self._model.state_repair(f"{error}; shapes are missing of", body.name)
+
+    def _add_mesh_asset(self, mesh: mjcf_meshes.Mesh, *, hull: bool = False) -> dict[str, str]:
+        key = id(mesh), hull
+        if key not in self._meshes:
+            file = mesh.write_hull() if hull else mesh.find_or_write_obj()
+            self._meshes[key] = f"mesh_{len(self._meshes)}"
+            SubElement(self._assets, "mesh", name=self._meshes[key], file=str(file))
+        return {"mesh": self._meshes[key]}
+
+
+def _format_numbers(values: Iterable[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _format_pose(X: RigidTransform) -> dict[str, str]:
+    quaternion = X.rotation().ToQuaternion().wxyz()
+    return {"pos": _format_numbers(X.translation()), "quat": _format_numbers(quaternion)}

@@ -13,9 +13,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI
-from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model.repair_report import RepairReport
+from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
+from drake_teleop.station.slave.model.model_references import read_xml
+from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 _MAX_ELEMENT_NESTING_DEPTH = 150  # largest depth of nested elements
 MIN_DIRECTION_VECTOR_LENGTH = 1e-9
@@ -29,25 +29,23 @@ _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
-    """Attributes of one XML element; `label` names it in the faults that `report` receives."""
+    """Attributes of one XML element; `label` names it in the faults of `model`."""
 
-    def __init__(self, values: dict[str, str], label: str, report: RepairReport) -> None:
+    def __init__(self, values: dict[str, str], label: str, model: ModelRepair) -> None:
         super().__init__(values)
-        self.label, self._report = label, report
+        self.label, self._model = label, model
 
     def numbers(
         self, name: str, default: tuple[float, ...], largest: float = math.inf
     ) -> list[float]:
         """Return the numbers in attribute `name`; the end of `default` completes a short list."""
-        try:
-            values = [float(word) for word in self.get(name, "").split()]
-        except ValueError:
-            values = [math.nan]
+        values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
-            self._report.add_fault(f"{self.label}: {name} {self[name]!r} is not a list of numbers")
-            return list(default)
-        if max(map(abs, values), default=0.0) > largest:
-            self._report.add_fault(f"{self.label}: {name} {self[name]!r} exceeds {largest:g}")
+            fault = "is not a list of numbers"
+        elif max(map(abs, values), default=0.0) > largest:
+            fault = f"exceeds {largest:g}"
+        if fault:
+            self._model.add_fault(f"{self.label}: {name} {self[name]!r} {fault}")
             return list(default)
         return [*values, *default[len(values) :]][: len(default)]
 
@@ -57,12 +55,17 @@ class Attributes(dict[str, str]):
         has_wrong_count = len(self.get(name, "").split()) not in (0, count)
         if has_wrong_count or max(map(abs, values)) > MAX_MODEL_VALUE_SI:
             what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_MODEL_VALUE_SI:g}"
-            self._report.add_fault(f"{self.label}: {what}")
+            self._model.add_fault(f"{self.label}: {what}")
             return np.array(default)
         return np.array(values)
 
     def number(self, name: str, default: float) -> float:
         return self.numbers(name, (default,))[0]
+
+    @property
+    def has_contact(self) -> bool:
+        """Whether a shape with these attributes takes part in contacts."""
+        return any(self.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
     def read_range(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
         """Return the range in attribute `name`, or None if attribute `flag` switches it off.
@@ -74,26 +77,26 @@ class Attributes(dict[str, str]):
         if limited == "false" or (limited == "auto" and not (automatic and lower != upper)):
             return None
         if lower > upper:
-            self._report.add_fault(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
+            self._model.add_fault(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
         return lower, upper
 
 
 class Mjcf:
-    """Content of an MJCF file with its includes, and the report of repairs and faults."""
+    """Content of the MJCF file `model.path` with its includes, class defaults and settings."""
 
-    def __init__(self, root: Element, path: Path, files: ModelFiles, report: RepairReport) -> None:
-        self.root, self.path, self.files, self.report = root, path, files, report
+    def __init__(self, model: ModelRepair) -> None:
+        self.model, self.root = model, model.root
         self._folders: dict[Element, Path] = {}  # of included elements
         if self.root.tag != "mujoco":
             what = f"does not contain a mujoco tag, but {self.root.tag}"
-            raise DrakeTeleopError(what, where=str(path), remedy="give an MJCF file")
-        self._insert_includes(self.root, path, {path.resolve()}, 0)
-        self.compiler = Attributes({}, "compiler", report)
+            raise DrakeTeleopError(what, where=str(model.path), remedy="give an MJCF file")
+        self._insert_includes(self.root, model.path, {model.path.resolve()}, 0)
+        self.compiler = Attributes({}, "compiler", model)
         for element in self.root.findall("compiler"):
             self.compiler.update(element.attrib)
         if self.compiler.get("coordinate", "local") != "local":
             what = "coordinate='global', which MuJoCo no longer reads either"
-            self.report.add_fault(f"{what}; give local coordinates")
+            self.model.add_fault(f"{what}; give local coordinates")
         self.autolimits = self.compiler.get("autolimits", "true") == "true"
         self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN_DEFAULT_CLASS: {}}
         for element in self.root.findall("default"):
@@ -101,8 +104,9 @@ class Mjcf:
 
     def find_file(self, element: Element, name: str, folder: str) -> Path | None:
         """Return the file `name` in `folder`, beside the main or else the included MJCF file."""
-        places = [self.path.resolve().parent, self._folders.get(element)]
-        found = (self.files.find_file(name, place / folder) for place in places if place)
+        places = [self.model.path.resolve().parent, self._folders.get(element)]
+        find = self.model.files.find_file
+        found = (find(name, place / folder) for place in places if place)
         return next((file for file in found if file is not None and not file.is_dir()), None)
 
     def elements_in(self, section: str) -> Iterator[Element]:
@@ -118,11 +122,11 @@ class Mjcf:
         """Return the attributes of an element, with defaults of its class or else `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
-            self.report.add_fault(f"{label}: there is no class {name}")
+            self.model.add_fault(f"{label}: there is no class {name}")
             name = _MAIN_DEFAULT_CLASS
         kind = "actuator" if element.tag in _ACTUATOR_TAGS else element.tag
         defaults = self._defaults[name].get(kind, {})
-        return Attributes(_merge_defaults(defaults, element.attrib), label, self.report)
+        return Attributes(_merge_defaults(defaults, element.attrib), label, self.model)
 
     def read_pose(self, attributes: Attributes) -> RigidTransform:
         """Return the pose of an element in its parent, from `pos` and its orientation."""
@@ -149,7 +153,7 @@ class Mjcf:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
             if np.linalg.norm(z) < MIN_DIRECTION_VECTOR_LENGTH:
-                self.report.add_fault(f"{given.label}: its xyaxes are parallel")
+                self.model.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
             return RotationMatrix(columns / np.linalg.norm(columns, axis=0))
@@ -158,7 +162,7 @@ class Mjcf:
     def _insert_includes(self, element: Element, path: Path, seen: set[Path], depth: int) -> None:
         if depth > _MAX_ELEMENT_NESTING_DEPTH:
             what = f"its elements are nested more than {_MAX_ELEMENT_NESTING_DEPTH} deep"
-            raise DrakeTeleopError(what, where=str(self.path))
+            raise DrakeTeleopError(what, where=str(self.model.path))
         content = list[Element]()
         for child in element:
             if child.get("file"):
@@ -170,9 +174,9 @@ class Mjcf:
             name = child.get("file", "")
             file = self.find_file(child, name, "")
             if file is None:
-                self.report.add_fault(f"the included file {name!r} was not found")
+                self.model.add_fault(f"the included file {name!r} was not found")
             elif file.resolve() in seen:
-                self.report.add_fault(f"{name} is included twice")
+                self.model.add_fault(f"{name} is included twice")
             else:
                 seen.add(file.resolve())
                 root = read_xml(file)
@@ -182,13 +186,12 @@ class Mjcf:
 
     def _add_defaults(self, element: Element, name: str, values: dict[str, dict[str, str]]) -> None:
         self._defaults[name] = values
-        nested = element.findall("default")
         for child in (each for each in element if each.tag != "default"):
             kind, own = child.tag, child.attrib
             if kind in _ACTUATOR_TAGS:
                 kind, own = "actuator", {**own, "kind": child.tag}
             values[kind] = _merge_defaults(values.get(kind, {}), own)
-        for child in nested:
+        for child in element.findall("default"):
             self._add_defaults(child, child.get("class", ""), dict(values))
 
 

@@ -12,15 +12,15 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS
-from drake_teleop.station.slave.model.triangles import (
+from drake_teleop.station.slave.model import model_references
+from drake_teleop.station.slave.model.meshes import (
     Triangles,
     check_triangle_vertices,
     convex_hull,
     obj_text,
     read_triangles,
 )
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
 
 class MassProperties(NamedTuple):
@@ -58,13 +58,12 @@ def combine_mass_properties(parts: list[MassProperties]) -> MassProperties:
 def unit_density_properties_of_primitive(kind: str, size: list[float]) -> MassProperties:
     """Return the mass properties of a shape of density 1 in its own axes."""
     a, b, c = size
-    if kind == "box":
-        volume, moments = 8 * a * b * c, np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / 3
-    elif kind == "ellipsoid":
-        volume = 4 / 3 * np.pi * a * b * c
-        moments = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / 5
-    elif kind == "sphere":
-        volume, moments = 4 / 3 * np.pi * a**3, np.full(3, 0.4 * a**2)
+    if kind == "sphere":
+        b = c = a
+    if kind in ("box", "ellipsoid", "sphere"):
+        factor, divisor = (8, 3) if kind == "box" else (4 / 3 * np.pi, 5)
+        volume = factor * a * b * c
+        moments = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / divisor
     elif kind in ("cylinder", "capsule"):
         middle = 2 * np.pi * a**2 * b
         ends = 4 / 3 * np.pi * a**3 if kind == "capsule" else 0.0
@@ -143,21 +142,17 @@ def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
     return np.abs(volume) if mode == "legacy" else volume
 
 
-_MESHES_NOT_FOUND_FAULT = f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
-_MESHES_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
-
-
 class Mesh:
     """Mesh of an `asset` section, with its own scale and reference pose applied."""
 
     def __init__(self, mjcf: Mjcf, attributes: Attributes, file: Path | None) -> None:
         self.name = attributes.get("name") or Path(attributes.get("file", "")).stem
         self.file, self.inertia = file, attributes.get("inertia", "legacy")
-        self._attributes = attributes
+        self._attributes, self._model = attributes, mjcf.model
         self._scale = attributes.vector("scale", (1.0, 1.0, 1.0))
         reference = {"pos": attributes.get("refpos", "0 0 0")}
         reference["quat"] = attributes.get("refquat", "1 0 0 0")
-        self._X_FM = mjcf.read_pose(Attributes(reference, attributes.label, mjcf.report))
+        self._X_FM = mjcf.read_pose(Attributes(reference, attributes.label, mjcf.model))
 
     @property
     def is_readable_by_drake(self) -> bool:
@@ -175,21 +170,19 @@ class Mesh:
             faces = faces[:, ::-1]
         return Triangles(moved, faces)
 
-    def find_or_write_obj(self, folder: Path) -> Path:
-        """Return an .obj file for Drake, written to `folder` if conversion is necessary."""
+    def find_or_write_obj(self) -> Path:
+        """Return an .obj file for Drake, written if conversion is necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
-        return self._write_triangles(self.triangles, folder)
+        return self._write_triangles(self.triangles)
 
-    def write_hull(self, folder: Path) -> Path:
-        """Write the convex hull, for contact, to an .obj file in `folder`; return its path."""
-        return self._write_triangles(convex_hull(self.triangles.vertices), folder)
+    def write_hull(self) -> Path:
+        """Write the convex hull, for contact, to an .obj file; return its path."""
+        return self._write_triangles(convex_hull(self.triangles.vertices))
 
-    def _write_triangles(self, triangles: Triangles, folder: Path) -> Path:
-        number = len(list(folder.iterdir()))
-        path = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)[:40]}.obj"
-        path.write_text(obj_text(triangles))
-        return path
+    def _write_triangles(self, triangles: Triangles) -> Path:
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", self.name)[:40]
+        return self._model.write_file(f"{name}.obj", obj_text(triangles))
 
 
 class MeshLibrary:
@@ -209,19 +202,19 @@ class MeshLibrary:
 
     def find(self, name: str) -> Mesh | str:
         """Return a mesh, or a text about its fault."""
-        mesh = self._meshes.get(name, _MESHES_NOT_FOUND_FAULT)
+        mesh = self._meshes.get(name, model_references.MESHES_NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:
                 _ = mesh.triangles
             except ValueError:
                 suffix = f"{mesh.file.suffix} " if mesh.file is not None else ""
-                self._meshes[name] = mesh = f"{suffix}{_MESHES_UNREADABLE_FAULT}"
+                self._meshes[name] = mesh = f"{suffix}{model_references.MESHES_UNREADABLE_FAULT}"
         return mesh
 
     def _find_mesh_file(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
         name = attributes.get("file", "")
         if not name:
-            return None, "" if "vertex" in attributes else _MESHES_UNREADABLE_FAULT
+            return None, "" if "vertex" in attributes else model_references.MESHES_UNREADABLE_FAULT
         compiler = self._mjcf.compiler
         if compiler.get("strippath") == "true":
             name = re.split(r"[/\\]", name)[-1]
@@ -229,8 +222,8 @@ class MeshLibrary:
         folder = compiler.get(own, compiler.get("assetdir", ""))
         file = self._mjcf.find_file(element, name, folder)
         if file is None:
-            return None, _MESHES_NOT_FOUND_FAULT
-        if fault := self._mjcf.files.file_access_fault(file, f"{element.tag} files"):
+            return None, model_references.MESHES_NOT_FOUND_FAULT
+        if fault := self._mjcf.model.files.file_access_fault(file, f"{element.tag} files"):
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

@@ -8,11 +8,11 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model.model_repair import ModelRepair
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
-from drake_teleop.station.slave.model.repair_report import RepairReport
 
-# ixx: (0, 0), ixy: (0, 1) and so on.
-_PLACE_OF_INERTIA_ENTRY = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
+# Row and column: ixx: (0, 0), ixy: (0, 1) and so on.
+_INERTIA_ENTRIES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
@@ -21,18 +21,18 @@ _TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
 
 
 def repair_inertia_and_detect_missing(
-    link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool
+    link: Element, model: ModelRepair, *, is_sdf: bool, at_rest: bool
 ) -> bool:
     """Replace physically impossible inertia of a link by the nearest possible one.
 
-    `report` receives changes and faults. A link that no joint moves (`at_rest`) loses impossible
+    Report changes and faults. A link that no joint moves (`at_rest`) loses impossible
     values. Return True if a link that joints may move has no inertia.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     mass_element = link.find("inertial/mass")
     if inertial is None or mass_element is None:
         if is_sdf:
-            report.state_assumption("1 kg, the default of SDF, for", name)
+            model.state_assumption("1 kg, the default of SDF, for", name)
         elif inertial is not None:
             link.remove(inertial)
         return not is_sdf
@@ -50,16 +50,25 @@ def repair_inertia_and_detect_missing(
     if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
         link.remove(inertial)
         what = "an impossible inertia left out, as no joint of the arm moves the link, of"
-        report.state_assumption(what, name)
+        model.state_assumption(what, name)
     elif fault:
-        report.add_fault(f"link {name}: {fault}")
+        model.add_fault(f"link {name}: {fault}")
     else:
         if no_mass and inertia.any():
-            report.state_repair("an inertia without a mass left out of", name)
-        nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, report)
-        link.remove(inertial)
-        pose = inertial.find("pose" if is_sdf else "origin")
-        _add_inertial_element(link, pose, mass, nearest, is_sdf=is_sdf)
+            model.state_repair("an inertia without a mass left out of", name)
+        nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, model)
+        entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_ENTRIES.items()}
+        pose = inertial.findall("pose" if is_sdf else "origin")[:1]
+        inertial.clear()
+        inertial.extend(pose)
+        if is_sdf:
+            SubElement(inertial, "mass").text = f"{mass:.17g}"
+            element = SubElement(inertial, "inertia")
+            for entry, value in entries.items():
+                SubElement(element, entry).text = value
+        else:
+            SubElement(inertial, "mass", value=f"{mass:.17g}")
+            SubElement(inertial, "inertia", entries)
     return not at_rest and not inertia.any()
 
 
@@ -67,41 +76,24 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
-    for name, (row, column) in _PLACE_OF_INERTIA_ENTRY.items():
+    for name, (row, column) in _INERTIA_ENTRIES.items():
         default = "1" if is_sdf and row == column else "0"
         text = element.get(name) or element.findtext(name) or default
         tensor[row, column] = tensor[column, row] = parse_number(text)
     return tensor
 
 
-def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) -> Array:
+def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) -> Array:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
     largest_change = change * np.abs(inertia).max()
     if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
-        report.state_assumption("an inertia corrected for rounding of", name)
+        model.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
         warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_SHARE else ""
-        report.state_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
+        model.state_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     return nearest
-
-
-def _add_inertial_element(
-    link: Element, pose: Element | None, mass: float, inertia: Array, *, is_sdf: bool
-) -> None:
-    inertial = SubElement(link, "inertial")
-    if pose is not None:
-        inertial.append(pose)
-    entries = {name: f"{inertia[place]:.17g}" for name, place in _PLACE_OF_INERTIA_ENTRY.items()}
-    if is_sdf:
-        SubElement(inertial, "mass").text = f"{mass:.17g}"
-        element = SubElement(inertial, "inertia")
-        for name, text in entries.items():
-            SubElement(element, name).text = text
-    else:
-        SubElement(inertial, "mass", value=f"{mass:.17g}")
-        SubElement(inertial, "inertia", entries)
 
 
 def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
@@ -124,7 +116,7 @@ def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
 
 
 MAX_MODEL_VALUE_SI = 1e6  # largest length, mass or inertia, SI units; limits may be larger
-_NUMBER_LIST_ATTRIBUTES = ("xyz", "rpy", "rgba", "size", "scale")
+_NUMBER_LIST_ATTRIBUTES = {"xyz", "rpy", "rgba", "size", "scale"}
 _NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", "emissive")
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
 _QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
@@ -139,75 +131,81 @@ def parse_number(text: str | None) -> float:
         return math.nan
 
 
+def parse_numbers(text: str | None) -> list[float]:
+    return [parse_number(word) for word in (text or "").split()]
+
+
 def replace_commas_by_blanks(root: Element) -> None:
     for element in root.iter():
-        for name in _NUMBER_LIST_ATTRIBUTES:
-            if "," in element.get(name, ""):
-                element.set(name, element.get(name, "").replace(",", " "))
-        if element.tag in _NUMBER_LIST_TAGS and "," in (element.text or ""):
-            element.text = (element.text or "").replace(",", " ")
+        for name in _NUMBER_LIST_ATTRIBUTES & element.attrib.keys():
+            element.set(name, element.attrib[name].replace(",", " "))
+        if element.tag in _NUMBER_LIST_TAGS and element.text:
+            element.text = element.text.replace(",", " ")
 
 
-def check_lengths_and_inertias(element: Element, where: str, report: RepairReport) -> None:
+def check_lengths_and_inertias(element: Element, where: str, model: ModelRepair) -> None:
     """Report lengths, inertias or rotor inertias in an element that are too large or no numbers."""
     for inner in element.iter():
         if inner.tag not in _QUANTITY_TAGS:
             continue
         if inner.tag == "origin":
             for name, text in inner.attrib.items():
-                if len(text.split()) != 3 or any(math.isnan(parse_number(x)) for x in text.split()):
-                    report.add_fault(f"{where}: origin {name}={text!r} is no list of three numbers")
+                values = parse_numbers(text)
+                if len(values) != 3 or any(map(math.isnan, values)):
+                    model.add_fault(f"{where}: origin {name}={text!r} is no list of three numbers")
         for word in " ".join([inner.text or "", *map(str, inner.attrib.values())]).split():
             value = parse_number(word)
             if math.isnan(value) and word.lower().strip("+-") != "nan":
                 continue  # a name; Drake reports an invalid number
             if not abs(value) <= MAX_MODEL_VALUE_SI:
                 what = f"is no finite number up to {MAX_MODEL_VALUE_SI:g}"
-                report.add_fault(f"{where}: {inner.tag} {word} {what}")
+                model.add_fault(f"{where}: {inner.tag} {word} {what}")
             if inner.tag == "drake:rotor_inertia" and value < 0.0:
-                report.add_fault(f"{where}: a rotor inertia of {word} kg m^2 is negative")
+                model.add_fault(f"{where}: a rotor inertia of {word} kg m^2 is negative")
 
 
-def repair_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
+def repair_joint(joint: Element, links: set[str], model: ModelRepair, *, in_chain: bool) -> None:
     """Correct limits, friction and damping of a joint; report changes and faults."""
     name = joint.get("name", "")
-    where = f"joint {name}"
+    where, is_held = f"joint {name}", name in model.purpose.held_positions
+    in_chain &= not is_held
     for end in ("parent", "child"):
         link = joint_end(joint, end)
         if not link:
-            report.add_fault(f"{where} has no {end} link")
+            model.add_fault(f"{where} has no {end} link")
         elif link not in links and link != WORLD_NAME and "::" not in link and in_chain:
-            report.add_fault(f"{where}: its {end} link {link!r} does not exist")
-    check_lengths_and_inertias(joint, where, report)
-    if joint.get("type") == "fixed":
-        for mimic in joint.findall("mimic"):
-            joint.remove(mimic)
+            model.add_fault(f"{where}: its {end} link {link!r} does not exist")
+    check_lengths_and_inertias(joint, where, model)
+    is_fixed = joint.get("type") == "fixed"
+    for mimic in joint.findall("mimic") if is_fixed or is_held else ():
+        joint.remove(mimic)
+    if is_fixed:
         return
     if in_chain:
-        _check_joint_type_mimic_and_axis(joint, where, report)
+        _check_joint_type_mimic_and_axis(joint, where, model)
     for limit in joint.iter("limit"):
-        _check_joint_limit(limit, where, report)
+        _check_joint_limit(limit, where, model)
     for dynamics in joint.iter("dynamics"):
-        _check_joint_dynamics(dynamics, name, report)
+        _check_joint_dynamics(dynamics, name, model)
 
 
-def _check_joint_type_mimic_and_axis(joint: Element, where: str, report: RepairReport) -> None:
+def _check_joint_type_mimic_and_axis(joint: Element, where: str, model: ModelRepair) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
     if kind not in ("revolute", "continuous", "prismatic"):
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
         remedy = "up to the sensor, use joints that turn about one axis or slide along it"
-        report.add_fault(f"{name} is a {kind} joint{between}; {remedy}")
+        model.add_fault(f"{name} is a {kind} joint{between}; {remedy}")
     elif joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
         remedy = "remove the tag, or fix the joint by slave.hold"
-        report.add_fault(f"{name} moves with another joint (mimic); {remedy}")
+        model.add_fault(f"{name} moves with another joint (mimic); {remedy}")
     axis = joint.find("axis")
     text = None if axis is None else axis.get("xyz") or axis.findtext("xyz")
-    values = [parse_number(word) for word in (text or "1 0 0").split()]
+    values = parse_numbers(text or "1 0 0")
     if len(values) != 3 or not all(map(math.isfinite, values)) or not any(values):
-        report.add_fault(f"{where}: axis {text!r} is no direction; give three numbers")
+        model.add_fault(f"{where}: axis {text!r} is no direction; give three numbers")
 
 
-def _check_joint_limit(limit: Element, where: str, report: RepairReport) -> None:
+def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
@@ -216,26 +214,26 @@ def _check_joint_limit(limit: Element, where: str, report: RepairReport) -> None
             continue
         values[name] = parse_number(text)
         if math.isnan(values[name]):
-            report.add_fault(f"{where}: {name} limit {text.strip()!r} is not a number")
+            model.add_fault(f"{where}: {name} limit {text.strip()!r} is not a number")
         elif name in ("velocity", "effort") and values[name] < 0.0:
             # In SDF, -1 means no limit.
             if limit.get(name) is not None or values[name] != -1.0:
-                report.add_fault(f"{where}: {name} limit {values[name]:g} is negative")
+                model.add_fault(f"{where}: {name} limit {values[name]:g} is negative")
         elif math.isinf(values[name]) and limit.get(name) is not None:
             del limit.attrib[name]  # the missing limit is stated
     lower, upper = values.get("lower", -math.inf), values.get("upper", math.inf)
     if lower > upper:
-        report.add_fault(f"{where}: lower limit {lower:g} is above upper limit {upper:g}")
+        model.add_fault(f"{where}: lower limit {lower:g} is above upper limit {upper:g}")
 
 
-def _check_joint_dynamics(dynamics: Element, name: str, report: RepairReport) -> None:
+def _check_joint_dynamics(dynamics: Element, name: str, model: ModelRepair) -> None:
     texts = [dynamics.get(tag) or dynamics.findtext(tag) for tag in ("damping", "friction")]
     damping, friction = (parse_number(text or "0") for text in texts)
     if friction != 0.0:
-        report.state_assumption("no dry friction, which the model has, of", name)
+        model.state_assumption("no dry friction, which the model has, of", name)
         dynamics.attrib.pop("friction", None)
     if not damping >= 0.0:
-        report.state_repair("damping 0 in place of a negative or unreadable one for", name)
+        model.state_repair("damping 0 in place of a negative or unreadable one for", name)
         dynamics.attrib.pop("damping", None)
         for inner in dynamics.findall("damping"):
             dynamics.remove(inner)

@@ -31,6 +31,8 @@ _BINARY_SUFFIXES = {".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jp
 _BINARY_SUFFIXES |= {".dae"}
 PACKAGE_FOLDER_SETTINGS = "--package-path, or package_paths in slave or master.leader"
 """Places where users name the folders of packages, for messages."""
+MESHES_NOT_FOUND_FAULT = f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
+MESHES_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
 _PACKAGE_FILE_NAME = "package.xml"
 _FILE_ATTRIBUTE_REGEX = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
 _FILE_ELEMENT_TAG_PATTERN = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
@@ -154,9 +156,7 @@ class ModelFiles:
         Call `check_referenced_files` first.
         """
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
-        for mesh in [
-            mesh for path in texts for mesh in self._referenced_files(path, with_meshes=True)
-        ]:
+        for mesh in [m for path in texts for m in self._referenced_files(path, with_meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):
                 yield from filter(os.path.isfile, self.sizes)
 

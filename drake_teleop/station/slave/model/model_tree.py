@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from xml.etree.ElementTree import Element
 
-from drake_teleop.station.slave.model.repair_report import RepairReport
+from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 WORLD_NAME = "world"  # name in URDF and SDF
 _CONSTRAINT_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
@@ -35,32 +35,37 @@ def link_of_frame(scope: Element, frame: str) -> str:
 
 
 def reduce_to_chain(
-    scope: Element, sensor_link: str, hold: set[str], report: RepairReport
-) -> tuple[list[Element], dict[str, int]] | None:
+    scope: Element, sensor_link: str, model: ModelRepair
+) -> tuple[set[Element], dict[str, int]] | None:
     """Keep the tree of links with the sensor; fix joints that are not between root and sensor.
 
-    Other trees and joints that close a loop are removed. The joints `hold` count as fixed. Return
-    the joints from the root to the sensor's link, also fixed ones, and the number of moving ones
-    between the root and each link; or None, with a fault in `report`, if they are ambiguous.
+    Other trees and joints that close a loop are removed. Held joints count as fixed. Return the
+    joints from the root to the sensor's link, also fixed ones, and the number of moving ones
+    between the root and each link; or None, with a fault of the model, if they are ambiguous.
     """
-    chain = _joint_chain_to_link(scope, sensor_link, report)
-    if chain is None:
+    joints = _joint_chain_to_link(scope, sensor_link, model)
+    if joints is None:
         return None
-    chain = _remove_free_base(scope, chain, report)
-    root = joint_end(chain[0], "parent") if chain else sensor_link
-    num_joints_to_link = _remove_unconnected_links(scope, root, chain, hold, report)
-    in_chain = set(map(id, chain))
+    joints = _remove_free_base(scope, joints, model)
+    root, chain = joint_end(joints[0], "parent") if joints else sensor_link, set(joints)
+    num_joints_to_link = _remove_unconnected_links(scope, root, chain, model)
     for joint in list_joints(scope):
-        if id(joint) not in in_chain and joint.get("name") not in hold:
-            make_joint_fixed(joint, report)
-    _remove_loop_constraints(scope, num_joints_to_link, report)
+        if joint not in chain and joint.get("name") not in model.purpose.held_positions:
+            make_joint_fixed(joint, model)
+    for element in [child for child in scope if child.tag in _CONSTRAINT_TAGS]:
+        names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
+        groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
+        scope.remove(element)
+        if len(names) < 2 or len(groups) > 1:
+            what = f"its links form a loop, by {element.tag}"
+            model.add_fault(f"{what}; model the chain to the sensor alone")
     return chain, num_joints_to_link
 
 
-def make_joint_fixed(joint: Element, report: RepairReport) -> None:
+def make_joint_fixed(joint: Element, model: ModelRepair) -> None:
     if joint.get("type") == "fixed":
         return
-    report.state_assumption("held:", joint.get("name", ""))
+    model.state_assumption("held:", joint.get("name", ""))
     joint.tag = "joint"
     joint.set("type", "fixed")
     for child in list(joint):
@@ -68,82 +73,69 @@ def make_joint_fixed(joint: Element, report: RepairReport) -> None:
             joint.remove(child)
 
 
-def _joint_chain_to_link(scope: Element, link: str, report: RepairReport) -> list[Element] | None:
-    parents: dict[str, list[Element]] = {}
+def _joint_chain_to_link(scope: Element, link: str, model: ModelRepair) -> list[Element] | None:
+    inboard: dict[str, list[Element]] = {}
     for joint in list_joints(scope):
-        parents.setdefault(joint_end(joint, "child"), []).append(joint)
+        inboard.setdefault(joint_end(joint, "child"), []).append(joint)
     chain, passed = list[Element](), set[str]()
-    while link in parents:
+    while joints := inboard.get(link):
+        names = [joint.get("name", "") for joint in joints]
+        fault = ""
         if link in passed:
-            report.add_fault(f"its joints form a loop through {link}; cut the loop")
+            fault = f"its joints form a loop through {link}; cut the loop"
+        elif link == WORLD_NAME:
+            fault = f"world is the child of {names[0]}"
+        elif len(joints) > 1:
+            fault = f"{link} is the child of two joints, {' and '.join(names)}; remove one of them"
+        if fault:
+            model.add_fault(fault)
             return None
         passed.add(link)
-        if link == WORLD_NAME:
-            report.add_fault(f"world is the child of {parents[link][0].get('name', '')}")
-            return None
-        if len(parents[link]) > 1:
-            names = " and ".join(joint.get("name", "") for joint in parents[link])
-            report.add_fault(f"{link} is the child of two joints, {names}; remove one of them")
-            return None
-        chain.append(parents[link][0])
-        link = joint_end(chain[-1], "parent")
+        chain.append(joints[0])
+        link = joint_end(joints[0], "parent")
     return chain[::-1]
 
 
-def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
-    moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
-    if not moving or chain[moving[0]].get("type") not in ("floating", "planar"):
+def _remove_free_base(scope: Element, chain: list[Element], model: ModelRepair) -> list[Element]:
+    first = next((k for k, each in enumerate(chain) if each.get("type") != "fixed"), None)
+    if first is None or chain[first].get("type") not in ("floating", "planar"):
         return chain
-    free = chain[moving[0]]
-    report.state_assumption("welded to the world, where it may float:", joint_end(free, "child"))
-    scope.remove(free)
+    base = joint_end(chain[first], "child")
+    model.state_assumption("welded to the world, where it may float:", base)
+    scope.remove(chain[first])
     for link in scope.findall("link"):
         if link.get("name") == WORLD_NAME:
             scope.remove(link)
-    return chain[moving[0] + 1 :]
+    return chain[first + 1 :]
 
 
 def _remove_unconnected_links(
-    scope: Element, root: str, chain: list[Element], hold: set[str], report: RepairReport
+    scope: Element, root: str, chain: set[Element], model: ModelRepair
 ) -> dict[str, int]:
     links = {link.get("name", ""): link for link in scope.findall("link")}
-    number_of, count = dict[int, int](), 0
-    for joint in chain:
-        count += joint.get("type") != "fixed" and joint.get("name", "") not in hold
-        number_of[id(joint)] = count
-    outboard: dict[str, list[Element]] = {}
-    for joint in sorted(list_joints(scope), key=lambda joint: id(joint) not in number_of):
+    held, outboard = model.purpose.held_positions, dict[str, list[Element]]()
+    for joint in sorted(list_joints(scope), key=lambda joint: joint not in chain):
         outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
-    num_joints_to_link, ahead, kept = {root: 0}, [root], set[int]()
+    num_joints_to_link, ahead, kept = {root: 0}, [root], set[Element]()
     while ahead:
         parent = ahead.pop()
         for joint in outboard.get(parent, []):
-            child = joint_end(joint, "child")
-            exists = child in links or id(joint) in number_of
-            if exists and child not in num_joints_to_link and child != WORLD_NAME:
-                num_joints_to_link[child] = number_of.get(id(joint), num_joints_to_link[parent])
-                kept.add(id(joint))
+            child, in_chain = joint_end(joint, "child"), joint in chain
+            is_new = child not in num_joints_to_link and child != WORLD_NAME
+            if is_new and (child in links or in_chain):
+                moves = in_chain and joint.get("type") != "fixed" and joint.get("name") not in held
+                num_joints_to_link[child] = num_joints_to_link[parent] + moves
+                kept.add(joint)
                 ahead.append(child)
-    for name in links.keys() - num_joints_to_link.keys():
+    for name in [name for name in links if name not in num_joints_to_link]:
         scope.remove(links[name])
-    for name in [name for name in links if name not in num_joints_to_link and name != WORLD_NAME]:
-        report.state_repair("not connected to the arm and left out:", name or "a link without name")
+        if name != WORLD_NAME:
+            what = "not connected to the arm and left out:"
+            model.state_repair(what, name or "a link without name")
     for joint in list_joints(scope):
-        if id(joint) not in kept:
+        if joint not in kept:
             scope.remove(joint)
             if joint_end(joint, "parent") in num_joints_to_link:
                 what = "left out, as it closes a loop or has no child:"
-                report.state_repair(what, joint.get("name", ""))
+                model.state_repair(what, joint.get("name", ""))
     return num_joints_to_link
-
-
-def _remove_loop_constraints(
-    scope: Element, num_joints_to_link: dict[str, int], report: RepairReport
-) -> None:
-    for element in [child for child in scope if child.tag in _CONSTRAINT_TAGS]:
-        names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
-        groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
-        scope.remove(element)
-        if len(names) < 2 or len(groups) > 1:
-            what = f"its links form a loop, by {element.tag}"
-            report.add_fault(f"{what}; model the chain to the sensor alone")
