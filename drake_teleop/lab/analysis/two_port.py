@@ -92,6 +92,13 @@ def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
     return two_port_matrix(h11, h12 / root, h21 * root, h22)
 
 
+def power_scaled_matrices(H: Complex, axis: OneAxis) -> tuple[Complex, Complex]:
+    """Return H and its scattering matrix S, with the slave's power at the hand's scale."""
+    ratio = power_ratio(axis)
+    scaled = scale_slave_power(H, ratio) if ratio > 0 else H
+    return scaled, scattering_matrix(scaled, reference_impedances(axis))
+
+
 def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
     """Return H that includes parallel impedances [N s/m] of the hand and of the environment."""
     h11, h12, h21, h22 = matrix_entries(H)

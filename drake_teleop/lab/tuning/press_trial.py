@@ -12,10 +12,9 @@ from scipy.optimize import bisect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.analysis.analyze import sampling_of_scenario
+from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.one_axis import AxisParameters
-from drake_teleop.lab.analysis.summary_values import axis_with_grip
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.comparison.delayed_contact import delayed_contact, figures_of_station_run
 from drake_teleop.lab.comparison.one_dof import (
