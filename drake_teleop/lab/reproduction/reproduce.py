@@ -41,9 +41,9 @@ def reproduce_command(
         )
         load = identify_load(identification_scenario(force, seed), stage)
         estimate = load.estimate
-        simulate_free = experiments.simulate_free_motion
-        force_run = simulate_free(force, estimate, stage("Fig. 6: vertical free motion"))
-        torque_run = simulate_free(torque, estimate, stage("Fig. 7: horizontal free motion"))
+        simulate = experiments.simulate_motion
+        force_run = simulate(force, estimate, stage("Fig. 6: vertical free motion"))
+        torque_run = simulate(torque, estimate, stage("Fig. 7: horizontal free motion"))
         about_all_axes = stage("Rotation about all axes, ideal sensor")
         ideal_run = experiments.simulate_ideal_motion(about_all_axes)
         contact_run = experiments.simulate_contact(contact, estimate, stage)
@@ -57,9 +57,11 @@ def reproduce_command(
         }
         session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
         pictures = draw_figures(force_run, torque_run, contact_run, summary)
+        runs = dict(zip(names, (force_run, torque_run, contact_run.touched), strict=True))
+        runs["contact_transition_without_sheet"] = contact_run.free
         written = stage("Write figures, replay and report")
         with files.output_folder(out):
-            _write_results(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
+            _write_results(out, seed, summary, load, runs, pictures)
             files.write_json(out / "session.json", session)
             files.write_json(out / "summary.json", summary)
         written(1.0)
@@ -69,8 +71,8 @@ def reproduce_command(
 
 
 def draw_figures(
-    force: experiments.FreeMotionRun,
-    torque: experiments.FreeMotionRun,
+    force: experiments.MotionRun,
+    torque: experiments.MotionRun,
     contact: experiments.RunsWithAndWithoutContact,
     summary: experiments.NamedValues,
 ) -> dict[str, Figure]:
@@ -90,9 +92,8 @@ def draw_figures(
     }
     detected = summary["contact"]["detected_s"]
     pictures["fig8"] = contact_figure(
-        contact.contact_result.t,
-        contact.measured_wrench[:, _FORCE_Z_INDEX],
-        contact.calculated_wrench[:, _FORCE_Z_INDEX],
+        contact.touched.result.t,
+        *(contact.touched.scaled_wrenches[sigma][:, _FORCE_Z_INDEX] for sigma in (1.0, 0.0)),
         symbol="$f_z$",
         contact=contact.in_contact,
         detected_s=math.nan if detected is None else detected,
@@ -118,32 +119,25 @@ def _write_results(
     seed: int,
     summary: experiments.NamedValues,
     load: LoadIdentification,
-    runs: tuple[
-        experiments.FreeMotionRun, experiments.FreeMotionRun, experiments.RunsWithAndWithoutContact
-    ],
+    runs: dict[str, experiments.MotionRun],
     pictures: dict[str, Figure],
 ) -> None:
-    force, torque, contact = runs
-    without_sheet = experiments.without_leaf_spring_with_next_seed(contact.scenario)
+    scenario, contact = runs["free_motion_force"].scenario, runs["contact_transition"]
+    logs = {"identification": (load.result, identification_scenario(scenario, seed))}
+    logs |= {name: (run.result, run.scenario) for name, run in runs.items()}
     files.make_folder(out / "logs")
-    for name, result, scenario in (
-        ("identification", load.result, identification_scenario(force.scenario, seed)),
-        ("free_motion_force", force.result, force.scenario),
-        ("free_motion_torque", torque.result, torque.scenario),
-        ("contact_transition", contact.contact_result, contact.scenario),
-        ("contact_transition_without_sheet", contact.free_result, without_sheet),
-    ):
+    for name, (result, of_log) in logs.items():
         result.write_parquet(out / "logs" / f"{name}.parquet")
-        write_scenario(out / "logs" / f"{name}.yaml", scenario)
+        write_scenario(out / "logs" / f"{name}.yaml", of_log)
     files.write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
     # The contact lasts 40 ms.
-    write_replay(out / "replay.html", contact.contact_result, contact.scenario, slow_motion=8.0)
+    write_replay(out / "replay.html", contact.result, contact.scenario, slow_motion=8.0)
     figures = report.values_by_full_name(summary)
     files.write_text(out / "table.md", _markdown_table(report.compare_with_paper(figures)))
-    true = experiments.true_offsets_and_phi(force.scenario)
+    true = experiments.true_offsets_and_phi(scenario)
     rows = report.parameter_rows(true, load.estimate, load.batch.standard_deviations)
-    setup = _describe_setup(seed, force.scenario, load)
+    setup = _describe_setup(seed, scenario, load)
     report.write_report(out, pictures, setup=setup, summary=figures, parameters=rows)
 
 
