@@ -48,6 +48,7 @@ from drake_teleop.lab.comparison.station_accounts import (
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
@@ -126,6 +127,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     estimate = true_load(base) if asked.ideal else identified_load(base, False).estimate
     passivity = PassivityConfig(method=asked.method)
     scenario, task = delayed_contact(base, Channel(network=network), passivity, leaf)
+    scenario = replace(scenario, sheet_spring__slip_speed=SheetSpring().slip_speed)
     if asked.friction > 0.0:
         # Friction stops a joint within 0.4 ms.
         scenario = replace(

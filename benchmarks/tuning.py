@@ -103,8 +103,9 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
         return not meets_requirements(trial(values | point, seed))
 
     def failing_share_in_axis(points: list[dict[str, Any]], gamma: float) -> float:
+        tried = dataclasses.replace(settings, gamma=gamma)
         shares = [
-            search.share_in_one_axis(axis, settings, gamma, p["hand"], p["wall"], 100 + k)
+            search.share_in_one_axis(axis, tried, p["hand"], p["wall"], 100 + k)
             for k, p in enumerate(points)
         ]
         return float(np.mean([not is_share_accepted(share) for share in shares]))

@@ -10,7 +10,7 @@ import pytest
 
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.one_axis import AxisParameters
+from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.comparison.delayed_contact import (
     _slave_height_and_rotation,
     delayed_contact,
@@ -242,9 +242,9 @@ def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
     monkeypatch.setattr(press_trial, "run_one_dof", capture_arguments)
     one = trial()
     search_ = OneAxisGammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
-    tuned = TunedSettings("ledger", 1.0, 0.3, 100.0)
+    tuned = TunedSettings("ledger", 1.5, 0.3, 100.0)
     with pytest.raises(CapturedArguments) as found:
-        search_.share_in_one_axis(AxisParameters(), tuned, 1.5, "firm", 3000.0, 4)
+        search_.share_in_one_axis(OneAxis(), tuned, "firm", 3000.0, 4)
     (model, _, forward, backward), options = found.value.args
     assert forward.delay == 0.02 and backward.delay == pytest.approx(0.05 + 0.416 / 100.0)
     assert (model.hand_stiffness, model.wall_stiffness, model.gamma) == (700.0, 3000.0, 1.5)

@@ -112,10 +112,9 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     """Return the network delays of pose and wrench in whole hand periods; 0: no network."""
-    lines = scenario.channel.networks_of_directions()
-    if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
+    if scenario.has_no_network_or_passivity:
         return 0, 0
-    rate = scenario.rates.hand_hz
+    rate, lines = scenario.rates.hand_hz, scenario.channel.networks_of_directions()
     ahead, back = (max(1, round(max(line.delay, line.playout) * rate)) for line in lines)
     return ahead, back
 

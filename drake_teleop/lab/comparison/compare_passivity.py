@@ -48,9 +48,6 @@ _RATES_OF_EVERY_RUN = Rates(
 )
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_SIMULATION_STEP_S = 2e-3
-#: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
-#: needs 9,000 to 16,000 steps per second instead of 1,500.
-_LEAF_SLIP_SPEED_M_S = 1e-3
 
 
 def compare_command(
@@ -154,19 +151,18 @@ def simulate_press(
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     channel, passivity = Channel(network=network), PassivityConfig(method=method)
     setup, task = delayed_contact.delayed_contact(scenario, channel, passivity, leaf)
-    setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = delayed_contact.force_and_energy_traces(result, setup)
-    held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
+    held = task.is_held(shown["t"])
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
-        "felt_share": max(1 + found.force_error, 0.0),
+        "felt_share": found.rendered_share,
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }

@@ -55,6 +55,10 @@ class Task:
     end: float = 17.0
     rest_window: float = 1.9  #: length of the windows in which rest is required
 
+    def is_held(self, t: Array) -> NDArray[np.bool_]:
+        """Return whether times (N,) [s] are in the window of rest during the hold."""
+        return (t >= self.release_start - self.rest_window) & (t < self.release_start)
+
 
 @dataclass(frozen=True, kw_only=True)
 class OneDof(AxisParameters):
@@ -139,6 +143,11 @@ class RunMeasures:
     free_force: float  #: rms force on the hand in free motion [N]
     rise_delay: float  #: from contact force to felt force at half the steady felt force [s], or NaN
     least_energy: float  #: least energy from both ends into the channel [J]; negative: active
+
+    @property
+    def rendered_share(self) -> float:
+        """Rendered share of the scaled contact force, or NaN."""
+        return max(1.0 + self.force_error, 0.0)
 
 
 def run_one_dof(

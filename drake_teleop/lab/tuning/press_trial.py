@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
-from drake_teleop.lab.analysis.one_axis import AxisParameters
+from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.comparison.delayed_contact import delayed_contact, figures_of_station_run
 from drake_teleop.lab.comparison.one_dof import (
@@ -48,7 +48,6 @@ _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window 
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_PRESS_DEPTH_M = 0.02
 _USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
-_LEAF_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _FILTER_DELAY_TIMES_BANDWIDTH = 0.416  # of the 4th-order Butterworth filter
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
@@ -74,12 +73,17 @@ class TunedSettings:
 
     def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
         sensor = base.wrist_sensor
-        if not sensor.ideal:
-            sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
-        scaling = dataclasses.replace(base.force_scaling, sigma=0.0, eta=None, sigma_weight=0.0)
-        scaling = dataclasses.replace(scaling, gamma=self.gamma, sigma_inertia=self.sigma_inertia)
-        method = self.passivity(stated)
-        return replace(base, wrist_sensor=sensor, force_scaling=scaling, passivity=method)
+        low_pass_hz = sensor.bandwidth_hz if sensor.ideal else self.low_pass_hz
+        return replace(
+            base,
+            wrist_sensor__bandwidth_hz=low_pass_hz,
+            force_scaling__sigma=0.0,
+            force_scaling__eta=None,
+            force_scaling__sigma_weight=0.0,
+            force_scaling__sigma_inertia=self.sigma_inertia,
+            force_scaling__gamma=self.gamma,
+            passivity=self.passivity(stated),
+        )
 
 
 def settings_from_values(values: FactorValues) -> TunedSettings:
@@ -113,23 +117,20 @@ class StationPressTrial:
         depth = renderable_press_depth(self.base_scenario, grip)
         method = scenario.passivity
         setup, _ = delayed_contact(scenario, channel, method, wall, task=task, depth=depth)
-        setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
             return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
         found = figures_of_station_run(result, setup, task)
-        hold = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)
+        hold = task.is_held(result.t)
         scaling = scenario.force_scaling
         gain = scaling.force_scale * scaling.scales().gamma
-        contact = float(result["true_contact_wrench_W"][hold, 2].mean())
-        felt = result["force_to_master"][hold, 2]
         free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
-        period = result.t[1] - result.t[0]
-        forces = (felt, *result["force_to_master"][free, :3].T)
+        force, period = result["force_to_master"], result.t[1] - result.t[0]
+        forces = (force[hold, 2], *force[free, :3].T)
         rest_force = max(rms_above_hz(f, period, MIN_REST_FORCE_FREQUENCY_HZ) for f in forces)
-        share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
+        share = found.rendered_share if np.isfinite(found.rendered_share) else 0.0
         human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
         return {
@@ -137,7 +138,7 @@ class StationPressTrial:
             "rest_force_N": rest_force,
             "share": share,
             "free_force_N": found.free_force,
-            "contact_N": abs(contact),
+            "contact_N": abs(float(result["true_contact_wrench_W"][hold, 2].mean())),
             "threshold_N": (smallest + 2 * rest_force) / (gain * share) if share else np.inf,
         }
 
@@ -166,7 +167,8 @@ class OneAxisGammaSearch:
         def stability_sign(log_gamma: float) -> float:
             gamma, share = float(np.exp(log_gamma)), np.inf
             for corner in self.stated_set.corners:
-                found = self.share_in_one_axis(axis, settings, gamma, *corner, seed)
+                tried = dataclasses.replace(settings, gamma=gamma)
+                found = self.share_in_one_axis(axis, tried, *corner, seed)
                 share = min(share, found)
                 if not is_share_accepted(found, MAX_TUNED_FORCE_ERROR):
                     return -1.0
@@ -183,7 +185,7 @@ class OneAxisGammaSearch:
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
-    def _linear_gamma_limit(self, axis: Any, settings: TunedSettings) -> float:
+    def _linear_gamma_limit(self, axis: OneAxis, settings: TunedSettings) -> float:
         sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
@@ -195,33 +197,22 @@ class OneAxisGammaSearch:
         return float(_TESTED_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
     def share_in_one_axis(
-        self,
-        axis: AxisParameters,
-        settings: TunedSettings,
-        gamma: float,
-        grip: str,
-        wall: float,
-        seed: int,
+        self, axis: OneAxis, settings: TunedSettings, grip: str, wall: float, seed: int
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable or too noisy at rest."""
         forward, backward = self.base_scenario.channel.networks_of_directions()
-        hand = GRIP_IMPEDANCES[grip]
-        shown = {f.name: getattr(axis, f.name) for f in dataclasses.fields(AxisParameters)}
-        model = OneDof(**shown | {
-            "hand_mass": hand.mass, "hand_damping": hand.damping,
-            "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
-        })  # fmt: skip
+        held = axis_with_grip(axis, grip)
+        shown = {f.name: getattr(held, f.name) for f in dataclasses.fields(AxisParameters)}
+        model = OneDof(**shown | {"wall_stiffness": wall, "gamma": settings.gamma})
         ideal = self.base_scenario.wrist_sensor.ideal
         added = 0.0 if ideal else _FILTER_DELAY_TIMES_BANDWIDTH / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
         passivity, intent = settings.passivity(self.stated_set), operator_intent(task)
         filtered = dataclasses.replace(backward, delay=backward.delay + added)
         run = run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
-        found = figures_of_run(run, model, task)
-        hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
-        force, period = run.hand_force[hold], run.t[1] - run.t[0]
-        quiet = rms_above_hz(force, period, MIN_REST_FORCE_FREQUENCY_HZ) <= MAX_REST_FORCE_N
-        return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
+        found, force = figures_of_run(run, model, task), run.hand_force[task.is_held(run.t)]
+        noise = rms_above_hz(force, run.t[1] - run.t[0], MIN_REST_FORCE_FREQUENCY_HZ)
+        return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 
 
 def is_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:

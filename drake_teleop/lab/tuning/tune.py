@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_teleop.common import files
-from drake_teleop.common.html import png_data_url, render_page
+from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.progress import show_progress
-from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
+from drake_teleop.common.style import BLACK, COLOURS, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning import search
 from drake_teleop.lab.tuning.press_trial import StationPressTrial, TunedSettings
@@ -82,11 +82,9 @@ def tune(
     summary = _make_tuning_summary(found, tuned, stated, network)
     with files.output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
-        picture = draw_trade_off(found, summary)
-        files.write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
-        shown_in_page = {"summary": summary, "picture": png_data_url(out / "trade_off.png")}
-        page = render_page("drake_teleop.lab.tuning", "report.html.j2", **shown_in_page)
-        files.write_text(out / "report.html", page)
+        pictures = {"trade_off": draw_trade_off(found, summary)}
+        package = "drake_teleop.lab.tuning"
+        write_report_page_and_pictures(out, package, pictures, summary=summary)
         files.write_json(out / "summary.json", summary)
     if not quiet:
         from rich.console import Console
@@ -189,8 +187,7 @@ def draw_trade_off(found: search.SearchResult, summary: dict[str, Any]) -> Figur
             axes.plot(margins, at_limit * margins, color=colour, label=method)
         figures = summary["figures"]
         axes.plot(figures["margin"], figures["threshold_N"], "o", color=BLACK, label="chosen")
-        axes.set_yscale("log")
+        axes.set(yscale="log", ylabel="smallest detected contact force [N]")
         axes.set_xlabel("margin: factor by which gamma may grow")
-        axes.set_ylabel("smallest detected contact force [N]")
         axes.legend()
     return figure
