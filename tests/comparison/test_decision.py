@@ -98,7 +98,7 @@ def test_impulses_count_from_the_delay_of_one_way(monkeypatch):
             least_energy_sum=lambda place: -0.1 * place,
         )
 
-    monkeypatch.setattr(release_and_taps, "run_one_dof", run)
+    monkeypatch.setattr(release_and_taps.one_dof, "run_one_dof", run)
     monkeypatch.setitem(release_and_taps.PRESETS, "late", NetworkConfig(delay=0.3))
     monkeypatch.setattr(release_and_taps, "Channel", lambda **_: Channel())
     monkeypatch.setattr(release_and_taps, "TAP_RATES_HZ", (1.5,))

@@ -239,7 +239,7 @@ UNEQUAL = Channel(delay=0.02, backward=NetworkConfig(delay=0.05))
 
 
 def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
-    monkeypatch.setattr(press_trial, "run_one_dof", capture_arguments)
+    monkeypatch.setattr(press_trial.one_dof, "run_one_dof", capture_arguments)
     one = trial()
     search_ = OneAxisGammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
     tuned = TunedSettings("ledger", 1.5, 0.3, 100.0)

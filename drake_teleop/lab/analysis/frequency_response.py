@@ -46,6 +46,7 @@ class MultiSine:
         """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
         frequencies = self.odd_multiples_of_base_rate() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
+        phases = self._phases_with_lowest_peak()
         duration = self.settle + self.period * self.periods + self.settle
         return [
             Sine(
@@ -57,9 +58,7 @@ class MultiSine:
                 translation=list(amplitude * direction[:3]),
                 rotation=list(amplitude * direction[3:]),
             )
-            for frequency, amplitude, phase in zip(
-                frequencies, amplitudes, self._phases_with_lowest_peak(), strict=True
-            )
+            for frequency, amplitude, phase in zip(frequencies, amplitudes, phases, strict=True)
         ]
 
     def _phases_with_lowest_peak(self) -> Array:

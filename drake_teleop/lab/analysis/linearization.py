@@ -25,14 +25,9 @@ from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialFor
 from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Diagram
 
+from drake_teleop.common import vectors
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-)
 from drake_teleop.lab.analysis.linear_model import Linearization, port_component_names
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port_matrix
@@ -380,13 +375,15 @@ def _central_differences(function: Callable[[Array], Array], steps: Array) -> Ar
 
 
 def _displace_pose(pose: Array, change: Array) -> Array:
-    rotated = quaternion_product(quaternion_exponential(tuple(change[3:])), pose[:4])
+    rotation = vectors.quaternion_exponential(tuple(change[3:]))
+    rotated = vectors.quaternion_product(rotation, pose[:4])
     return np.concatenate([rotated, pose[4:] + change[:3]])
 
 
 def _pose_difference(pose: Array, other: Array) -> Array:
-    rotation = quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
-    return np.concatenate([pose[4:] - other[4:], quaternion_logarithm(rotation)])
+    inverse = vectors.conjugate_quaternion(tuple(other[:4]))
+    rotation = vectors.quaternion_product(tuple(pose[:4]), inverse)
+    return np.concatenate([pose[4:] - other[4:], vectors.quaternion_logarithm(rotation)])
 
 
 def _without_nonlinear_parts(scenario: Scenario) -> Scenario:

@@ -13,13 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.one_axis import (
-    Complex,
-    OneAxis,
-    device_impedance,
-    servo_admittance,
-    servo_response,
-)
+from drake_teleop.lab.analysis import one_axis
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 
 
 def two_port_matrix(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
@@ -40,12 +35,13 @@ def hybrid_matrix(
 
     `servo` replaces the axis' servo response and admittance.
     """
-    response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
+    servo = servo or (one_axis.servo_response(axis, s), one_axis.servo_admittance(axis, s))
+    response, slave_admittance = servo
     delay_factor = np.exp(-s * axis.delay)
     tool = axis.displayed_tool_mass * s
     slave = axis.position_scale * delay_factor * response
     return two_port_matrix(
-        device_impedance(axis, s) + axis.force_scale * delay_factor * tool * slave,
+        one_axis.device_impedance(axis, s) + axis.force_scale * delay_factor * tool * slave,
         axis.force_scale * delay_factor * (axis.gamma - tool * slave_admittance),
         -slave,
         slave_admittance,

@@ -7,15 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.comparison.one_dof import (
-    ACTUAL,
-    PERIOD,
-    OneDof,
-    OneDofRun,
-    Task,
-    operator_intent,
-    run_one_dof,
-)
+from drake_teleop.lab.comparison import one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, OneDofRun, Task
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -39,7 +32,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
     def simulate_hand(intent: Array, grip: Array | None = None) -> OneDofRun:
-        return run_one_dof(
+        return one_dof.run_one_dof(
             model,
             PassivityConfig(method=method),
             PRESETS[network],
@@ -52,7 +45,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     release_time = 3.0 + 3 * round_trip
     end = release_time + 2.0
     task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, rest_window=0.1)
-    pressing = operator_intent(task)
+    pressing = one_dof.operator_intent(task)
     release_row = round(release_time / PERIOD)
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
     grip[release_row:] = 0.0
@@ -68,7 +61,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
             _tap_impulse_share(found, scale, rate, 0.5 * round_trip)
             for found, rate in zip(tapping, TAP_RATES_HZ, strict=True)
         ),
-        leaked=max(max(0.0, -found.least_energy_sum(ACTUAL)) for found in (released, *tapping)),
+        leaked=max(0.0, *(-run.least_energy_sum(one_dof.ACTUAL) for run in (released, *tapping))),
     )
 
 

@@ -13,14 +13,8 @@ from matplotlib.patches import Rectangle
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
-from drake_teleop.lab.comparison.decision import (
-    VERDICT_CHATTERS,
-    VERDICT_HOLDS,
-    VERDICT_LEAKS,
-    VERDICT_POSITION_ERROR,
-    VERDICT_UNSTABLE,
-    decision_table,
-)
+from drake_teleop.lab.comparison import decision
+from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.release_and_taps import TAP_RATES_HZ
 from drake_teleop.station.channel.network import PRESETS
 
@@ -40,11 +34,11 @@ RUN_COLUMNS = (
 
 #: Verdict -> mark, colour of the cell, colour of the text. The cells also differ in lightness.
 VERDICT_STYLES = {
-    VERDICT_HOLDS: ("✓", "#CBE4F4", BLACK),
-    VERDICT_LEAKS: ("⚠", "#FBEBB8", BLACK),
-    VERDICT_CHATTERS: ("≈", "#F7D39B", BLACK),
-    VERDICT_POSITION_ERROR: ("↷", "#F0B878", BLACK),
-    VERDICT_UNSTABLE: ("✗", "#565C66", "white"),
+    decision.VERDICT_HOLDS: ("✓", "#CBE4F4", BLACK),
+    decision.VERDICT_LEAKS: ("⚠", "#FBEBB8", BLACK),
+    decision.VERDICT_CHATTERS: ("≈", "#F7D39B", BLACK),
+    decision.VERDICT_POSITION_ERROR: ("↷", "#F0B878", BLACK),
+    decision.VERDICT_UNSTABLE: ("✗", "#565C66", "white"),
 }
 _NETWORK_MARKERS = "os^Dv"  # marks of the networks
 

@@ -16,14 +16,9 @@ from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenar
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
+from drake_teleop.lab.comparison import one_dof
 from drake_teleop.lab.comparison.delayed_contact import delayed_contact, figures_of_station_run
-from drake_teleop.lab.comparison.one_dof import (
-    OneDof,
-    Task,
-    figures_of_run,
-    operator_intent,
-    run_one_dof,
-)
+from drake_teleop.lab.comparison.one_dof import OneDof, Task
 from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.lab.tuning.stated_set import StatedSet
 from drake_teleop.station.master.data_sheets import FIGURES
@@ -207,10 +202,10 @@ class OneAxisGammaSearch:
         ideal = self.base_scenario.wrist_sensor.ideal
         added = 0.0 if ideal else _FILTER_DELAY_TIMES_BANDWIDTH / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
-        passivity, intent = settings.passivity(self.stated_set), operator_intent(task)
+        passivity, intent = settings.passivity(self.stated_set), one_dof.operator_intent(task)
         filtered = dataclasses.replace(backward, delay=backward.delay + added)
-        run = run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
-        found, force = figures_of_run(run, model, task), run.hand_force[task.is_held(run.t)]
+        run = one_dof.run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
+        found, force = one_dof.figures_of_run(run, model, task), run.hand_force[task.is_held(run.t)]
         noise = rms_above_hz(force, run.t[1] - run.t[0], MIN_REST_FORCE_FREQUENCY_HZ)
         return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 

@@ -18,18 +18,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
+from drake_teleop.lab.tuning import press_trial
 from drake_teleop.lab.tuning.press_trial import (
-    GIVEN_SETTINGS_NAME,
     MAX_RENDERED_FORCE_ERROR,
     MAX_REST_FORCE_N,
-    MAX_TUNED_FORCE_ERROR,
-    SEARCH_MEASURES,
-    TRIAL_MEASURES,
-    OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
-    is_share_accepted,
-    settings_from_values,
 )
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
@@ -75,7 +69,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
-    unscaled = TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
+    unscaled = TunedSettings(press_trial.GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
     given = execute("as_given", _study_of_settings(unscaled, ends, [stiffest]), trial)
     unscaled = dataclasses.replace(unscaled, method="ledger")
     quiet = execute("noise", _study_of_settings(unscaled, ends, [stiffest]), trial)
@@ -91,8 +85,8 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
         Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
         Factor(field="low_pass_hz", values=low_passes),
     ]
-    study = Study(factors=factors, measures=SEARCH_MEASURES)
-    rows = execute("search", study, OneAxisGammaSearch(base, stated, caps))
+    study = Study(factors=factors, measures=press_trial.SEARCH_MEASURES)
+    rows = execute("search", study, press_trial.OneAxisGammaSearch(base, stated, caps))
     search = [_add_predicted_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
@@ -102,9 +96,9 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _find_station_gamma(settings_from_values(row), trial, execute)
+        gamma, inside = _find_station_gamma(press_trial.settings_from_values(row), trial, execute)
         if inside:
-            chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
+            chosen = dataclasses.replace(press_trial.settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
@@ -125,7 +119,7 @@ def _find_station_gamma(
     """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
 
     def holds(rows: list[Row]) -> bool:
-        return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
+        return all(meets_requirements(row, press_trial.MAX_TUNED_FORCE_ERROR) for row in rows)
 
     gamma, stable, failed = settings.gamma, 0.0, np.inf
     smallest = gamma / _MAX_GAMMA_REDUCTION
@@ -155,8 +149,8 @@ def _find_station_gamma(
 
 def meets_requirements(row: Row, max_force_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
-    quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and is_share_accepted(row["share"], max_force_error))
+    exact = press_trial.is_share_accepted(row["share"], max_force_error)
+    return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
@@ -200,4 +194,4 @@ def _study_of_settings(
     factors = [Factor(field="method", words=[numbers.pop("method")])]
     factors += [Factor(field=name, values=[number]) for name, number in numbers.items()]
     factors += [Factor(field="hand", words=hands), Factor(field="wall", values=walls)]
-    return Study(factors=factors, measures=TRIAL_MEASURES, seed=seed, repeats=repeats)
+    return Study(factors=factors, measures=press_trial.TRIAL_MEASURES, seed=seed, repeats=repeats)
