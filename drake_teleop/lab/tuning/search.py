@@ -19,12 +19,7 @@ from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning import press_trial
-from drake_teleop.lab.tuning.press_trial import (
-    MAX_RENDERED_FORCE_ERROR,
-    MAX_REST_FORCE_N,
-    StationPressTrial,
-    TunedSettings,
-)
+from drake_teleop.lab.tuning.press_trial import MAX_REST_FORCE_N, StationPressTrial, TunedSettings
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
 """Candidates; others are dominated by them or render too little force."""
@@ -74,9 +69,8 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     unscaled = dataclasses.replace(unscaled, method="ledger")
     quiet = execute("noise", _study_of_settings(unscaled, ends, [stiffest]), trial)
     noise = max(1e-9, *(row["rest_force_N"] for row in quiet))  # N at gamma = 1
-    low_passes = [own]
-    if not base.wrist_sensor.ideal:
-        low_passes += [f for f in _LOW_PASSES_HZ if stated.requirements.min_low_pass_hz <= f < own]
+    lowest = np.inf if base.wrist_sensor.ideal else stated.requirements.min_low_pass_hz
+    low_passes = [own, *(f for f in _LOW_PASSES_HZ if lowest <= f < own)]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = margin / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
     caps = {f: min(MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
@@ -147,7 +141,9 @@ def _find_station_gamma(
     return stable, inside
 
 
-def meets_requirements(row: Row, max_force_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
+def meets_requirements(
+    row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
+) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     exact = press_trial.is_share_accepted(row["share"], max_force_error)
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)

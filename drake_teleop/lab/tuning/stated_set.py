@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -92,14 +91,14 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
                 raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
     if not hands:
         raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
-    limits = f"{_MIN_WALL_N_M / 1e3:g} to {_MAX_WALL_N_M / 1e3:g} kN/m"
-    for wall in walls:
-        if not (math.isfinite(wall) and _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M):
-            what = f"{wall:g} kN/m is outside {limits}"
-            raise DrakeTeleopError(what, where="walls", remedy="give stiffnesses in kN/m")
     if not walls:
         remedy = "give kN/m, such as 0.5,20"
         raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
+    for wall in walls:
+        if not _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M:
+            limits = f"{_MIN_WALL_N_M / 1e3:g} to {_MAX_WALL_N_M / 1e3:g} kN/m"
+            what = f"{wall:g} kN/m is outside {limits}"
+            raise DrakeTeleopError(what, where="walls", remedy="give stiffnesses in kN/m")
     grips = list(GRIP_IMPEDANCES)
     places = sorted(map(grips.index, hands))
     between = tuple(grips[places[0] : places[-1] + 1])
@@ -114,20 +113,20 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
     if network is not None and network not in PRESETS:
         remedy = suggest_name(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
-    channel = scenario.channel if network is None else Channel(network=network)
-    if replace(scenario, channel=channel).has_no_network_or_passivity:
+    if network is not None:
+        scenario = replace(scenario, channel=Channel(network=network))
+    if scenario.has_no_network_or_passivity:
         what = "the scenario has neither network nor passivity method"
         what += ", which the energy balances of the runs need"
         remedy = f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}"
         raise DrakeTeleopError(what, where="network", remedy=remedy)
-    scaling = scenario.force_scaling
+    force_scale = scenario.force_scaling.force_scale
     simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
     return replace(
         scenario.without_environment(),
         simulation=simulation,
-        channel=channel,
         passivity=PassivityConfig(),
-        force_scaling=ForceScalingConfig(sigma=0.0, force_scale=scaling.force_scale),
+        force_scaling=ForceScalingConfig(sigma=0.0, force_scale=force_scale),
         contact_detection=None,
         operator__intent=[],
         operator__task=None,

@@ -61,8 +61,8 @@ def tune(
     shown = progress and not quiet
     with show_progress(shown) as stage:
         load = identified_load(base, stage)
-    own = dataclasses.replace(given, contact_detection=None)
-    own = replace(own, simulation=base.simulation, operator=base.operator, channel=base.channel)
+    of_trials = {name: getattr(base, name) for name in ("simulation", "operator", "channel")}
+    own = replace(given, contact_detection=None, **of_trials)
     trial = StationPressTrial(own, base, stated, load.estimate)
     basis = {
         "given": to_commented_yaml(given),
@@ -71,14 +71,8 @@ def tune(
         "estimate": load.estimate.tolist(),
     }
     found = search.search_settings(trial, search.make_study_executor(out, basis, jobs, shown))
-    tuned = dataclasses.replace(
-        replace(found.settings.apply(base, stated), simulation=given.simulation),
-        operator=given.operator,
-        sheet_spring=given.sheet_spring,
-        slot=given.slot,
-        environment=given.environment,
-        contact_detection=given.contact_detection,
-    )
+    tuned = replace(given, channel=base.channel, force_scaling=base.force_scaling)
+    tuned = found.settings.apply(tuned, stated)
     summary = _make_tuning_summary(found, tuned, stated, network)
     with files.output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
