@@ -83,22 +83,19 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
             lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
             lines += cell.motion_texts
-            offset = 0.12 * len(lines)
             style: dict[str, Any] = {"color": text_colour, "ha": "center", "va": "center"}
-            title = f"{mark} {cell.verdict_text}"
-            axes.text(x, y - offset, title, size=9.5, weight="bold", **style)
-            for place, line in enumerate(lines):
-                axes.text(x, y - offset + 0.27 * (place + 1), line, size=8.5, **style)
-        axes.set_xlim(-0.5, len(networks) - 0.5)
-        axes.set_ylim(len(methods) - 0.5, -0.5)
+            y -= 0.12 * len(lines)
+            axes.text(x, y, f"{mark} {cell.verdict_text}", size=9.5, weight="bold", **style)
+            for place, line in enumerate(lines, 1):
+                axes.text(x, y + 0.27 * place, line, size=8.5, **style)
+        axes.set(xlim=(-0.5, len(networks) - 0.5), ylim=(len(methods) - 0.5, -0.5))
         names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
         axes.set_xticks(range(len(networks)), names)
         axes.set_yticks(range(len(methods)), methods)
         axes.xaxis.tick_top()
         axes.tick_params(length=0)
         axes.grid(False)
-        for side in axes.spines.values():
-            side.set_visible(False)
+        axes.spines[:].set_visible(False)
         figure.suptitle("Verdict of each method over each network", x=0.01, ha="left")
     return figure
 
@@ -122,14 +119,13 @@ def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
                 marker, colour = _NETWORK_MARKERS[place % 5], COLOURS[place % len(COLOURS)]
                 x = [max(value(row), 0.0) for row in shown]
                 axes.plot(x, y, marker, markersize=5, color=colour, label=network)
-            axes.set_xscale(scale)
+            axes.set(xscale=scale, xlabel=title)
             if scale == "log":
                 axes.xaxis.set_major_formatter("{x:g}")
             else:
                 axes.set_xlim(left=0.0)
             axes.set_yticks(range(len(methods)), methods)
             axes.set_ylim(len(methods) - 0.5, -0.5)
-            axes.set_xlabel(title)
         figure.legend(*columns[0].get_legend_handles_labels(), loc="outside upper center", ncols=6)
     return figure
 
@@ -191,12 +187,11 @@ def draw_round_trip_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 shortest, longest = max(min(found), 1.0), max(max(found), 1.0)
                 axes.plot([1.0, shortest], [place, place], color=COLOURS[0], linewidth=5)
                 axes.plot([shortest, longest], [place, place], color=COLOURS[5], linewidth=2)
-            axes.set_xscale("log")
-            axes.set_xlim(1.0, 1e3 * max(rows[0]["grid_s"]))
+            axes.set(xscale="log", xlim=(1.0, 1e3 * max(rows[0]["grid_s"])))
             axes.set_yticks(range(len(methods)), methods)
             axes.invert_yaxis()
-            axes.set_title(f"wall of {wall / 1e3:g} kN/m")
-            axes.set_xlabel("longest stable round trip [ms]")
+            title, label = f"wall of {wall / 1e3:g} kN/m", "longest stable round trip [ms]"
+            axes.set(title=title, xlabel=label)
     return figure
 
 

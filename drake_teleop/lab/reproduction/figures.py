@@ -28,6 +28,10 @@ def scaling_figure(
     """
     time, time_unit = _time_axis(t)
     traces = [np.asarray(trace, float) for trace in values]
+    at_master_and_back = (
+        lambda v: np.asarray(v) / downscaling,
+        lambda v: np.asarray(v) * downscaling,
+    )
     meanings = {1.0: "as measured", 0.0: "non-contact part eliminated"}
     with style.plot_style():
         figure = style.Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
@@ -35,15 +39,15 @@ def scaling_figure(
         for axes, trace, sigma in zip(rows, traces, sigmas, strict=True):
             axes.plot(time, trace, color=style.BLUE if sigma else style.GREEN)
             meaning = meanings.get(sigma, f"{sigma:.0%} of the non-contact part")
-            axes.set_title(f"σ = {sigma:g}:  {meaning}")
+            axes.set(title=f"σ = {sigma:g}:  {meaning}", ylabel=f"{symbol} [{unit}]")
             peak = float(np.abs(trace).max())
             slave, master = _format_number(peak), _format_number(peak / downscaling)
             note = f"peak {slave} {unit}   ·   {master} {unit} at the master"
             _write_note_above_axes(axes, note)
-            axes.set_ylabel(f"{symbol} [{unit}]")
-            _add_axis_at_master_scale(axes, downscaling, f"at the master [{unit}]")
-        rows[0].set_ylim(*_common_value_range(traces))
-        rows[0].set_xlim(time[0], time[-1])
+            right = axes.secondary_yaxis("right", functions=at_master_and_back)
+            right.set_ylabel(f"at the master [{unit}]", color=style.GREY)
+            right.spines["right"].set_visible(True)
+        rows[0].set(ylim=_common_value_range(traces), xlim=(time[0], time[-1]))
         rows[-1].set_xlabel(f"t [{time_unit}]")
     return figure
 
@@ -75,8 +79,7 @@ def contact_figure(
         for axes, trace, title, colour in zip(rows, traces, titles, colours, strict=True):
             style.shade_contact(axes, time, touched)
             axes.plot(time, trace, color=colour)
-            axes.set_title(title)
-            axes.set_ylabel(f"{symbol} [N]")
+            axes.set(title=title, ylabel=f"{symbol} [N]")
             if turning_s is not None:
                 _draw_time_mark(axes, turning_s * per_second, "no contact", style.GREY)
         if touched.any():
@@ -87,8 +90,7 @@ def contact_figure(
         peaks = [f"peak {_format_number(np.abs(trace).max())} N" for trace in traces]
         _write_note_above_axes(rows[0], peaks[0])
         _write_note_above_axes(rows[1], f"{peaks[1]}   ·   threshold {_format_number(threshold)} N")
-        rows[0].set_ylim(*_common_value_range(traces))
-        rows[0].set_xlim(time[0], time[-1])
+        rows[0].set(ylim=_common_value_range(traces), xlim=(time[0], time[-1]))
         rows[1].set_xlabel(f"t [{time_unit}]")
     return figure
 
@@ -99,8 +101,7 @@ def _time_axis(t: ArrayLike) -> tuple[Array, str]:
 
 
 def _common_value_range(traces: Sequence[Array]) -> tuple[float, float]:
-    low = min(0.0, *(float(trace.min()) for trace in traces))
-    high = max(0.0, *(float(trace.max()) for trace in traces))
+    low, high = min(0.0, float(np.min(traces))), max(0.0, float(np.max(traces)))
     margin = 0.1 * (high - low) or 1.0
     return low - margin, high + margin
 
@@ -113,13 +114,6 @@ def _format_number(value: float) -> str:
 
 def _write_note_above_axes(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="right", color=style.GREY, fontsize=8.5)
-
-
-def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> None:
-    scales = (lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling)
-    right = axes.secondary_yaxis("right", functions=scales)
-    right.set_ylabel(label, color=style.GREY)
-    right.spines["right"].set_visible(True)
 
 
 def _draw_time_mark(axes: Axes, time: float, text: str, colour: str) -> None:
