@@ -37,10 +37,11 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     is_share_accepted,
+    make_stated_set,
     settings_from_values,
+    without_task_and_method,
 )
 from drake_teleop.lab.tuning.search import meets_requirements
-from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace

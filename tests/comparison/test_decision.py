@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.comparison import release_and_taps
-from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.one_dof import ACTUAL
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
-from drake_teleop.lab.comparison.report import draw_decision_table, draw_energy, draw_force_traces
+from drake_teleop.lab.comparison.report import (
+    decision_table,
+    draw_decision_table,
+    draw_energy,
+    draw_force_traces,
+)
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 

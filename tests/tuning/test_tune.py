@@ -23,11 +23,12 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
+    make_stated_set,
     renderable_press_depth,
     rms_above_hz,
+    without_task_and_method,
 )
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
-from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig

@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, transparency, two_port
+from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
@@ -319,26 +319,26 @@ def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str
     for name, one in (("free", axis), ("wall", contact)):
         environment = environment_impedance(one, S_AT_OMEGA)
         felt = two_port.transmitted_impedance(H, environment)
-        ideal = transparency.ideal_impedance(axis, S_AT_OMEGA, environment)
-        noticed = transparency.is_difference_noticed(felt, ideal)
+        ideal = two_port.ideal_impedance(axis, S_AT_OMEGA, environment)
+        noticed = two_port.is_difference_noticed(felt, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
-            which: transparency.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
+            which: two_port.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
             for which, impedance in (("felt", felt), ("ideal", ideal))
         }
         figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
     tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
     end = len(tracks) if tracks.all() else int(np.argmin(tracks))
     figures["tracking_bandwidth_Hz"] = float(OMEGA[max(end - 1, 0)] / (2 * np.pi))
-    width = transparency.transmitted_z_width(H).decades
+    width = two_port.transmitted_z_width(H).decades
     figures["width_decades"] = {
         f"{hz:g} Hz": float(np.interp(2 * np.pi * hz, OMEGA, width)) for hz in (1.0, 5.0, 10.0)
     }
     stiffness = contact.wall_stiffness
-    change = transparency.smallest_stiffness_change(H, OMEGA, stiffness)
+    change = two_port.smallest_stiffness_change(H, OMEGA, stiffness)
     figures["smallest_stiffness_N_per_m"] = {
         "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA, change)),
-        "on the wall itself": transparency.WEBER_FRACTION * stiffness,
+        "on the wall itself": two_port.WEBER_FRACTION * stiffness,
     }
     return figures
 

@@ -14,7 +14,7 @@ from drake_teleop.lab.analysis import cut_loop, one_axis
 from drake_teleop.lab.analysis.cut_loop import CutLoop
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.transparency import ideal_impedance
+from drake_teleop.lab.analysis.two_port import ideal_impedance
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE_NAME = "rate"

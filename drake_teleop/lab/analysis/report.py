@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, VERMILION, Picture, plot_style
-from drake_teleop.lab.analysis import absolute_stability, transparency, two_port
+from drake_teleop.lab.analysis import absolute_stability, two_port
 from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 
@@ -103,7 +103,7 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
             grid[1, column].semilogx(hertz, phase, **style)
 
         for column, (name, environment) in enumerate(environments.items()):
-            ideal = transparency.ideal_impedance(curves.axis, s, environment)
+            ideal = two_port.ideal_impedance(curves.axis, s, environment)
             closed_form = two_port.transmitted_impedance(curves.closed_form, environment)
             linear = two_port.transmitted_impedance(curves.H, environment)
             draw(column, hertz, ideal, "ideal", color=GREY, linestyle="--", linewidth=1.0)
@@ -167,7 +167,7 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
 
 
 def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
-    hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_z_width(curves.H)
+    hertz, width = curves.omega / (2 * np.pi), two_port.transmitted_z_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
     with plot_style():

@@ -20,8 +20,8 @@ from drake_teleop.common.files import make_folder, output_folder, write_json, wr
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison import delayed_contact, one_dof
-from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
+from drake_teleop.lab.comparison.report import decision_table
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel

@@ -16,8 +16,13 @@ from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning import search
-from drake_teleop.lab.tuning.press_trial import StationPressTrial, TunedSettings
-from drake_teleop.lab.tuning.stated_set import StatedSet, make_stated_set, without_task_and_method
+from drake_teleop.lab.tuning.press_trial import (
+    StatedSet,
+    StationPressTrial,
+    TunedSettings,
+    make_stated_set,
+    without_task_and_method,
+)
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 
