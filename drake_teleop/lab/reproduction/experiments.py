@@ -33,30 +33,23 @@ _CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
 
 @dataclass(frozen=True, eq=False)
 class MotionRun:
-    """Recorded movement.
-
-    `scaled_wrenches`: sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave.
-    That of sigma = 1 is the measured wrench without offsets, that of 0 the contact wrench.
-    """
+    """Recorded movement, with the load's wrench scaled."""
 
     scenario: Scenario
     result: SimulationResult
+    #: Sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave. 1: measured wrench
+    #: without offsets; 0: calculated contact wrench.
     scaled_wrenches: dict[float, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class IdealSensorRun:
-    """Free movement with exact wrench and motion instead of sensor readings.
+    """Free movement with exact wrench and motion instead of sensor readings."""
 
-    Attributes:
-        weld_reaction: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So.
-        sensor_motion: specific force, angular velocity and angular acceleration of S, (N, 3) each.
-        phi: (10,) true load.
-    """
-
-    weld_reaction: Array
+    weld_reaction: Array  #: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So
+    #: Specific force, angular velocity and angular acceleration of S, (N, 3) each.
     sensor_motion: tuple[Array, Array, Array]
-    phi: Array
+    phi: Array  #: (10,) true load
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,20 +34,14 @@ _NOT_REPORTED = "not reported"
 
 @dataclass(frozen=True)
 class Comparison:
-    """Row that compares paper and reproduction.
-
-    Args:
-        set_or_found: "set" if the scenario was chosen to match the paper's value; else "found".
-        accepted_range: accepted range as text; empty if the value is not comparable.
-        is_accepted: True if the value is accepted; None if it is not comparable.
-    """
+    """Row that compares paper and reproduction."""
 
     quantity: str
     paper_value: str
     reproduced_value: str
-    set_or_found: str
-    accepted_range: str
-    is_accepted: bool | None
+    set_or_found: str  #: "set" if the scenario was chosen to match the paper's value; else "found"
+    accepted_range: str  #: as text; empty if the value is not comparable
+    is_accepted: bool | None  #: None if the value is not comparable
 
     @property
     def verdict(self) -> str:

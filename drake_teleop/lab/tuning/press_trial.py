@@ -58,15 +58,10 @@ GIVEN_SETTINGS_NAME = "as given"
 
 @dataclass(frozen=True)
 class TaskRequirements:
-    """Requirements of a task.
+    """Requirements of a task."""
 
-    Args:
-        loop_gain_margin: factor of the loop gain that must still be stable.
-        min_low_pass_hz: lowest bandwidth of the sensor; a lower one delays the contact force.
-    """
-
-    loop_gain_margin: float
-    min_low_pass_hz: float
+    loop_gain_margin: float  #: factor of the loop gain that must still be stable
+    min_low_pass_hz: float  #: lowest bandwidth of the sensor; a lower one delays the contact force
 
 
 REQUIREMENTS_OF_TASK = {
@@ -79,17 +74,11 @@ REQUIREMENTS_OF_TASK = {
 
 @dataclass(frozen=True)
 class StatedSet:
-    """Hands, walls and task for which the settings must hold.
+    """Hands, walls and task for which the settings must hold."""
 
-    Args:
-        hands: names of all grips from the softest to the firmest.
-        walls: lowest and highest stiffness [N/m].
-        task: key of `REQUIREMENTS_OF_TASK`.
-    """
-
-    hands: tuple[str, ...]
-    walls: tuple[float, float]
-    task: str
+    hands: tuple[str, ...]  #: names of all grips from the softest to the firmest
+    walls: tuple[float, float]  #: lowest and highest stiffness [N/m]
+    task: str  #: key of `REQUIREMENTS_OF_TASK`
 
     @property
     def corners(self) -> list[tuple[str, float]]:
@@ -206,18 +195,12 @@ def settings_from_values(values: FactorValues) -> TunedSettings:
 
 @dataclass(frozen=True)
 class StationPressTrial:
-    """Function that a study runs: one press in the whole station.
+    """Function that a study runs: one press in the whole station."""
 
-    Args:
-        user_scenario: scenario of the user, with its own passivity and scales.
-        base_scenario: the same without environment, task and passivity method.
-        load_estimate: (16,) [offsets, phi].
-    """
-
-    user_scenario: Scenario
-    base_scenario: Scenario
+    user_scenario: Scenario  #: with the user's passivity and scales
+    base_scenario: Scenario  #: the same without environment, task and passivity method
     stated_set: StatedSet
-    load_estimate: Array
+    load_estimate: Array  #: (16,) [offsets, phi]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
@@ -258,14 +241,11 @@ class StationPressTrial:
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Function that a study runs: the largest gamma that is stable in one axis at all corners.
-
-    `gamma_upper_bounds`: low-pass [Hz] -> largest tried gamma.
-    """
+    """Function that a study runs: the largest gamma that is stable in one axis at all corners."""
 
     base_scenario: Scenario
     stated_set: StatedSet
-    gamma_upper_bounds: dict[float, float]
+    gamma_upper_bounds: dict[float, float]  #: low-pass [Hz] -> largest tried gamma
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})

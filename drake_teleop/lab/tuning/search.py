@@ -41,20 +41,15 @@ RunStudy = Callable[[str, Study, Any], list[Row]]
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of the search.
-
-    Attributes:
-        searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
-        given_runs: runs of the user's settings at the stiffest wall.
-        inside_runs: runs in the stated set: gamma times margin, then gamma at the stiffest wall.
-        beyond_runs: runs with a larger gamma, then at stiffer walls.
-    """
+    """Result of the search."""
 
     settings: TunedSettings
+    #: Tried settings in one axis, with the predicted `threshold_N` and `gamma`.
     searched_settings: list[Row]
-    given_runs: list[Row]
+    given_runs: list[Row]  #: runs of the user's settings at the stiffest wall
+    #: Runs in the stated set: gamma times margin, then gamma at the stiffest wall.
     inside_runs: list[Row]
-    beyond_runs: list[Row]
+    beyond_runs: list[Row]  #: runs with a larger gamma, then at stiffer walls
 
 
 def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
