@@ -41,8 +41,7 @@ from drake_teleop.lab.tuning.press_trial import (
     settings_from_values,
     without_task_and_method,
 )
-from drake_teleop.lab.tuning.search import meets_requirements
-from drake_teleop.lab.tuning.tune import tune
+from drake_teleop.lab.tuning.tune import meets_requirements, tune
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 

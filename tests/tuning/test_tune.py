@@ -17,7 +17,8 @@ from drake_teleop.lab.comparison.delayed_contact import (
     leaf_thickness,
 )
 from drake_teleop.lab.comparison.one_dof import RunMeasures
-from drake_teleop.lab.tuning import press_trial, search
+from drake_teleop.lab.tuning import press_trial
+from drake_teleop.lab.tuning import tune as search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
     OneAxisGammaSearch,
@@ -28,8 +29,7 @@ from drake_teleop.lab.tuning.press_trial import (
     rms_above_hz,
     without_task_and_method,
 )
-from drake_teleop.lab.tuning.search import meets_requirements, search_settings
-from drake_teleop.lab.tuning.tune import tune
+from drake_teleop.lab.tuning.tune import meets_requirements, search_settings, tune
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +19,12 @@ from drake_teleop.lab.identification import (
     true_load,
 )
 from drake_teleop.lab.reproduction import experiments, report
-from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
+from drake_teleop.lab.reproduction.figures import (
+    FORCE_Z_INDEX,
+    TORQUE_X_INDEX,
+    contact_figure,
+    scaling_figure,
+)
 from drake_teleop.station.replay import write_replay
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.scenario_reference import write_scenario
@@ -28,7 +32,6 @@ from drake_teleop.station.simulation import MakeSimulator, advance_without_garba
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
-_FORCE_Z_INDEX, _TORQUE_X_INDEX = 2, 3
 _NUM_TIMINGS, _SIMULATED_TIME_PER_TIMING_S = 11, 0.1  # simulated time of one measurement [s]
 
 
@@ -58,14 +61,19 @@ def reproduce_command(
         contact_run = experiments.simulate_contact(contact, estimate, stage)
         measure_free_run = experiments.peaks_and_residuals_of_free_run
         summary = {
-            "free_force": measure_free_run(force_run, _FORCE_Z_INDEX, "N"),
-            "free_torque": measure_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
+            "free_force": measure_free_run(force_run, FORCE_Z_INDEX, "N"),
+            "free_torque": measure_free_run(torque_run, TORQUE_X_INDEX, "Nm"),
             "ideal": experiments.wrench_errors_of_ideal_run(ideal_run),
             "contact": experiments.detection_and_peaks_of_contact_run(contact_run),
             "identification": experiments.errors_of_identification(load, force),
         }
         session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
-        pictures = draw_figures(force_run, torque_run, contact_run, summary)
+        detected_s = summary["contact"]["detected_s"]
+        pictures = {
+            "fig6": scaling_figure(force_run, FORCE_Z_INDEX, symbol="$f_z$", unit="N"),
+            "fig7": scaling_figure(torque_run, TORQUE_X_INDEX, symbol=r"$\tau_x$", unit="N m"),
+            "fig8": contact_figure(contact_run, detected_s),
+        }
         runs = dict(zip(names, (force_run, torque_run, contact_run.touched), strict=True))
         runs["contact_transition_without_sheet"] = contact_run.free
         written = stage("Write figures, replay and report")
@@ -77,39 +85,6 @@ def reproduce_command(
     if not quiet:
         _print_comparison(report.compare_with_paper(report.values_by_full_name(summary)), out)
     return summary | session
-
-
-def draw_figures(
-    force: experiments.MotionRun,
-    torque: experiments.MotionRun,
-    contact: experiments.RunsWithAndWithoutContact,
-    summary: experiments.NamedValues,
-) -> dict[str, Figure]:
-    pictures = {
-        name: scaling_figure(
-            run.result.t,
-            [run.scaled_wrenches[sigma][:, component] for sigma in experiments.SIGMAS],
-            experiments.SIGMAS,
-            symbol=symbol,
-            unit=unit,
-            downscaling=1 / run.scenario.force_scaling.force_scale,
-        )
-        for name, run, component, symbol, unit in (
-            ("fig6", force, _FORCE_Z_INDEX, "$f_z$", "N"),
-            ("fig7", torque, _TORQUE_X_INDEX, r"$\tau_x$", "N m"),
-        )
-    }
-    detected = summary["contact"]["detected_s"]
-    pictures["fig8"] = contact_figure(
-        contact.touched.result.t,
-        *(contact.touched.scaled_wrenches[sigma][:, _FORCE_Z_INDEX] for sigma in (1.0, 0.0)),
-        symbol="$f_z$",
-        contact=contact.in_contact,
-        detected_s=math.nan if detected is None else detected,
-        threshold=contact.threshold_N,
-        turning_s=experiments.time_of_largest_raw_force_after_contact(contact),
-    )
-    return pictures
 
 
 def _measure_simulation_speed(progress: UpdateProgress) -> experiments.NamedValues:
