@@ -21,7 +21,6 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison import delayed_contact, one_dof
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
-from drake_teleop.lab.comparison.report import decision_table
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
@@ -90,6 +89,11 @@ def compare_command(
         "one_dof": limits,
         "covering": covering,
     }
+    # Workers import this module without matplotlib and polars.
+    import polars as pl
+
+    from drake_teleop.lab.comparison.report import decision_table, print_tables, write_report
+
     summary["decision"] = [
         {
             "method": method,
@@ -101,10 +105,6 @@ def compare_command(
         }
         for (method, network), cell in decision_table(summary).items()
     ]
-    import polars as pl
-
-    from drake_teleop.lab.comparison.report import print_tables, write_report
-
     with output_folder(out):
         write_table(out / "runs.parquet", pl.DataFrame(runs, infer_schema_length=None))
         write_report(summary, traces, out)
@@ -192,27 +192,23 @@ def _run_while_stable(
 def _run_one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
-    cases = list(itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS))
+    cases = [
+        {"method": method, "wall_N_per_m": wall, "jitter": jitter, "loss": loss}
+        for method in methods
+        for wall, (jitter, loss) in itertools.product(WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
+    ]
     # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], one_dof.OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
-    seeds = range(seed, seed + 2)
-    runs = [
-        (method, one_dof.OneDof(wall_stiffness=wall), *impairment, seeds)
-        for method, wall, impairment in cases
-    ]
+    runs = []
+    for method, wall, *impairment in map(dict.values, cases):
+        runs.append((method, one_dof.OneDof(wall_stiffness=wall), *impairment, [seed, seed + 1]))
     found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
+    grid = list(ROUND_TRIPS_S)
     return [
-        {
-            "method": method,
-            "wall_N_per_m": wall,
-            "jitter": jitter,
-            "loss": loss,
-            "longest_s": longest,
-            "grid_s": list(ROUND_TRIPS_S),
-        }
-        for (method, wall, (jitter, loss)), longest in zip(cases, found, strict=True)
+        case | {"longest_s": longest, "grid_s": grid}
+        for case, longest in zip(cases, found, strict=True)
     ]
 
 
