@@ -105,14 +105,8 @@ class StatedSet:
 
 def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
     """Return the set of these grips, walls [kN/m] and this task."""
-    for what, names, known in (
-        ("hands", hands, tuple(GRIP_IMPEDANCES)),
-        ("task", (task,), tuple(REQUIREMENTS_OF_TASK)),
-    ):
-        for name in names:
-            if name not in known:
-                remedy = suggest_name(name, known, f"choose among {', '.join(known)}")
-                raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
+    _check_names("hands", hands, tuple(GRIP_IMPEDANCES))
+    _check_names("task", [task], tuple(REQUIREMENTS_OF_TASK))
     if not hands:
         raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
     if not walls:
@@ -120,13 +114,20 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
         raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
     for wall in walls:
         if not _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M:
-            limits = f"{_MIN_WALL_N_M / 1e3:g} to {_MAX_WALL_N_M / 1e3:g} kN/m"
-            what = f"{wall:g} kN/m is outside {limits}"
+            lowest, highest = _MIN_WALL_N_M / 1e3, _MAX_WALL_N_M / 1e3
+            what = f"{wall:g} kN/m is outside {lowest:g} to {highest:g} kN/m"
             raise DrakeTeleopError(what, where="walls", remedy="give stiffnesses in kN/m")
     grips = list(GRIP_IMPEDANCES)
-    places = sorted(map(grips.index, hands))
-    between = tuple(grips[places[0] : places[-1] + 1])
+    places = list(map(grips.index, hands))
+    between = tuple(grips[min(places) : max(places) + 1])
     return StatedSet(between, (1e3 * min(walls), 1e3 * max(walls)), task)
+
+
+def _check_names(where: str, names: Sequence[str], known: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in known:
+            remedy = suggest_name(name, known, f"choose among {', '.join(known)}")
+            raise DrakeTeleopError(f"'{name}' is unknown", where=where, remedy=remedy)
 
 
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
@@ -134,10 +135,8 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
 
     `network` is a preset; None keeps the scenario's network.
     """
-    if network is not None and network not in PRESETS:
-        remedy = suggest_name(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
-        raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
     if network is not None:
+        _check_names("network", [network], tuple(PRESETS))
         scenario = replace(scenario, channel=Channel(network=network))
     if scenario.has_no_network_or_passivity:
         what = "the scenario has neither network nor passivity method"
@@ -208,11 +207,10 @@ class StationPressTrial:
         if values["method"] != GIVEN_SETTINGS_NAME:
             scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
-        channel = self.base_scenario.channel
+        channel, passivity = self.base_scenario.channel, scenario.passivity
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         depth = renderable_press_depth(self.base_scenario, grip)
-        method = scenario.passivity
-        setup, _ = delayed_contact(scenario, channel, method, wall, task=task, depth=depth)
+        setup, _ = delayed_contact(scenario, channel, passivity, wall, task=task, depth=depth)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
@@ -258,25 +256,19 @@ class OneAxisGammaSearch:
         shares: dict[float, float] = {}
 
         def stability_sign(log_gamma: float) -> float:
-            gamma, share = float(np.exp(log_gamma)), np.inf
+            tried, found = dataclasses.replace(settings, gamma=float(np.exp(log_gamma))), []
             for corner in self.stated_set.corners:
-                tried = dataclasses.replace(settings, gamma=gamma)
-                found = self.share_in_one_axis(axis, tried, *corner, seed)
-                share = min(share, found)
-                if not is_share_accepted(found, MAX_TUNED_FORCE_ERROR):
+                found.append(self.share_in_one_axis(axis, tried, *corner, seed))
+                if not is_share_accepted(found[-1], MAX_TUNED_FORCE_ERROR):
                     return -1.0
-            shares[gamma] = share
+            shares[tried.gamma] = min(found)
             return 1.0
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
-        limit = high
-        if stability_sign(high) < 0:
-            limit = -np.inf
-            if stability_sign(low) > 0:
-                limit = bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
-        gamma = max((g for g in shares if g <= np.exp(limit) * 1.001), default=0.0)
-        share = shares.get(gamma, 0.0)
-        return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
+        if stability_sign(high) < 0 < stability_sign(low):
+            bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
+        gamma = max(shares, default=0.0)
+        return {"gamma_limit": gamma, "linear_limit": linear, "share": shares.get(gamma, 0.0)}
 
     def _linear_gamma_limit(self, axis: OneAxis, settings: TunedSettings) -> float:
         sampling = sampling_of_scenario(self.base_scenario)
