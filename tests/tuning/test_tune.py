@@ -11,12 +11,12 @@ import pytest
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.comparison.delayed_contact import (
+from drake_teleop.lab.comparison.one_dof import RunMeasures
+from drake_teleop.lab.comparison.whole_station import (
     _slave_height_and_rotation,
     delayed_contact,
     leaf_thickness,
 )
-from drake_teleop.lab.comparison.one_dof import RunMeasures
 from drake_teleop.lab.tuning import press_trial
 from drake_teleop.lab.tuning import tune as search
 from drake_teleop.lab.tuning.press_trial import (

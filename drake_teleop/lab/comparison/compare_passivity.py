@@ -1,6 +1,6 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies: the whole station presses on sheet springs (`delayed_contact`), a hand lets go and
+Three studies: the whole station presses on sheet springs (`whole_station`), a hand lets go and
 taps (`release_and_taps`), and the longest stable round trip (`one_dof`).
 """
 
@@ -19,7 +19,7 @@ from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.comparison import delayed_contact, one_dof
+from drake_teleop.lab.comparison import one_dof, whole_station
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
@@ -150,13 +150,13 @@ def simulate_press(
     names = [entry.name for entry in dataclasses.fields(one_dof.RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     channel, passivity = Channel(network=network), PassivityConfig(method=method)
-    setup, task = delayed_contact.delayed_contact(scenario, channel, passivity, leaf)
+    setup, task = whole_station.delayed_contact(scenario, channel, passivity, leaf)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    shown = delayed_contact.force_and_energy_traces(result, setup)
+    shown = whole_station.force_and_energy_traces(result, setup)
     held = task.is_held(shown["t"])
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
@@ -182,7 +182,7 @@ def _run_while_stable(
         end = 1e-3 * round(1e3 * (settle + part.end))  # exactly at the event
         simulation.advance_without_garbage_collection(simulator, end)
         result = simulation.read_recorded_signals(simulator, settle)
-        found = delayed_contact.figures_of_station_run(result, scenario, part)
+        found = whole_station.figures_of_station_run(result, scenario, part)
         if not found.stable:
             break
     # Without rest in the hold the drift is not defined.
@@ -230,10 +230,10 @@ def _run_station_study(
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
-    cases = list(itertools.product(slowest, delayed_contact.LEAF_THICKNESSES_M, methods))
+    cases = list(itertools.product(slowest, whole_station.LEAF_THICKNESSES_M, methods))
     runs = [(base, method, network, leaf, estimate) for network, leaf, method in cases]
     results = _run_in_processes(simulate_press, runs, jobs, stage("The whole station"))
-    leaves = list(delayed_contact.LEAF_THICKNESSES_M)
+    leaves = list(whole_station.LEAF_THICKNESSES_M)
     rows = [row for row, _ in results]
     rows.sort(key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])))
     traces = {

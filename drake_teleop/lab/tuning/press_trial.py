@@ -18,8 +18,8 @@ from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_l
 from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.comparison import one_dof
-from drake_teleop.lab.comparison.delayed_contact import delayed_contact, figures_of_station_run
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
+from drake_teleop.lab.comparison.whole_station import delayed_contact, figures_of_station_run
 from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
