@@ -38,6 +38,7 @@ HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
+TAP_RATES_HZ = (1.0, 1.5)  #: Hz
 WRIST_TO_TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest position, intended depth
 

@@ -14,8 +14,7 @@ from matplotlib.patches import Rectangle
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
-from drake_teleop.lab.comparison.one_dof import WRIST_TO_TIP_DISTANCE_M
-from drake_teleop.lab.comparison.release_and_taps import TAP_RATES_HZ
+from drake_teleop.lab.comparison.one_dof import TAP_RATES_HZ, WRIST_TO_TIP_DISTANCE_M
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N
 
