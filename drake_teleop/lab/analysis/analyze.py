@@ -139,11 +139,11 @@ def _analyze_in_stages(
         measured(1.0)
     summary = to_json_data(summary)
     summary["verdict"] = report.verdict_sentences(summary)
-    closed_form, nyquist = two_port.hybrid_matrix(axis, S_AT_OMEGA), {}
+    nyquist = {}
     for grip in GRIP_IMPEDANCES:
         loop = cut_loop.cut_loop(axis_with_grip(contact, grip), sampling)
         nyquist[grip] = -cut_loop.loop_response(loop, OMEGA, axis.delay)
-    return summary, report.ReportCurves(contact, OMEGA, H, closed_form, nyquist, maps)
+    return summary, report.ReportCurves(contact, OMEGA, H, nyquist, maps)
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:

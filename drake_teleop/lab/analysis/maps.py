@@ -106,13 +106,9 @@ def _axis_and_loop_with_values(
 ) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():
         if name == RATE_NAME:
-            factor = value / sampling.hand_hz
-            sampling = replace(
-                sampling,
-                hand_hz=value,
-                joint_control_hz=factor * sampling.joint_control_hz,
-                sensor_hz=factor * sampling.sensor_hz,
-            )
+            factor, others = value / sampling.hand_hz, ("joint_control_hz", "sensor_hz")
+            rates = {other: factor * getattr(sampling, other) for other in others}
+            sampling = replace(sampling, hand_hz=value, **rates)
         elif name == "low_pass_hz":
             sampling = replace(sampling, low_pass_hz=value)
         else:

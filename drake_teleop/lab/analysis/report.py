@@ -37,7 +37,6 @@ class ReportCurves:
     axis: OneAxis  #: in contact with the wall
     omega: Array  #: (n,) [rad/s]
     H: Complex  #: (n, 2, 2) two-port of the Diagram, without the hand's mass
-    closed_form: Complex  #: (n, 2, 2) two-port of the one-axis model
     nyquist: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
     maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
 
@@ -93,6 +92,7 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
     wall = f"wall of {curves.axis.wall_stiffness / 1e3:.3g} kN/m"
     environments = {"free motion": np.zeros_like(s), wall: environment_impedance(curves.axis, s)}
+    closed_form = two_port.hybrid_matrix(curves.axis, s)
     with plot_style():
         figure = Picture(figsize=(9.0, 5.4))
         grid = figure.subplots(2, 2, sharex=True, sharey="row")
@@ -104,10 +104,10 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
 
         for column, (name, environment) in enumerate(environments.items()):
             ideal = two_port.ideal_impedance(curves.axis, s, environment)
-            closed_form = two_port.transmitted_impedance(curves.closed_form, environment)
+            one_axis = two_port.transmitted_impedance(closed_form, environment)
             linear = two_port.transmitted_impedance(curves.H, environment)
             draw(column, hertz, ideal, "ideal", color=GREY, linestyle="--", linewidth=1.0)
-            draw(column, hertz, closed_form, "closed form", color=COLOURS[3], linewidth=2.4)
+            draw(column, hertz, one_axis, "closed form", color=COLOURS[3], linewidth=2.4)
             draw(column, hertz, linear, "Diagram, linearised", color=COLOURS[0], linewidth=1.1)
             grid[0, column].set_title(name)
             grid[1, column].set_xlabel("frequency [Hz]")
