@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.reproduction.experiments import MotionRun, RunsWithAndWithoutContact
-from drake_teleop.lab.reproduction.figures import FORCE_Z_INDEX, contact_figure, scaling_figure
+from drake_teleop.lab.reproduction.report import FORCE_Z_INDEX, contact_figure, scaling_figure
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.signals import SIGNALS
@@ -32,7 +32,7 @@ def motion_run(wrenches, t=T, touched=0 * T):
 
 def scaling(t=T):
     run = motion_run({1.0: RAW, 0.5: 0.5 * RAW, 0.0: 0.01 * RAW}, t)
-    return scaling_figure(run, FORCE_Z_INDEX, symbol="$f_z$", unit="N")
+    return scaling_figure(run, FORCE_Z_INDEX, "$f_z$", "N")
 
 
 def contact(touched=TOUCHED, detected_s=0.225):

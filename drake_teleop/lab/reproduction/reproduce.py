@@ -19,12 +19,6 @@ from drake_teleop.lab.identification import (
     true_load,
 )
 from drake_teleop.lab.reproduction import experiments, report
-from drake_teleop.lab.reproduction.figures import (
-    FORCE_Z_INDEX,
-    TORQUE_X_INDEX,
-    contact_figure,
-    scaling_figure,
-)
 from drake_teleop.station.replay import write_replay
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.scenario_reference import write_scenario
@@ -61,8 +55,8 @@ def reproduce_command(
         contact_run = experiments.simulate_contact(contact, estimate, stage)
         measure_free_run = experiments.peaks_and_residuals_of_free_run
         summary = {
-            "free_force": measure_free_run(force_run, FORCE_Z_INDEX, "N"),
-            "free_torque": measure_free_run(torque_run, TORQUE_X_INDEX, "Nm"),
+            "free_force": measure_free_run(force_run, report.FORCE_Z_INDEX, "N"),
+            "free_torque": measure_free_run(torque_run, report.TORQUE_X_INDEX, "Nm"),
             "ideal": experiments.wrench_errors_of_ideal_run(ideal_run),
             "contact": experiments.detection_and_peaks_of_contact_run(contact_run),
             "identification": experiments.errors_of_identification(load, force),
@@ -70,9 +64,9 @@ def reproduce_command(
         session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
         detected_s = summary["contact"]["detected_s"]
         pictures = {
-            "fig6": scaling_figure(force_run, FORCE_Z_INDEX, symbol="$f_z$", unit="N"),
-            "fig7": scaling_figure(torque_run, TORQUE_X_INDEX, symbol=r"$\tau_x$", unit="N m"),
-            "fig8": contact_figure(contact_run, detected_s),
+            "fig6": report.scaling_figure(force_run, report.FORCE_Z_INDEX, "$f_z$", "N"),
+            "fig7": report.scaling_figure(torque_run, report.TORQUE_X_INDEX, r"$\tau_x$", "N m"),
+            "fig8": report.contact_figure(contact_run, detected_s),
         }
         runs = dict(zip(names, (force_run, torque_run, contact_run.touched), strict=True))
         runs["contact_transition_without_sheet"] = contact_run.free
