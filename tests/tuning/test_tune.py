@@ -20,13 +20,12 @@ from drake_teleop.lab.comparison.whole_station import (
 from drake_teleop.lab.tuning import press_trial
 from drake_teleop.lab.tuning import tune as search
 from drake_teleop.lab.tuning.press_trial import (
-    MAX_REST_FORCE_N,
     OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
     make_stated_set,
     renderable_press_depth,
-    rms_above_hz,
+    rms_above_5_hz,
     without_task_and_method,
 )
 from drake_teleop.lab.tuning.tune import meets_requirements, search_settings, tune
@@ -35,6 +34,7 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.operator.perception import Perception
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -134,9 +134,9 @@ def test_firm_grip_presses_less_deeply_with_a_weak_device():
 def test_only_force_above_5_hz_counts_as_oscillation():
     t = np.arange(800) * 1e-3
     slow, fast = np.sin(2 * np.pi * 1.25 * t), 0.3 * np.sin(2 * np.pi * 40.0 * t)
-    assert rms_above_hz(slow, 1e-3, 5.0) < 0.05
-    assert rms_above_hz(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
-    assert rms_above_hz(np.full(800, np.nan), 1e-3, 5.0) == np.inf
+    assert rms_above_5_hz(slow, 1e-3) < 0.05
+    assert rms_above_5_hz(slow + fast, 1e-3) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+    assert rms_above_5_hz(np.full(800, np.nan), 1e-3) == np.inf
 
 
 @pytest.mark.parametrize(

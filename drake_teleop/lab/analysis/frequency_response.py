@@ -102,10 +102,8 @@ class StationResponse:
         felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
         # The force noise is about equal at all lines, so that the weights are the accelerations.
         acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
-        powers = (omega[:, None] / omega[-1]) ** [0, 2]
         mass = (felt / (1j * omega)).real
-        weighted = acceleration[:, None] * powers
-        return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
+        return float(np.polyfit((omega / omega[-1]) ** 2, mass, 1, w=acceleration)[1])
 
 
 def measure_frequency_response(

@@ -26,6 +26,7 @@ from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.tdpa import charged_tdpa_config
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
@@ -33,9 +34,6 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
-MAX_REST_FORCE_N = 0.05
-"""Rms of the rendered force above `MIN_REST_FORCE_FREQUENCY_HZ` that is accepted at rest [N]."""
-MIN_REST_FORCE_FREQUENCY_HZ = 5.0
 MAX_RENDERED_FORCE_ERROR = 0.1
 """Largest accepted error of the rendered force, as a share of the scaled contact force."""
 MAX_TUNED_FORCE_ERROR = 0.075
@@ -223,7 +221,7 @@ class StationPressTrial:
         free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
         force, period = result["force_to_master"], result.t[1] - result.t[0]
         forces = (force[hold, 2], *force[free, :3].T)
-        rest_force = max(rms_above_hz(f, period, MIN_REST_FORCE_FREQUENCY_HZ) for f in forces)
+        rest_force = max(rms_above_5_hz(f, period) for f in forces)
         share = found.rendered_share if np.isfinite(found.rendered_share) else 0.0
         human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
@@ -296,7 +294,7 @@ class OneAxisGammaSearch:
         filtered = dataclasses.replace(backward, delay=backward.delay + added)
         run = one_dof.run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
         found, force = one_dof.figures_of_run(run, model, task), run.hand_force[task.is_held(run.t)]
-        noise = rms_above_hz(force, run.t[1] - run.t[0], MIN_REST_FORCE_FREQUENCY_HZ)
+        noise = rms_above_5_hz(force, run.t[1] - run.t[0])
         return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 
 
@@ -327,12 +325,12 @@ def renderable_press_depth(base: Scenario, grip: str) -> float:
     return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
-def rms_above_hz(x: Array, period: float, frequency: float) -> float:
-    """Return the rms of x (N,) above a frequency [Hz], without parabola; inf for invalid x."""
+def rms_above_5_hz(x: Array, period: float) -> float:
+    """Return the rms of x (N,) above 5 Hz, without parabola; inf for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
-    # The cosine transform continues x evenly, so that slow motion stays below the frequency.
+    # The cosine transform continues x evenly, so that slow motion stays below 5 Hz.
     spectrum = dct(x - np.polyval(np.polyfit(t, x, 2), t), norm="ortho")
-    high = np.arange(len(x)) / (2 * len(x) * period) > frequency
+    high = np.arange(len(x)) / (2 * len(x) * period) > 5.0
     return float(np.sqrt(np.sum(spectrum[high] ** 2) / len(x)))

@@ -25,7 +25,8 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning import press_trial
-from drake_teleop.lab.tuning.press_trial import MAX_REST_FORCE_N, StationPressTrial, TunedSettings
+from drake_teleop.lab.tuning.press_trial import StationPressTrial, TunedSettings
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 
