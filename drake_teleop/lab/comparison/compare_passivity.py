@@ -260,7 +260,7 @@ def _run_one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = [
-        {"method": method, "wall_N_per_m": wall, "jitter": jitter, "loss": loss}
+        (method, wall, jitter, loss)
         for method in methods
         for wall, (jitter, loss) in itertools.product(WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
     ]
@@ -268,13 +268,15 @@ def _run_one_dof_study(
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
-    runs = []
-    for method, wall, *impairment in map(dict.values, cases):
-        runs.append((method, OneDof(wall_stiffness=wall), *impairment, [seed, seed + 1]))
+    seeds = [seed, seed + 1]
+    runs = [
+        (method, OneDof(wall_stiffness=wall), jitter, loss, seeds)
+        for method, wall, jitter, loss in cases
+    ]
     found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
-    grid = list(ROUND_TRIPS_S)
+    names, grid = ("method", "wall_N_per_m", "jitter", "loss"), list(ROUND_TRIPS_S)
     return [
-        case | {"longest_s": longest, "grid_s": grid}
+        dict(zip(names, case, strict=True)) | {"longest_s": longest, "grid_s": grid}
         for case, longest in zip(cases, found, strict=True)
     ]
 

@@ -81,12 +81,13 @@ def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgres
     """Simulate a movement and calculate the scaled wrench for each sigma."""
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation, progress=progress)
-    wrench, *motion = sensor_samples(result)
-    samples = wrench, estimate[:6], *motion
-    loads, scaled = (estimate[6:], np.zeros(10)), {}
+    wrench, s, omega, alpha = sensor_samples(result)
+    offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
+    scaled = {}
     for sigma in SIGMAS:
         scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}
-        scaled[sigma] = scaled_wrench(*samples, *loads, **scales)
+        parts = wrench, offsets, s, omega, alpha, phi, no_object
+        scaled[sigma] = scaled_wrench(*parts, **scales)
     return MotionRun(scenario, result, scaled)
 
 
