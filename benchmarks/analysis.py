@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from drake_teleop.lab.analysis import (
     absolute_stability,
-    transparency,
     two_port,
 )
 from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin, loop_response
@@ -326,9 +325,9 @@ def analyse(axis: OneAxis, omega: Array) -> None:
     H = two_port.hybrid_matrix(axis, s)
     wall = environment_impedance(axis, s)
     felt = two_port.transmitted_impedance(H, wall)
-    transparency.is_difference_noticed(felt, transparency.ideal_impedance(axis, s, wall))
-    transparency.fit_apparent_impedance(felt, omega)
-    transparency.transmitted_z_width(H)
+    two_port.is_difference_noticed(felt, two_port.ideal_impedance(axis, s, wall))
+    two_port.fit_apparent_impedance(felt, omega)
+    two_port.transmitted_z_width(H)
     scaled = two_port.scale_slave_power(H, two_port.power_ratio(axis))
     absolute_stability.llewellyn_criterion(H)
     absolute_stability.required_damping(H)

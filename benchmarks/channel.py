@@ -12,7 +12,7 @@ import argparse
 import json
 from pathlib import Path
 
-from drake_teleop.lab.reproduction.speed import (
+from drake_teleop.lab.reproduction.reproduce import (
     MakeSettledStationSimulator,
     cpu_time_per_simulated_second,
 )

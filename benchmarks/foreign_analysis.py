@@ -31,16 +31,18 @@ from inverse_kinematics import described
 from stations import ARMS
 
 from drake_teleop.lab.analysis.analyze import (
+    OMEGA,
     UNIT_VECTORS,
+    axis_with_grip,
     close_all_loops,
     close_other_directions,
     sampling_of_scenario,
+    stiffest_stable_walls,
 )
 from drake_teleop.lab.analysis.linear_model import Linearization
 from drake_teleop.lab.analysis.linearization import hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
-from drake_teleop.lab.analysis.summary_values import OMEGA, axis_with_grip, stiffest_stable_walls
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances
 from drake_teleop.lab.identification import slave_arm

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.comparison.compare_passivity import base_scenario
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND
-from drake_teleop.lab.comparison.station_accounts import (
+from drake_teleop.lab.comparison.whole_station import (
     start_energy,
     station_accounts,
     work_of_displayed_load_wrench,

@@ -1,7 +1,7 @@
 """Does `ledger` meet its criteria in the whole station, over what network, leaf, hand and sigma?
 
 `python benchmarks/ledger_in_station.py [--json FILE]` presses on a leaf as `compare-passivity` does
-(`lab.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs. Each has
+(`lab.comparison.whole_station`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs. Each has
 the station's noisy sensor and its identified load, or with `--ideal` an ideal sensor and the true
 load. `--network`, `--leaf`, `--grip`, `--sigma` choose some, `--method` another method.
 `--friction` is that of the arm's joints at the tool [N], `--damping` that of the leaf [N s/m]. The
@@ -34,13 +34,11 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from drake_teleop.lab.comparison.compare_passivity import base_scenario
-from drake_teleop.lab.comparison.delayed_contact import (
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
+from drake_teleop.lab.comparison.whole_station import (
     LEAF_THICKNESSES_M,
     delayed_contact,
     figures_of_station_run,
-)
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.lab.comparison.station_accounts import (
     start_energy,
     station_accounts,
     work_of_displayed_load_wrench,
@@ -48,6 +46,7 @@ from drake_teleop.lab.comparison.station_accounts import (
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
@@ -125,6 +124,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     estimate = true_load(base) if asked.ideal else identified_load(base, False).estimate
     passivity = PassivityConfig(method=asked.method)
     scenario, task = delayed_contact(base, Channel(network=network), passivity, leaf)
+    scenario = replace(scenario, sheet_spring__slip_speed=SheetSpring().slip_speed)
     if asked.friction > 0.0:
         # Friction stops a joint within 0.4 ms.
         scenario = replace(

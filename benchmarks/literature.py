@@ -90,10 +90,11 @@ def detection() -> dict[str, Any]:
     estimate = identified_load(scenario, False).estimate
     run = simulate_contact(scenario, estimate, lambda name: lambda done, words="": None)
     values, arm = detection_and_peaks_of_contact_run(run), slave_arm(scenario)
-    touched, free = (np.abs(residual(x, arm)) for x in (run.touched, run.free))
-    start = run.touched.t[np.argmax(run.contact)]
-    beyond = (touched > 1.5 * free.max(axis=0)).any(axis=1) & (run.touched.t >= start)
-    seen = float(run.touched.t[np.argmax(beyond)]) if beyond.any() else np.nan
+    touched, free = (np.abs(residual(x.result, arm)) for x in (run.touched, run.free))
+    t = run.touched.result.t
+    start = t[np.argmax(run.in_contact)]
+    beyond = (touched > 1.5 * free.max(axis=0)).any(axis=1) & (t >= start)
+    seen = float(t[np.argmax(beyond)]) if beyond.any() else np.nan
     ours = 1e3 * (values["detected_s"] - values["true_s"])
     observer = 1e3 * (seen - float(start))
     return {"ours_ms": ours, "observer_ms": observer, "sooner_%": 100.0 * (1.0 - ours / observer)}

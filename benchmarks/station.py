@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.lab.reproduction.speed import (
+from drake_teleop.lab.reproduction.reproduce import (
     MakeBarePlantSimulator,
     MakeSettledStationSimulator,
     cpu_time_per_simulated_second,

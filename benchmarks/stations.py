@@ -32,7 +32,10 @@ from station import against_the_port, fastest
 
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.lab.reproduction.speed import MakeBarePlantSimulator, MakeSettledStationSimulator
+from drake_teleop.lab.reproduction.reproduce import (
+    MakeBarePlantSimulator,
+    MakeSettledStationSimulator,
+)
 from drake_teleop.lab.run import run_scenario, summarise
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME, Master
 from drake_teleop.station.master.leader_model import Leader

@@ -37,11 +37,11 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     is_share_accepted,
+    make_stated_set,
     settings_from_values,
+    without_task_and_method,
 )
-from drake_teleop.lab.tuning.search import meets_requirements
-from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
-from drake_teleop.lab.tuning.tune import tune
+from drake_teleop.lab.tuning.tune import meets_requirements, tune
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
@@ -103,8 +103,9 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
         return not meets_requirements(trial(values | point, seed))
 
     def failing_share_in_axis(points: list[dict[str, Any]], gamma: float) -> float:
+        tried = dataclasses.replace(settings, gamma=gamma)
         shares = [
-            search.share_in_one_axis(axis, settings, gamma, p["hand"], p["wall"], 100 + k)
+            search.share_in_one_axis(axis, tried, p["hand"], p["wall"], 100 + k)
             for k, p in enumerate(points)
         ]
         return float(np.mean([not is_share_accepted(share) for share in shares]))

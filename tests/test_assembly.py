@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
-from drake_teleop.lab.comparison.station_accounts import station_accounts
+from drake_teleop.lab.comparison.whole_station import station_accounts
 from drake_teleop.load.contact.detection import NoiseFloor
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import STATE_OTHER_LOAD

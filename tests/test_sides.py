@@ -12,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, Leaf
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.comparison.delayed_contact import injected_energy
+from drake_teleop.lab.comparison.whole_station import injected_energy
 from drake_teleop.lab.identification import true_load
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.channel.channel import Channel

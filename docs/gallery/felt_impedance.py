@@ -14,8 +14,7 @@ import numpy as np
 import drake_teleop as dt
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
-from drake_teleop.lab.analysis.transparency import ideal_impedance
-from drake_teleop.lab.analysis.two_port import transmitted_impedance
+from drake_teleop.lab.analysis.two_port import ideal_impedance, transmitted_impedance
 
 axis = OneAxisFromScenario(dt.LoadScenario("contact_transition"), (0.0, 0.0, 1.0))
 omega = 2 * np.pi * np.geomspace(0.5, 100, 300)

@@ -9,7 +9,6 @@ from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis import analyze
-from drake_teleop.lab.analysis import summary_values as of_summary
 from drake_teleop.lab.analysis.maps import stability_map
 from drake_teleop.lab.analysis.report import print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction
@@ -24,7 +23,7 @@ PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 def coarse_maps():
     """Use coarse maps: test_maps.py tests them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(of_summary, "_POINTS_PER_MAP_AXIS", 12)
+        patch.setattr(analyze, "_POINTS_PER_MAP_AXIS", 12)
         yield
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.lab.analysis import transparency as tr
 from drake_teleop.lab.analysis import two_port as tp
 from drake_teleop.lab.analysis.one_axis import OneAxis, environment_impedance
 
@@ -46,21 +45,21 @@ def test_ideal_station_displays_the_ideal_impedance():
     values = {**AXIS.__dict__, "ideal_servo": True, "delay": 0.0, "mass_error": 0.0}
     axis = OneAxis(**values)
     H, wall = tp.hybrid_matrix(axis, S), environment_impedance(axis, S)
-    felt, ideal = tp.transmitted_impedance(H, wall), tr.ideal_impedance(axis, S, wall)
+    felt, ideal = tp.transmitted_impedance(H, wall), tp.ideal_impedance(axis, S, wall)
     np.testing.assert_allclose(felt, ideal, rtol=1e-11)
-    assert not np.any(tr.is_difference_noticed(felt, ideal))
+    assert not np.any(tp.is_difference_noticed(felt, ideal))
 
 
 def test_differences_above_the_weber_fraction_are_noticed():
     ideal = 2.0 + 3.0 * S
-    assert np.all(tr.is_difference_noticed(ideal * np.exp(1j * np.radians(-20)), ideal))
-    assert not np.any(tr.is_difference_noticed(1.22 * ideal, ideal))
-    assert np.all(tr.is_difference_noticed(1.24 * ideal, ideal))
+    assert np.all(tp.is_difference_noticed(ideal * np.exp(1j * np.radians(-20)), ideal))
+    assert not np.any(tp.is_difference_noticed(1.22 * ideal, ideal))
+    assert np.all(tp.is_difference_noticed(1.24 * ideal, ideal))
     # A station with a servo is near its ideal at low frequencies only.
     axis = OneAxis(sigma=0.5, wall_stiffness=1000.0)
     wall = environment_impedance(axis, S)
     felt = tp.transmitted_impedance(tp.hybrid_matrix(axis, S), wall)
-    near = tr.is_difference_noticed(felt, tr.ideal_impedance(axis, S, wall))
+    near = tp.is_difference_noticed(felt, tp.ideal_impedance(axis, S, wall))
     assert not np.any(near[OMEGA < 2.0])
     assert np.any(near[OMEGA > 10.0])
 
@@ -69,7 +68,7 @@ def test_apparent_mass_damping_and_stiffness():
     rng = np.random.default_rng(0)
     for _ in range(20):
         m, b, k = rng.uniform(-1, 3), rng.uniform(0, 50), rng.uniform(0, 5000)
-        fitted = tr.fit_apparent_impedance(m * S + b + k / S, OMEGA)
+        fitted = tp.fit_apparent_impedance(m * S + b + k / S, OMEGA)
         np.testing.assert_allclose(fitted, [m, b, k], rtol=1e-9, atol=1e-9)
 
 
@@ -77,19 +76,19 @@ def test_apparent_mass_damping_and_stiffness():
 def test_apparent_mass_in_free_motion_follows_the_scales(sigma):
     slow = 1j * np.linspace(0.5, 5.0, 50)
     axis = OneAxis(sigma=sigma, ideal_servo=True, mass_error=-0.1)
-    felt = tr.fit_apparent_impedance(tp.hybrid_matrix(axis, slow)[:, 0, 0], slow.imag)
+    felt = tp.fit_apparent_impedance(tp.hybrid_matrix(axis, slow)[:, 0, 0], slow.imag)
     error = (sigma - 1.0) * -0.1
     mass = axis.device_mass + (sigma * axis.tool_mass + error) / 17.5
     assert felt.mass == pytest.approx(mass, rel=1e-9)
     assert felt.damping == pytest.approx(axis.device_damping, rel=1e-9)
     # The lag of the servo adds damping from the tool.
-    real = tr.fit_apparent_impedance(tp.hybrid_matrix(OneAxis(sigma=1.0), slow)[:, 0, 0], slow.imag)
+    real = tp.fit_apparent_impedance(tp.hybrid_matrix(OneAxis(sigma=1.0), slow)[:, 0, 0], slow.imag)
     assert real.damping > axis.device_damping
     assert real.mass == pytest.approx(axis.device_mass + axis.tool_mass / 17.5, rel=0.02)
 
 
 def test_transmitted_width_agrees_with_solved_equations():
-    width = tr.transmitted_z_width(tp.hybrid_matrix(AXIS, S))
+    width = tp.transmitted_z_width(tp.hybrid_matrix(AXIS, S))
     np.testing.assert_allclose(
         width.free,
         solved("hand", 0.0, OneAxis(**{**AXIS.__dict__, "wall_damping": 0.0})),
@@ -101,18 +100,18 @@ def test_transmitted_width_agrees_with_solved_equations():
     )
     # At low frequency a rigid wall has the scaled stiffness of the servo.
     axis = OneAxis()
-    rigid = tr.transmitted_z_width(tp.hybrid_matrix(axis, np.array([1e-3j]))).rigid
+    rigid = tp.transmitted_z_width(tp.hybrid_matrix(axis, np.array([1e-3j]))).rigid
     spring = axis.slave_mass * axis.velocity_gain * axis.position_gain
     assert -rigid.imag * 1e-3 == pytest.approx(spring * axis.force_scale, rel=1e-6)
     assert np.all(
-        np.isinf(tr.transmitted_z_width(tp.hybrid_matrix(OneAxis(ideal_servo=True), S)).rigid)
+        np.isinf(tp.transmitted_z_width(tp.hybrid_matrix(OneAxis(ideal_servo=True), S)).rigid)
     )
 
 
 @pytest.mark.parametrize("stiffness", [0.0, 50.0, 5100.0, 1e6])
 def test_smallest_stiffness_change_differs_by_the_weber_fraction(stiffness):
     H = tp.hybrid_matrix(AXIS, S)
-    change = tr.smallest_stiffness_change(H, OMEGA, stiffness)
+    change = tp.smallest_stiffness_change(H, OMEGA, stiffness)
     found = np.isfinite(change)
     before = tp.transmitted_impedance(H, stiffness / S)
     for i in np.flatnonzero(found):
@@ -129,11 +128,11 @@ def test_smallest_stiffness_change_of_transparent_and_real_stations():
     direct = tp.two_port_matrix(0.0 * S, 1.0, -1.0, 0.0)
     for k in (10.0, 5100.0):
         np.testing.assert_allclose(
-            tr.smallest_stiffness_change(direct, OMEGA, k), 0.23 * k, rtol=1e-12
+            tp.smallest_stiffness_change(direct, OMEGA, k), 0.23 * k, rtol=1e-12
         )
     # The device's mass and damping add to the wall and may cancel part of it.
     axis, k = OneAxis(ideal_servo=True), 5100.0
-    change = tr.smallest_stiffness_change(tp.hybrid_matrix(axis, S), OMEGA, k)
+    change = tp.smallest_stiffness_change(tp.hybrid_matrix(axis, S), OMEGA, k)
     felt = axis.device_damping + 1j * (axis.device_mass * OMEGA - k / 17.5 / OMEGA)
     np.testing.assert_allclose(change, 0.23 * np.abs(felt) * OMEGA * 17.5, rtol=1e-9)
     # The servo's spring is in series with the wall: a stiffer one must change by more.
@@ -142,14 +141,14 @@ def test_smallest_stiffness_change_of_transparent_and_real_stations():
     for k in (5100.0, 200000.0):
         both = 1.23 / (1 / k + 1 / spring)
         stiffer = 1 / (1 / both - 1 / spring) - k
-        hidden = tr.smallest_stiffness_change(H, OMEGA, k)[0]
+        hidden = tp.smallest_stiffness_change(H, OMEGA, k)[0]
         assert hidden == pytest.approx(stiffer, rel=1e-3)
     # Above some stiffness no difference is detectable.
-    assert np.isinf(tr.smallest_stiffness_change(H, OMEGA, 5 * spring)[0])
+    assert np.isinf(tp.smallest_stiffness_change(H, OMEGA, 5 * spring)[0])
     # The softest detectable wall depends on the device's own impedance.
     w = 2 * np.pi
     axis = OneAxis(ideal_servo=True)
-    softest = tr.smallest_stiffness_change(
+    softest = tp.smallest_stiffness_change(
         tp.hybrid_matrix(axis, np.array([1j * w])), np.array([w]), 0.0
     )
     device = abs(axis.device_mass * 1j * w + axis.device_damping)

@@ -14,7 +14,7 @@ from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison import compare_passivity as study
-from drake_teleop.lab.comparison import delayed_contact
+from drake_teleop.lab.comparison import whole_station
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
 from drake_teleop.lab.comparison.report import RUN_COLUMNS, run_cells
 from drake_teleop.lab.identified_load import identified_load
@@ -30,8 +30,8 @@ pytestmark = pytest.mark.long
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALL_STIFFNESSES_N_M", (5100.0,))
     monkeypatch.setattr(study, "JITTER_AND_LOSS_PAIRS", ((0.0, 0.0),))
-    leaves = {"contact": delayed_contact.LEAF_THICKNESSES_M["contact"]}
-    monkeypatch.setattr(delayed_contact, "LEAF_THICKNESSES_M", leaves)
+    leaves = {"contact": whole_station.LEAF_THICKNESSES_M["contact"]}
+    monkeypatch.setattr(whole_station, "LEAF_THICKNESSES_M", leaves)
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study,
@@ -49,7 +49,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
         end=4.8,
         rest_window=0.6,
     )
-    monkeypatch.setattr(delayed_contact, "task_for_round_trip", lambda round_trip: task)
+    monkeypatch.setattr(whole_station, "task_for_round_trip", lambda round_trip: task)
     shipped = LoadScenario("contact_transition")
     monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))
     compare = study.compare_command  # in this process, which has the settings above

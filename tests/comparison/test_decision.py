@@ -7,11 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_teleop.lab.comparison import release_and_taps
-from drake_teleop.lab.comparison.decision import decision_table
+from drake_teleop.lab.comparison import compare_passivity
+from drake_teleop.lab.comparison.compare_passivity import simulate_release_and_taps
 from drake_teleop.lab.comparison.one_dof import ACTUAL
-from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
-from drake_teleop.lab.comparison.report import draw_decision_table, draw_energy, draw_force_traces
+from drake_teleop.lab.comparison.report import (
+    decision_table,
+    draw_decision_table,
+    draw_energy,
+    draw_force_traces,
+)
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 
@@ -98,10 +102,10 @@ def test_impulses_count_from_the_delay_of_one_way(monkeypatch):
             least_energy_sum=lambda place: -0.1 * place,
         )
 
-    monkeypatch.setattr(release_and_taps, "run_one_dof", run)
-    monkeypatch.setitem(release_and_taps.PRESETS, "late", NetworkConfig(delay=0.3))
-    monkeypatch.setattr(release_and_taps, "Channel", lambda **_: Channel())
-    monkeypatch.setattr(release_and_taps, "TAP_RATES_HZ", (1.5,))
+    monkeypatch.setattr(compare_passivity.one_dof, "run_one_dof", run)
+    monkeypatch.setitem(compare_passivity.PRESETS, "late", NetworkConfig(delay=0.3))
+    monkeypatch.setattr(compare_passivity, "Channel", lambda **_: Channel())
+    monkeypatch.setattr(compare_passivity, "TAP_RATES_HZ", (1.5,))
     found = simulate_release_and_taps("none", "late")
     assert found.tap_shares == pytest.approx((1.0,), abs=1e-9)
     assert found.leaked == pytest.approx(0.1 * ACTUAL)

@@ -9,7 +9,7 @@ import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.lab.comparison.station_accounts import (
+from drake_teleop.lab.comparison.whole_station import (
     start_energy,
     station_accounts,
     work_of_displayed_load_wrench,

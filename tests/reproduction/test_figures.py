@@ -7,27 +7,38 @@ import io
 import numpy as np
 import pytest
 
-from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
+from drake_teleop.lab.reproduction.experiments import MotionRun, RunsWithAndWithoutContact
+from drake_teleop.lab.reproduction.report import FORCE_Z_INDEX, contact_figure, scaling_figure
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.signals import SIGNALS
 
 T = np.linspace(0, 0.8, 801)
 RAW = 100 * np.sin(10 * T)
+TOUCHED = (T > 0.22) & (T < 0.26)
 
 
-def scaling(t=T, downscaling=17.5):
-    values = [RAW, 0.5 * RAW, 0.01 * RAW]
-    return scaling_figure(t, values, [1, 0.5, 0], symbol="$f_z$", unit="N", downscaling=downscaling)
+def vertical(force):
+    """Return a wrench (N, 6) with this f_z (N,)."""
+    return np.asarray(force, float)[:, np.newaxis] * np.eye(6)[FORCE_Z_INDEX]
 
 
-def contact(**changes):
-    touched = (T > 0.22) & (T < 0.26)
-    settings = {
-        "symbol": "$f_z$",
-        "contact": touched,
-        "detected_s": 0.225,
-        "threshold": 3.0,
-        "turning_s": 0.6,
-    }
-    return contact_figure(T, RAW + 20 * touched, 20.0 * touched, **(settings | changes))
+def motion_run(wrenches, t=T, touched=0 * T):
+    name = "true_contact_wrench_W"
+    result = SimulationResult(t, {name: vertical(touched)}, [SIGNALS[name]])
+    scaled = {sigma: vertical(force) for sigma, force in wrenches.items()}
+    return MotionRun(LoadScenario("free_motion_force"), result, scaled)
+
+
+def scaling(t=T):
+    run = motion_run({1.0: RAW, 0.5: 0.5 * RAW, 0.0: 0.01 * RAW}, t)
+    return scaling_figure(run, FORCE_Z_INDEX, "$f_z$", "N")
+
+
+def contact(touched=TOUCHED, detected_s=0.225):
+    with_contact = motion_run({1.0: RAW + 20 * touched, 0.0: 20.0 * touched}, touched=touched)
+    free = motion_run({1.0: RAW, 0.0: np.full(len(T), 2.0)})
+    return contact_figure(RunsWithAndWithoutContact(with_contact, free), detected_s)
 
 
 def render(figure) -> bytes:
@@ -80,16 +91,16 @@ def test_contact_is_shaded_and_marked():
         assert shade.get_x() + shade.get_width() == pytest.approx(259.0)
     marks = [(text.get_text(), text.xy[0]) for text in (*upper.texts, *lower.texts)]
     assert marks == [
-        ("no contact", 600.0),
+        ("no contact", pytest.approx(471.0)),
         ("contact", pytest.approx(221.0)),
-        ("no contact", 600.0),
+        ("no contact", pytest.approx(471.0)),
         ("detected", 225.0),
     ]
     assert "threshold 3.00 N" in lower.get_title("right")
 
 
 def test_figure_without_contact_has_no_contact_mark():
-    upper, lower = contact(contact=np.zeros(len(T), bool), turning_s=None).axes
+    upper, lower = contact(touched=0 * T).axes
     assert not upper.patches and not upper.texts
     assert [text.get_text() for text in lower.texts] == ["detected"]
 

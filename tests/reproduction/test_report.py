@@ -10,6 +10,8 @@ import pytest
 
 from drake_teleop.common.style import Picture
 from drake_teleop.lab.reproduction.experiments import (
+    MotionRun,
+    RunsWithAndWithoutContact,
     errors_of_identification,
     largest_raw_force_beyond_free_range,
     true_offsets_and_phi,
@@ -22,6 +24,7 @@ from drake_teleop.lab.reproduction.report import (
     parameter_rows,
     write_report,
 )
+from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 
 SUMMARY = {
@@ -188,12 +191,12 @@ def test_raw_force_is_beyond_its_free_range_on_either_side():
     free = np.outer(np.linspace(-1.0, 1.0, 10), [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
     measured = np.zeros((10, 6))
     measured[4] = [1.5, -2.75, 0.0, 9.0, 9.0, 9.0]
-    run = SimpleNamespace(
-        contact_result=SimpleNamespace(t=t),
-        in_contact=np.arange(10) == 4,
-        measured_wrench=measured,
-        measured_wrench_free=free,
-    )
+    touch = np.zeros((10, 6))
+    touch[4, 2] = 1.0
+    spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
+    result, scenario = SimulationResult(t, {spec.name: touch}, [spec]), LoadScenario("press")
+    runs = (MotionRun(scenario, result, {1.0: wrench}) for wrench in (measured, free))
+    run = RunsWithAndWithoutContact(*runs)
     beyond = largest_raw_force_beyond_free_range(run)
     np.testing.assert_allclose(beyond[:2], [0.5, 0.75])
     assert beyond[2] < 0.0

@@ -18,11 +18,13 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.reproduction import experiments, reproduce
 from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
+    MotionRun,
     RunsWithAndWithoutContact,
     detection_and_peaks_of_contact_run,
     largest_raw_force_beyond_free_range,
     peaks_and_residuals_of_free_run,
-    simulate_free_motion,
+    simulate_motion,
+    time_of_largest_raw_force_after_contact,
     wrench_errors_of_ideal_run,
 )
 from drake_teleop.lab.reproduction.report import (
@@ -30,7 +32,6 @@ from drake_teleop.lab.reproduction.report import (
     describe_unaccepted,
     values_by_full_name,
 )
-from drake_teleop.lab.run import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor_into
@@ -44,7 +45,7 @@ FORCE_SCALE = 1 / 17.5
 
 EXPERIMENTS = (
     "identify_load",
-    "simulate_free_motion",
+    "simulate_motion",
     "simulate_ideal_motion",
     "simulate_contact",
     "_measure_simulation_speed",
@@ -219,27 +220,26 @@ def motion() -> RunsWithAndWithoutContact:
     free[:, 2] = -30 + 70 * np.cos(2 * np.pi * (t - 0.05) / 0.38)
     residual = np.outer(np.sin(40 * t), force(0.0, 0.0, 0.5))
     touch = np.outer((t >= 0.22) & (t < 0.26), force(0.0, 0.0, 15.0))
+    return RunsWithAndWithoutContact(
+        motion_run(touch, free + touch + residual, touch + residual),
+        motion_run(0.0 * touch, free + residual, residual),
+    )
+
+
+def motion_run(touch: np.ndarray, measured: np.ndarray, calculated: np.ndarray) -> MotionRun:
+    t = 5e-4 * np.arange(len(touch))
     spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
     sheet = Signal("sheet_state", ("z", "v"), ("m", "m/s"))
-    result = SimulationResult(
-        t, {spec.name: touch, sheet.name: np.zeros((len(t), 2))}, [spec, sheet]
-    )
-    return RunsWithAndWithoutContact(
-        scenario=LoadScenario("contact_transition"),
-        contact_result=result,
-        free_result=result,
-        measured_wrench=free + touch + residual,
-        calculated_wrench=touch + residual,
-        measured_wrench_free=free + residual,
-        calculated_wrench_free=residual,
-        in_contact=is_in_contact(result),
-        threshold_N=0.75,
-    )
+    signals = {spec.name: touch, sheet.name: np.zeros((len(t), 2))}
+    wrenches = {1.0: measured, 0.0: calculated}
+    scenario = LoadScenario("contact_transition")
+    return MotionRun(scenario, SimulationResult(t, signals, [spec, sheet]), wrenches)
 
 
 def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
     figures = detection_and_peaks_of_contact_run(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
+    assert figures["threshold_N"] == pytest.approx(0.75, rel=1e-3)
     assert figures["raw_detectable"] is False
     assert np.all(largest_raw_force_beyond_free_range(motion) <= 0)
     assert figures["false_alarm_0_6_s"] is False
@@ -248,51 +248,44 @@ def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_raw_force_detects_contact_by_any_axis(motion, axis):
-    told = motion.measured_wrench.copy()
-    told[motion.in_contact, axis] += 180.0
-    figures = detection_and_peaks_of_contact_run(dataclasses.replace(motion, measured_wrench=told))
-    assert figures["raw_detectable"] is True
+    motion.touched.scaled_wrenches[1.0][motion.in_contact, axis] += 180.0
+    assert detection_and_peaks_of_contact_run(motion)["raw_detectable"] is True
 
 
 def test_raw_force_detects_contact_by_its_norm(motion):
     """Each component is inside its range, but not the norm."""
-    free, told = motion.measured_wrench_free.copy(), motion.measured_wrench.copy()
+    free, told = (one.scaled_wrenches[1.0] for one in (motion.free, motion.touched))
     free[:100, 0] = told[:100, 0] = 80.0
     told[motion.in_contact, 0] = 80.0
-    excess = largest_raw_force_beyond_free_range(
-        dataclasses.replace(motion, measured_wrench=told, measured_wrench_free=free)
-    )
+    excess = largest_raw_force_beyond_free_range(motion)
     assert np.all(excess[:3] <= 0)
     assert excess[3] > 0
 
 
 def test_crossing_at_the_second_reversal_is_a_false_alarm(motion):
-    calculated = motion.calculated_wrench.copy()
-    calculated[np.argmin(np.abs(motion.contact_result.t - 0.6)), 2] = 2.0
-    figures = detection_and_peaks_of_contact_run(
-        dataclasses.replace(motion, calculated_wrench=calculated)
-    )
-    assert figures["false_alarm_0_6_s"] is True
+    run = motion.touched
+    run.scaled_wrenches[0.0][np.argmin(np.abs(run.result.t - 0.6)), 2] = 2.0
+    assert detection_and_peaks_of_contact_run(motion)["false_alarm_0_6_s"] is True
 
 
 def test_contact_is_not_detected_without_elimination(motion):
-    largest = 1.5 * np.abs(motion.measured_wrench_free[:, 2]).max()
-    figures = detection_and_peaks_of_contact_run(
-        dataclasses.replace(motion, calculated_wrench=motion.measured_wrench, threshold_N=largest)
-    )
+    for one in (motion.touched, motion.free):
+        one.scaled_wrenches[0.0] = one.scaled_wrenches[1.0]
+    figures = detection_and_peaks_of_contact_run(motion)
     assert figures["detected_s"] is None
     assert np.isnan(values_by_full_name({"contact": figures})["contact.detected_s"])
 
 
 def test_contact_time_is_null_without_contact(motion):
-    nothing = np.zeros(len(motion.contact_result.t), dtype=bool)
-    figures = detection_and_peaks_of_contact_run(
-        dataclasses.replace(
-            motion, in_contact=nothing, calculated_wrench=motion.calculated_wrench_free
-        )
-    )
+    without = RunsWithAndWithoutContact(motion.free, motion.free)
+    figures = detection_and_peaks_of_contact_run(without)
     assert figures["true_s"] is figures["detected_s"] is None
     assert figures["raw_detectable"] is False
+    assert time_of_largest_raw_force_after_contact(without) is None
+
+
+def test_reversal_without_contact_has_the_largest_raw_force_after_contact(motion):
+    assert time_of_largest_raw_force_after_contact(motion) == pytest.approx(0.62, abs=0.01)
 
 
 def mutants_of_regressor():
@@ -385,7 +378,7 @@ def test_wrong_mass_increases_the_residual():
     )
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
-    motion = simulate_free_motion(scenario, estimate, lambda done: None)
+    motion = simulate_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled_wrenches) == SIGMAS
     figures = peaks_and_residuals_of_free_run(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)

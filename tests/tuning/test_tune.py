@@ -10,30 +10,31 @@ import pytest
 
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.one_axis import AxisParameters
-from drake_teleop.lab.comparison.delayed_contact import (
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.comparison.one_dof import RunMeasures
+from drake_teleop.lab.comparison.whole_station import (
     _slave_height_and_rotation,
     delayed_contact,
     leaf_thickness,
 )
-from drake_teleop.lab.comparison.one_dof import RunMeasures
-from drake_teleop.lab.tuning import press_trial, search
+from drake_teleop.lab.tuning import press_trial
+from drake_teleop.lab.tuning import tune as search
 from drake_teleop.lab.tuning.press_trial import (
-    MAX_REST_FORCE_N,
     OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
+    make_stated_set,
     renderable_press_depth,
-    rms_above_hz,
+    rms_above_5_hz,
+    without_task_and_method,
 )
-from drake_teleop.lab.tuning.search import meets_requirements, search_settings
-from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
-from drake_teleop.lab.tuning.tune import tune
+from drake_teleop.lab.tuning.tune import meets_requirements, search_settings, tune
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.operator.perception import Perception
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -133,9 +134,9 @@ def test_firm_grip_presses_less_deeply_with_a_weak_device():
 def test_only_force_above_5_hz_counts_as_oscillation():
     t = np.arange(800) * 1e-3
     slow, fast = np.sin(2 * np.pi * 1.25 * t), 0.3 * np.sin(2 * np.pi * 40.0 * t)
-    assert rms_above_hz(slow, 1e-3, 5.0) < 0.05
-    assert rms_above_hz(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
-    assert rms_above_hz(np.full(800, np.nan), 1e-3, 5.0) == np.inf
+    assert rms_above_5_hz(slow, 1e-3) < 0.05
+    assert rms_above_5_hz(slow + fast, 1e-3) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+    assert rms_above_5_hz(np.full(800, np.nan), 1e-3) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -239,12 +240,12 @@ UNEQUAL = Channel(delay=0.02, backward=NetworkConfig(delay=0.05))
 
 
 def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
-    monkeypatch.setattr(press_trial, "run_one_dof", capture_arguments)
+    monkeypatch.setattr(press_trial.one_dof, "run_one_dof", capture_arguments)
     one = trial()
     search_ = OneAxisGammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
-    tuned = TunedSettings("ledger", 1.0, 0.3, 100.0)
+    tuned = TunedSettings("ledger", 1.5, 0.3, 100.0)
     with pytest.raises(CapturedArguments) as found:
-        search_.share_in_one_axis(AxisParameters(), tuned, 1.5, "firm", 3000.0, 4)
+        search_.share_in_one_axis(OneAxis(), tuned, "firm", 3000.0, 4)
     (model, _, forward, backward), options = found.value.args
     assert forward.delay == 0.02 and backward.delay == pytest.approx(0.05 + 0.416 / 100.0)
     assert (model.hand_stiffness, model.wall_stiffness, model.gamma) == (700.0, 3000.0, 1.5)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
-from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
+from drake_teleop.lab.analysis.two_port import matrix_entries, two_port_matrix
 
 BooleanArray = NDArray[np.bool_]
 
@@ -141,10 +141,9 @@ class ImpedanceRange:
         return np.stack([b0 + 1j * low, b1 + 1j * low, b1 + 1j * high, b0 + 1j * high], -1)
 
     def contains(self, impedance: Complex, omega: Array) -> BooleanArray:
-        corners = self.corners(omega)
-        low, high, z = corners[..., 0], corners[..., 2], impedance
-        above = (z.real >= low.real) & (z.imag >= low.imag)
-        return above & (z.real <= high.real) & (z.imag <= high.imag)
+        corners, z = self.corners(omega), impedance
+        above, below = z - corners[..., 0], corners[..., 2] - z
+        return np.min([above.real, above.imag, below.real, below.imag], axis=0) >= 0
 
 
 def impedance_range_of_grips() -> ImpedanceRange:
@@ -162,30 +161,19 @@ def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
-    wall: Complex = np.zeros((), dtype=complex)
-    stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
-    dz = np.roll(z, -1, axis=-1) - z
-    t, u = _oscillation_points_on_edges(h11, h12 * h21, h22, z, dz, wall, stiffer)
-    limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
-    return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
-
-
-def _oscillation_points_on_edges(
-    h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
-) -> tuple[Array, Array]:
-    # Hand z + t dz and wall e + u de oscillate at t, u (nan: never), where
-    # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u is zero, so that
-    # t = -(a + c u) / (b + d u) is real.
-    hand_side, environment_side = z + h11, 1 + h22 * e
-    a, b = hand_side * environment_side - product * e, dz * environment_side
-    c, d = (hand_side * h22 - product) * de, dz * h22 * de
+    # Hand z + t dz and wall u / s oscillate where (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e =
+    # a + b t + (c + d t) u is zero, so that t = -(a + c u) / (b + d u) is real.
+    a, b = z + h11, np.roll(z, -1, axis=-1) - z
+    per_stiffness = np.asarray(-1j / omega)[..., None]
+    c, d = (a * h22 - h12 * h21) * per_stiffness, b * h22 * per_stiffness
     # (a + c u) conj(b + d u) as a polynomial of u: its imaginary part vanishes.
     p0, p1, p2 = a * b.conj(), a * d.conj() + c * b.conj(), c * d.conj()
     with np.errstate(divide="ignore", invalid="ignore"):
         half = -(p1.imag + np.copysign(np.sqrt(p1.imag**2 - 4 * p2.imag * p0.imag), p1.imag)) / 2
         u = np.stack([half / p2.imag, p0.imag / half])
-        size = _squared_abs(b) + u * (2 * (b * d.conj()).real + u * _squared_abs(d))
-        return -(p0.real + u * (p1.real + u * p2.real)) / size, u
+        t = -(p0.real + u * (p1.real + u * p2.real)) / _squared_abs(b + d * u)
+    limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
+    return np.where(hand.contains(-H[..., 0, 0], omega), 0.0, limit)
 
 
 def bounded_singular_value(
@@ -201,10 +189,8 @@ def bounded_singular_value(
     # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
     # with this diagonal and this product of the other two.
     first, second, product = r1 / felt, r2 * (h22 * reduction - through), -r1 * r2 * through / felt
-    square = _squared_abs(first) + _squared_abs(second) + 2 * np.abs(product)
-    determinant = 4 * _squared_abs(first * second - product)
-    square += np.sqrt(np.maximum(square**2 - determinant, 0.0))
-    return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
+    mu = structured_singular_value(two_port_matrix(first, product, 1.0, second))
+    return np.min(mu, axis=(-2, -1))
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,17 @@ from pydrake.math import RollPitchYaw
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
-from drake_teleop.common.numeric import one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import report, summary_values
-from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
-from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
+from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, two_port
+from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
+from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
-from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
+from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
+from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
-from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -27,6 +30,14 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+#: N/m, walls of the table of margins, in addition to the scenario's own.
+WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
+COMPARISON_BAND_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
+OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
+S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
+_MAX_FITTED_OMEGA_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
+_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
+_MEASUREMENT_MOTION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def analyze_command(
@@ -69,10 +80,10 @@ def _analyze_in_stages(
     estimate = true_load(scenario)
     along = task_direction(linear, UNIT_VECTORS[direction])
     sampling = sampling_of_scenario(linear)
-    is_wall_known, omega = along.axis.wall_stiffness > 0.0, summary_values.OMEGA
-    wall = (along.axis.wall_stiffness, along.axis.wall_damping) if is_wall_known else (5100.0, 0.0)
-    axis = dataclasses.replace(along.axis, wall_stiffness=0.0, wall_damping=0.0)
-    contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
+    contact, is_wall_known = along.axis, along.axis.wall_stiffness > 0.0
+    if not is_wall_known:
+        contact = dataclasses.replace(contact, wall_stiffness=5100.0, wall_damping=0.0)
+    axis = dataclasses.replace(contact, wall_stiffness=0.0, wall_damping=0.0)
 
     progress = stage("Linearise the Diagram")
     free = linearize(linear.without_environment(), load_estimate=estimate)
@@ -87,33 +98,30 @@ def _analyze_in_stages(
 
     progress = stage("Two-port, margins, transparency")
     one_loop_open = close_other_directions(free, linear, along)
-    with_hand = hybrid_along(one_loop_open, omega, along.hand, along.tool)
-    H = absorb_impedances(with_hand, hand=-summary_values.S_AT_OMEGA * axis.hand_mass)
-    closed_form = hybrid_matrix(axis, summary_values.S_AT_OMEGA)
+    with_hand = hybrid_along(one_loop_open, OMEGA, along.hand, along.tool)
+    H = two_port.absorb_impedances(with_hand, hand=-S_AT_OMEGA * axis.hand_mass)
     progress(0.3)
     summary: dict[str, Any] = {
         "direction": direction,
         "grip": scenario.operator.grip,
         "method": method,
         "delay_s": axis.delay,
-        "wall_N_per_m": wall[0],
+        "wall_N_per_m": contact.wall_stiffness,
         "wall_is": describe_wall_source(scenario, is_wall_known),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            summary_values.summarise_diagram_stability(
-                name, close_all_loops(system, linear), one_axis, sampling
-            )
+            summarise_diagram_stability(name, close_all_loops(system, linear), one_axis, sampling)
             for name, system, one_axis in points
         ],
-        "two_port": summary_values.two_port_deviations(with_hand, axis, sampling),
-        "margins": summary_values.margin_rows(axis, sampling, wall[0]),
-        "absolute": summary_values.absolute_stability_values(H, axis),
-        "bounded": summary_values.stiffest_stable_walls(H, axis, sampling),
-        "transparency": summary_values.transparency_values(H, axis, wall),
-        "z_width": summary_values.virtual_wall_limits(axis, sampling),
+        "two_port": two_port_deviations(with_hand, axis, sampling),
+        "margins": margin_rows(axis, sampling, contact.wall_stiffness),
+        "absolute": absolute_stability_values(H, axis),
+        "bounded": stiffest_stable_walls(H, axis, sampling),
+        "transparency": transparency_values(H, axis, contact),
+        "z_width": virtual_wall_limits(axis, sampling),
     }
     progress(1.0)
-    maps = summary_values.parameter_maps(axis, wall, sampling, stage)
+    maps = parameter_maps(axis, contact, sampling, stage)
     summary["maps"] = [
         {
             "title": title,
@@ -127,15 +135,15 @@ def _analyze_in_stages(
     summary["measured"] = None
     if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        summary["measured"] = summary_values.measure_free_impedance(linear, along, one_loop_open)
+        summary["measured"] = measure_free_impedance(linear, along, one_loop_open)
         measured(1.0)
     summary = to_json_data(summary)
     summary["verdict"] = report.verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
-        loop = cut_loop(summary_values.axis_with_grip(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, omega, axis.delay)
-    return summary, report.ReportCurves(axis, omega, H, closed_form, wall, nyquist, maps)
+        loop = cut_loop.cut_loop(axis_with_grip(contact, grip), sampling)
+        nyquist[grip] = -cut_loop.loop_response(loop, OMEGA, axis.delay)
+    return summary, report.ReportCurves(contact, OMEGA, H, nyquist, maps)
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
@@ -186,3 +194,224 @@ def close_other_directions(
     return system.close_loop(
         [f"operator_wrench.{axis}" for axis in others], [f"hand_wrench.{axis}" for axis in others]
     )
+
+
+def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
+    hand = GRIP_IMPEDANCES[grip]
+    return dataclasses.replace(
+        axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
+    )
+
+
+def summarise_diagram_stability(
+    name: str, system: Linearization, axis: OneAxis, sampling: Sampling
+) -> dict[str, Any]:
+    """Return stability, decay rate and frequency of linearised Diagram and one-axis model.
+
+    Decay and frequency are those of the largest multiplier.
+    """
+    loop = cut_loop.cut_loop(axis, sampling)
+    stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
+    return {
+        "point": name,
+        "states": system.num_states,
+        **_slowest_motion(system, stable),
+        # The count of unstable multipliers also includes those far from the unit circle.
+        "one_axis": _slowest_motion(closed_axis_model(axis, sampling), stable) | {"stable": stable},
+    }
+
+
+def _slowest_motion(system: Linearization, stable: bool) -> dict[str, Any]:
+    # `stable` replaces the multipliers of a model with too many states.
+    if system.num_states > MAX_STATES:
+        return {"stable": stable, "decay_1_per_s": None, "frequency_Hz": None}
+    multiplier = complex(system.multipliers[0])
+    return {
+        "stable": abs(multiplier) < 1,
+        "decay_1_per_s": float(-np.log(abs(multiplier)) / system.dt),
+        "frequency_Hz": float(abs(np.angle(multiplier)) / system.dt / (2 * np.pi)),
+    }
+
+
+def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    """Return the largest deviations of H from the one-axis models up to 30 Hz.
+
+    They are relative to the largest magnitude of each entry. `H` (N, 2, 2) is the linearised
+    Diagram's at `OMEGA`, with the hand's mass.
+    """
+    compared = OMEGA <= COMPARISON_BAND_RAD_S
+    with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
+
+    def greatest_deviations(other: Complex) -> dict[str, float]:
+        found = np.abs(H[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
+        return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
+
+    closed_form = two_port.hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])
+    sampled = sampled_two_port(with_hand_mass, sampling, OMEGA[compared])
+    models = {"closed_form": closed_form, "sampled": sampled}
+    return {name: greatest_deviations(model) for name, model in models.items()}
+
+
+def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
+    """Return stability margins for each grip and wall; `own_wall`: another stiffness [N/m]."""
+    rows = []
+    omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
+    walls = sorted({*WALL_STIFFNESSES_N_M, own_wall})
+    for grip, wall in itertools.product(GRIP_IMPEDANCES, walls):
+        held = dataclasses.replace(axis_with_grip(axis, grip), wall_stiffness=wall)
+        loop = cut_loop.cut_loop(held, sampling)
+        stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
+        gain, phase = 1.0, 0.0
+        if stable:
+            response = cut_loop.loop_response(loop, omega, axis.delay)
+            gain, phase = cut_loop.gain_and_phase_margin(response)
+        rows.append(
+            {
+                "grip": grip,
+                "wall_N_per_m": wall,
+                "stable": stable,
+                "gain": gain,
+                "phase_deg": float(np.degrees(phase)),
+                "round_trip_s": float(cut_loop.delay_margin(loop)),
+            }
+        )
+    return rows
+
+
+def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
+    """Return stability criteria for any passive hand and environment."""
+    parameter = absolute_stability.llewellyn_parameter(H)
+    worst = int(np.argmin(parameter))
+    scaled, S = two_port.power_scaled_matrices(H, axis)
+    return {
+        "absolutely_stable": bool(absolute_stability.is_absolutely_stable(H).all()),
+        "least_parameter": float(parameter[worst]),
+        "at_Hz": float(OMEGA[worst] / (2 * np.pi)),
+        "lacking_damping_Ns_per_m": float(absolute_stability.required_damping(H).max()),
+        "passive": bool(absolute_stability.is_passive(scaled).all()),
+        "scattering_norm": float(absolute_stability.scattering_norm(S).max()),
+    }
+
+
+def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    """Return the stiffest stable wall [N/m]: for any hand between light and firm, and per grip."""
+    hands = absolute_stability.impedance_range_of_grips()
+    limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
+    each = {
+        grip: _find_stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
+        for grip in GRIP_IMPEDANCES
+    }
+    return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
+
+
+def _find_stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
+    stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
+    walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
+    loop = cut_loop.cut_loop(dataclasses.replace(axis, **walls), sampling)
+    (bad,) = np.nonzero(cut_loop.count_unstable_multipliers(loop, axis.delay))
+    return float("inf") if len(bad) == 0 else float(stiffness[max(bad[0] - 1, 0)])
+
+
+def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str, Any]:
+    """Return displayed and ideal impedances, and the tracking bandwidth."""
+    fitted = OMEGA <= _MAX_FITTED_OMEGA_RAD_S
+    figures: dict[str, Any] = {}
+    for name, one in (("free", axis), ("wall", contact)):
+        environment = environment_impedance(one, S_AT_OMEGA)
+        felt = two_port.transmitted_impedance(H, environment)
+        ideal = two_port.ideal_impedance(axis, S_AT_OMEGA, environment)
+        noticed = two_port.is_difference_noticed(felt, ideal)
+        first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
+        figures[name] = {
+            which: two_port.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
+            for which, impedance in (("felt", felt), ("ideal", ideal))
+        }
+        figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
+    tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
+    end = len(tracks) if tracks.all() else int(np.argmin(tracks))
+    figures["tracking_bandwidth_Hz"] = float(OMEGA[max(end - 1, 0)] / (2 * np.pi))
+    width = two_port.transmitted_z_width(H).decades
+    figures["width_decades"] = {
+        f"{hz:g} Hz": float(np.interp(2 * np.pi * hz, OMEGA, width)) for hz in (1.0, 5.0, 10.0)
+    }
+    stiffness = contact.wall_stiffness
+    change = two_port.smallest_stiffness_change(H, OMEGA, stiffness)
+    figures["smallest_stiffness_N_per_m"] = {
+        "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA, change)),
+        "on the wall itself": two_port.WEBER_FRACTION * stiffness,
+    }
+    return figures
+
+
+def virtual_wall_limits(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    wall_damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
+    mass = axis.hand_mass + axis.device_mass
+    damping = axis.hand_damping + axis.device_damping
+    limits = {
+        "wall_damping_Ns_per_m": wall_damping,
+        "passive_N_per_m": passive_stiffness(axis.device_damping, wall_damping, period),
+        "passive_in_the_hand_N_per_m": passive_stiffness(damping, wall_damping, period),
+        "stable_in_the_hand_N_per_m": stable_stiffness(
+            mass, damping, wall_damping, period, hand_stiffness=axis.hand_stiffness
+        ),
+    }
+    walls = [dict(zip(limits, row, strict=True)) for row in np.array([*limits.values()]).T.tolist()]
+    device = {"device_damping_Ns_per_m": axis.device_damping, "rate_Hz": sampling.hand_hz}
+    return device | {"walls": walls}
+
+
+def measure_free_impedance(
+    scenario: Scenario, along: TaskDirection, system: Linearization
+) -> dict[str, Any]:
+    """Return the impedance displayed in free motion, from a simulation without Coulomb friction.
+
+    The errors are those of the linear model `system`.
+    """
+    frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
+    smooth = replace(scenario.without_environment(), master=frictionless, slave__friction=[])
+    estimate = true_load(scenario)
+    if not scenario.wrist_sensor.ideal:
+        estimate[:6] = scenario.wrist_sensor.offset
+    found = measure_frequency_response(smooth, along, _MEASUREMENT_MOTION, load_estimate=estimate)
+    # Held force: its component at the frequency itself, as in the two-port.
+    step = 1j * found.omega / scenario.rates.hand_hz
+    held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
+    # The hand's mass moves with the stylus and belongs to the hand.
+    felt = held - 1j * found.omega * along.axis.hand_mass
+    ratio = held / hybrid_along(system, found.omega, along.hand, along.tool)[:, 0, 0]
+    return {
+        "frequency_Hz": found.omega / (2 * np.pi),
+        "felt_re": felt.real,
+        "felt_im": felt.imag,
+        "coherence": found.coherence("hand_velocity", "hand_force"),
+        "greatest_error": np.abs(np.abs(ratio) - 1).max(),
+        "greatest_error_deg": np.abs(np.angle(ratio, deg=True)).max(),
+    }
+
+
+def parameter_maps(
+    axis: OneAxis, contact: OneAxis, sampling: Sampling, stage: StartStage
+) -> dict[str, dict[str, StabilityMap]]:
+    n, tool = _POINTS_PER_MAP_AXIS, axis.tool_mass
+    delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)
+    walls = np.geomspace(100.0, 1e5, n)
+    # The sensor's low-pass has to stay below half of its rate.
+    slowest = 2.4 * (sampling.low_pass_hz or 0.0) * sampling.hand_hz / sampling.sensor_hz
+    rate = np.geomspace(max(slowest, 100.0), 10e3, n)
+    parameters: dict[str, tuple[Any, ...]] = {
+        "Delay and stiffness of the wall": (contact, "delay", delay, "wall_stiffness", walls),
+        "Delay and σ, in free motion": (axis, "delay", delay, "sigma", sigma),
+        "Delay and σ, on the wall": (contact, "delay", delay, "sigma", sigma),
+        "Error of the estimated mass and σ, in free motion": (
+            *(axis, "mass_error", np.linspace(-0.9, 4.0, n) * tool, "sigma", sigma),
+        ),
+        "Rate and stiffness of the wall": (contact, RATE_NAME, rate, "wall_stiffness", walls),
+    }
+    progress, found = stage("Maps"), {}
+    for done, (title, (base, *grid)) in enumerate(parameters.items()):
+        found[title] = {
+            grip: stability_map(axis_with_grip(base, grip), sampling, *grid)
+            for grip in GRIP_IMPEDANCES
+        }
+        progress((done + 1) / len(parameters))
+    return found

@@ -167,15 +167,10 @@ def _gain_crossings_into(opened, closed, angles, found):
 
 @njit(cache=True)
 def _add_pole_angles(angles, poles):
-    more = np.empty(_ANGLE_OFFSETS_NEAR_POLES.shape[0] * poles.shape[0])
-    count = 0
-    for pole in poles:
-        for share in _ANGLE_OFFSETS_NEAR_POLES:
-            angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
-            if angles[0] < angle < math.pi:
-                more[count] = angle
-                count += 1
-    return np.sort(np.concatenate((angles, more[:count])))
+    pole_angles, offsets = np.abs(np.angle(poles)), np.abs(1.0 - np.abs(poles))
+    more = (pole_angles + _ANGLE_OFFSETS_NEAR_POLES.reshape(-1, 1) * offsets).ravel()
+    inside = (more > angles[0]) & (more < math.pi)
+    return np.sort(np.concatenate((angles, more[inside])))
 
 
 @njit(cache=True)

@@ -13,7 +13,6 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.task_direction import TaskDirection
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
-from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import jacobian
@@ -46,6 +45,7 @@ class MultiSine:
         """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
         frequencies = self.odd_multiples_of_base_rate() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
+        phases = self._phases_with_lowest_peak()
         duration = self.settle + self.period * self.periods + self.settle
         return [
             Sine(
@@ -57,9 +57,7 @@ class MultiSine:
                 translation=list(amplitude * direction[:3]),
                 rotation=list(amplitude * direction[3:]),
             )
-            for frequency, amplitude, phase in zip(
-                frequencies, amplitudes, self._phases_with_lowest_peak(), strict=True
-            )
+            for frequency, amplitude, phase in zip(frequencies, amplitudes, phases, strict=True)
         ]
 
     def _phases_with_lowest_peak(self) -> Array:
@@ -104,10 +102,8 @@ class StationResponse:
         felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
         # The force noise is about equal at all lines, so that the weights are the accelerations.
         acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
-        powers = (omega[:, None] / omega[-1]) ** [0, 2]
         mass = (felt / (1j * omega)).real
-        weighted = acceleration[:, None] * powers
-        return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
+        return float(np.polyfit((omega / omega[-1]) ** 2, mass, 1, w=acceleration)[1])
 
 
 def measure_frequency_response(
@@ -140,27 +136,22 @@ def measure_frequency_response(
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
     result = simulate(diagram, drawing.simulation, progress=False)
-    odd_multiples = excitation.odd_multiples_of_base_rate()
-    spectra: dict[str, Complex] = {}
-    for name, signal in _forces_and_velocities_along_task(result, scenario, task).items():
-        periods = signal[: steps * excitation.periods].reshape(-1, steps)
-        spectra[name] = np.fft.rfft(periods)[:, odd_multiples] * (2 / steps)
-    omega = np.asarray(2 * np.pi / period * odd_multiples, dtype=float)
-    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
-
-
-def _forces_and_velocities_along_task(
-    result: SimulationResult, scenario: Scenario, task: TaskDirection
-) -> dict[str, Array]:
     arm, states = NominalSlave(scenario.slave).arm, result["slave_state"]
     n = arm.num_joints
     J, twists = np.empty((6, n)), np.empty((len(states), 6))
     for state, twist in zip(states, twists, strict=True):
         jacobian(arm.table, np.ascontiguousarray(state[:n]), J)
         twist[:] = J @ state[n:]
-    return {
+    signals = {
         "hand_force": result["hand_wrench_E"] @ task.hand,
         "hand_velocity": result["twist_master"] @ task.hand,
         "felt_force": result["force_to_master"] @ task.hand,
         "tool_velocity": twists @ task.tool,
     }
+    odd_multiples = excitation.odd_multiples_of_base_rate()
+    spectra: dict[str, Complex] = {}
+    for name, signal in signals.items():
+        periods = signal[: steps * excitation.periods].reshape(-1, steps)
+        spectra[name] = np.fft.rfft(periods)[:, odd_multiples] * (2 / steps)
+    omega = np.asarray(2 * np.pi / period * odd_multiples, dtype=float)
+    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)

@@ -13,7 +13,7 @@ excludes the sensor's noise, offset, quantisation and saturation, and all Coulom
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,14 +25,9 @@ from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialFor
 from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Diagram
 
+from drake_teleop.common import vectors
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-)
 from drake_teleop.lab.analysis.linear_model import Linearization, port_component_names
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port_matrix
@@ -112,10 +107,9 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     """Return the network delays of pose and wrench in whole hand periods; 0: no network."""
-    lines = scenario.channel.networks_of_directions()
-    if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
+    if scenario.has_no_network_or_passivity:
         return 0, 0
-    rate = scenario.rates.hand_hz
+    rate, lines = scenario.rates.hand_hz, scenario.channel.networks_of_directions()
     ahead, back = (max(1, round(max(line.delay, line.playout) * rate)) for line in lines)
     return ahead, back
 
@@ -163,12 +157,12 @@ class _StateGroup:
 class _PeriodSimulator:
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rate_multiples(scenario)
-        own_period = scenario.master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz)
-        if own_period is not None:
+        hand_hz = scenario.rates.hand_hz
+        if own_period := scenario.master.sampling_period_if_slower_than_hand(hand_hz):
             what = f"is above the device's own rate of {1 / own_period:g} Hz (must be equal)"
             remedy = f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0"
             raise DrakeTeleopError(what, where="rates.hand_hz", remedy=remedy)
-        self.dt = 1 / scenario.rates.hand_hz
+        self.dt = 1 / hand_hz
         smooth = _without_nonlinear_parts(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
@@ -198,15 +192,14 @@ class _PeriodSimulator:
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
         self._steps = np.concatenate([group.difference_steps for group in self._groups])
-        # The sensor's memory follows from the other states; it is of order 1.
-        sensed = [group.system_name == "wrist_sensor" for group in self._groups]
-        counts = [len(group.difference_steps) for group in self._groups]
-        self._sizes = np.where(np.repeat(sensed, counts), _LINEAR_STATE_STEP, self._steps)
         self.states = tuple(
             f"{g.system_name} {'' if g.discrete_group is None else g.discrete_group}[{k}]"
             for g in self._groups
             for k in range(len(g.difference_steps))
         )
+        # The sensor's memory follows from the other states; it is of order 1.
+        sensed = [name.startswith("wrist_sensor") for name in self.states]
+        self._sizes = np.where(sensed, _LINEAR_STATE_STEP, self._steps)
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
@@ -227,24 +220,22 @@ class _PeriodSimulator:
         self._get_block(system).GetInputPort(port).FixValue(self._get_context(system), value)
 
     def _make_state_groups(self) -> list[_StateGroup]:
-        def whole_group(system: str, group: int, *steps: Array) -> _StateGroup:
-            return _StateGroup(system, group, slice(None), np.concatenate(steps))
-
-        joints = self._get_context("slave_plant").num_continuous_states() // 2
+        whole = slice(None)
         axes = self._device.num_joints
+        joints = self._get_context("slave_plant").num_continuous_states() // 2
         # The sensor's memory contains angles, which must stay small.
-        remembered = np.full(len(self._sensor.motion_dependent_state_indices), _ANGLE_STEP)
+        remembered = self._sensor.motion_dependent_state_indices
         groups = [
-            whole_group("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
-            whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
-            whole_group("master_device", 2, np.full(6, _RATE_STEP)),
+            _StateGroup("master_device", 0, whole, np.repeat([_ANGLE_STEP, _RATE_STEP], axes)),
+            _StateGroup("master_device", 1, whole, np.full(7, _ANGLE_STEP)),
+            _StateGroup("master_device", 2, whole, np.full(6, _RATE_STEP)),
             # The angles for the display; its other states act only after faults.
             _StateGroup("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
-            whole_group("joint_control", 0, np.full(self._joints, _LINEAR_STATE_STEP)),
+            _StateGroup("joint_control", 0, whole, np.full(self._joints, _LINEAR_STATE_STEP)),
             _StateGroup(
-                "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
+                "slave_plant", None, whole, np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
-            _StateGroup("wrist_sensor", 0, self._sensor.motion_dependent_state_indices, remembered),
+            _StateGroup("wrist_sensor", 0, remembered, np.full(len(remembered), _ANGLE_STEP)),
         ]
         if self._has_ik_state:
             steps = np.full(self._joints, self._command_step)
@@ -319,9 +310,8 @@ class _PeriodSimulator:
         context = self._get_context("master_device")
         x_B = self._device.coordinates_for_force_display(q)
         display = initial_display_state(x_B, self._device.parameters)
-        for group, value in enumerate(
-            (np.append(q, np.zeros_like(q)), pose_B, np.zeros(6), display)
-        ):
+        states = np.append(q, np.zeros_like(q)), pose_B, np.zeros(6), display
+        for group, value in enumerate(states):
             context.SetDiscreteState(group, value)
         target = self._evaluate_output("kinematic_scaling", "pose_command")
         ramp = round(_TIME_TO_OPERATING_POINT_S / self.dt) if displacement.any() else 0
@@ -358,42 +348,42 @@ class _PeriodSimulator:
         raise DrakeTeleopError(what, where="displacement", remedy="choose another operating point")
 
     def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
-        A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
+        def outputs_and_end_state(change: Array) -> Array:
+            self._set_state(x + change)
+            outputs = self._evaluate_outputs()
+            return np.concatenate([outputs, self._run_one_period()])
+
         self._apply_input_changes(np.zeros(24))
-        for k, step in enumerate(self._steps):
-            ends, outputs = [], []
-            for sign in (1.0, -1.0):
-                displaced = x.copy()
-                displaced[k] += sign * step
-                self._set_state(displaced)
-                outputs.append(self._evaluate_outputs())
-                ends.append(self._run_one_period())
-            A[:, k] = (ends[0] - ends[1]) / (2 * step)
-            C[:, k] = (outputs[0] - outputs[1]) / (2 * step)
+        C, A = np.split(_central_differences(outputs_and_end_state, self._steps), [30])
         return A, C
 
     def differentiate_by_input(self, x: Array) -> Array:
-        B = np.empty((len(x), 24))
+        def end_state(change: Array) -> Array:
+            self._set_state(x)
+            self._apply_input_changes(change)
+            return self._run_one_period()
+
         pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
         steps = np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
-        for k, step in enumerate(steps):
-            ends = []
-            for sign in (1.0, -1.0):
-                self._set_state(x)
-                self._apply_input_changes(sign * step * np.eye(24)[k])
-                ends.append(self._run_one_period())
-            B[:, k] = (ends[0] - ends[1]) / (2 * step)
-        return B
+        return _central_differences(end_state, steps)
+
+
+def _central_differences(function: Callable[[Array], Array], steps: Array) -> Array:
+    """Return the Jacobian of a function at 0, by displacements of these sizes."""
+    columns = [function(step) - function(-step) for step in np.diag(steps)]
+    return np.stack(columns, axis=1) / (2 * steps)
 
 
 def _displace_pose(pose: Array, change: Array) -> Array:
-    rotated = quaternion_product(quaternion_exponential(tuple(change[3:])), pose[:4])
+    rotation = vectors.quaternion_exponential(tuple(change[3:]))
+    rotated = vectors.quaternion_product(rotation, pose[:4])
     return np.concatenate([rotated, pose[4:] + change[:3]])
 
 
 def _pose_difference(pose: Array, other: Array) -> Array:
-    rotation = quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
-    return np.concatenate([pose[4:] - other[4:], quaternion_logarithm(rotation)])
+    inverse = vectors.conjugate_quaternion(tuple(other[:4]))
+    rotation = vectors.quaternion_product(tuple(pose[:4]), inverse)
+    return np.concatenate([pose[4:] - other[4:], vectors.quaternion_logarithm(rotation)])
 
 
 def _without_nonlinear_parts(scenario: Scenario) -> Scenario:

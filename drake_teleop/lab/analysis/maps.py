@@ -10,21 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.analysis.cut_loop import (
-    CutLoop,
-    count_unstable_multipliers,
-    cut_loop,
-    loop_response,
-)
-from drake_teleop.lab.analysis.one_axis import (
-    Complex,
-    OneAxis,
-    device_impedance,
-    environment_impedance,
-    hand_impedance,
-)
+from drake_teleop.lab.analysis import cut_loop, one_axis
+from drake_teleop.lab.analysis.cut_loop import CutLoop
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.transparency import ideal_impedance
+from drake_teleop.lab.analysis.two_port import ideal_impedance
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE_NAME = "rate"
@@ -60,29 +50,25 @@ def stability_map(
     """
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
-    def is_stable(at_x: Array, at_y: Array) -> NDArray[np.bool_]:
-        values = {x_name: at_x, y_name: at_y}
-        moved, loop = _axis_and_loop_with_values(axis, sampling, values)
-        return count_unstable_multipliers(loop, moved.delay) == 0
+    def evaluate(x: Array, y: Array) -> tuple[OneAxis, CutLoop, NDArray[np.int64]]:
+        moved, loop = _axis_and_loop_with_values(axis, sampling, {x_name: x, y_name: y})
+        return moved, loop, cut_loop.count_unstable_multipliers(loop, moved.delay)
 
-    moved, loop = _axis_and_loop_with_values(axis, sampling, {x_name: xs, y_name: ys[:, None]})
-    shape = len(ys), len(xs)
-    unstable = np.broadcast_to(count_unstable_multipliers(loop, moved.delay), shape)
+    points = np.stack(np.meshgrid(xs, ys), axis=-1)
+    moved, loop, unstable = evaluate(xs, ys[:, None])
+    unstable = np.broadcast_to(unstable, points.shape[:2])
     stable = unstable == 0
     # Neighbours in a row, then neighbours in a column.
-    row, column = np.nonzero(stable[:, 1:] != stable[:, :-1])
-    along_x = _bisect_stability_limit(
-        lambda at: is_stable(at, ys[row]), xs[column], xs[column + 1], stable[row, column]
-    )
-    row_2, column_2 = np.nonzero(stable[1:] != stable[:-1])
-    along_y = _bisect_stability_limit(
-        lambda at: is_stable(xs[column_2], at), ys[row_2], ys[row_2 + 1], stable[row_2, column_2]
-    )
-    boundary = np.concatenate(
-        [np.column_stack([along_x, ys[row]]), np.column_stack([xs[column_2], along_y])]
-    )
-    felt = np.broadcast_to(force_distortion(moved, loop), shape)
-    return StabilityMap(x_name, y_name, xs, ys, unstable, felt, boundary)
+    across, along = stable[:, 1:] != stable[:, :-1], stable[1:] != stable[:-1]
+    low = np.concatenate([points[:, :-1][across], points[:-1][along]])
+    high = np.concatenate([points[:, 1:][across], points[1:][along]])
+    stable_at_low = np.concatenate([stable[:, :-1][across], stable[:-1][along]])
+    for _ in range(_NUM_STABILITY_LIMIT_BISECTIONS if len(low) else 0):
+        middle = 0.5 * (low + high)
+        as_low = ((evaluate(*middle.T)[2] == 0) == stable_at_low)[:, None]
+        low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)
+    felt = np.broadcast_to(force_distortion(moved, loop), stable.shape)
+    return StabilityMap(x_name, y_name, xs, ys, unstable, felt, 0.5 * (low + high))
 
 
 def force_distortion(
@@ -92,14 +78,13 @@ def force_distortion(
 
     The maximum is over `frequency` (N,) [rad/s].
     """
-    shape = np.broadcast_shapes(
-        loop.period_s.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
-    )
+    shape = np.broadcast_shapes(loop.period_s.shape, *map(np.shape, vars(axis).values()))
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     s: Complex = 1j * w.reshape(-1, *[1] * len(shape))
-    hand = hand_impedance(axis, s)
-    ideal = hand + ideal_impedance(axis, s, environment_impedance(axis, s))
-    exerted = (hand + device_impedance(axis, s)) * (1 - loop_response(loop, w, axis.delay))
+    hand = one_axis.hand_impedance(axis, s)
+    ideal = hand + ideal_impedance(axis, s, one_axis.environment_impedance(axis, s))
+    response = cut_loop.loop_response(loop, w, axis.delay)
+    exerted = (hand + one_axis.device_impedance(axis, s)) * (1 - response)
     return np.abs(exerted / ideal - 1).max(axis=0)
 
 
@@ -121,26 +106,11 @@ def _axis_and_loop_with_values(
 ) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():
         if name == RATE_NAME:
-            factor = value / sampling.hand_hz
-            sampling = replace(
-                sampling,
-                hand_hz=value,
-                joint_control_hz=factor * sampling.joint_control_hz,
-                sensor_hz=factor * sampling.sensor_hz,
-            )
+            factor, others = value / sampling.hand_hz, ("joint_control_hz", "sensor_hz")
+            rates = {other: factor * getattr(sampling, other) for other in others}
+            sampling = replace(sampling, hand_hz=value, **rates)
         elif name == "low_pass_hz":
             sampling = replace(sampling, low_pass_hz=value)
         else:
             axis = replace(axis, **{name: value})
-    return axis, cut_loop(axis, sampling)
-
-
-def _bisect_stability_limit(
-    is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]
-) -> Array:
-    low, high = low.copy(), high.copy()
-    for _ in range(_NUM_STABILITY_LIMIT_BISECTIONS if low.size else 0):
-        middle = 0.5 * (low + high)
-        as_low = is_stable(middle) == stable_at_low
-        low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)
-    return 0.5 * (low + high)
+    return axis, cut_loop.cut_loop(axis, sampling)

@@ -10,7 +10,6 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,14 +57,16 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
     n = FIRST_FILTER_STATE + 2 * sections.shape[-2]
-    rows = _PeriodMapRows(axis, n + 3)
-    hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
+    parameters = *vars(axis).values(), *vars(sampling).values()
+    shape = np.broadcast_shapes(*map(np.shape, parameters))
+    zeros = np.zeros((*shape, n + 3, n + 3))
+    hand = _hand_rows(zeros[..., :2, :], axis, hand_period)
+    servo = _servo_row(zeros[..., :1, :], axis)
+    sensor = _sensor_rows(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
-    flows = {gap: rows.slave_rows(float(gap) * hand_period) for gap in set(gaps)}
-    parts = hand, servo, sensor, *flows.values()
-    shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
-    M = np.broadcast_to(np.eye(n + 3), (*shape, n + 3, n + 3)).copy()
+    slave = {gap: _slave_rows(zeros[..., :2, :], axis, float(gap) * hand_period) for gap in gaps}
+    M = zeros + np.eye(n + 3)
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
         if time == 0:
@@ -75,7 +76,7 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
         if (time * sensor_samples).denominator == 1:
             new[..., SAMPLED_FORCE:n, :] = sensor @ M
         M = new
-        M[..., [SLAVE_X, SLAVE_V], :] = flows[gap] @ M
+        M[..., [SLAVE_X, SLAVE_V], :] = slave[gap] @ M
     return M
 
 
@@ -150,76 +151,60 @@ def _low_pass_sections(sampling: Sampling) -> Array:
     return sections.reshape(*rates.shape, 2, 5)
 
 
-class _PeriodMapRows:
-    def __init__(self, axis: OneAxis, size: int) -> None:
-        self._axis, self._size = axis, size
+def _hand_rows(zeros: Array, axis: OneAxis, period: Array) -> Array:
+    rows, mass = zeros.copy(), axis.hand_mass + axis.device_mass
+    responses = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
+    rows[..., [MASTER_X, MASTER_V]] = responses[..., :2]
+    forces = {MASTER_X: -axis.hand_stiffness, MASTER_V: -axis.hand_damping}
+    for column, force in (forces | {_HELD_HAND_FORCE: 1, RECEIVED_FORCE: -1}).items():
+        rows[..., column] += np.asarray(force / mass)[..., None] * responses[..., 2]
+    return rows
 
-    def _make_row(self, entries: dict[int, Any]) -> Array:
-        values = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in entries.values()))
-        row = np.zeros((*values[0].shape, self._size))
-        for index, value in zip(entries, values, strict=True):
-            row[..., index] += value
-        return row
 
-    def hand_rows(self, period: Array) -> Array:
-        axis = self._axis
-        mass = axis.hand_mass + axis.device_mass
-        x, v, push = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
-        force = {
-            MASTER_X: -axis.hand_stiffness / mass,
-            MASTER_V: -axis.hand_damping / mass,
-            _HELD_HAND_FORCE: 1 / mass,
-            RECEIVED_FORCE: -1 / mass,
-        }
-        ahead = [self._make_row(force) * push[..., i, None] for i in range(2)]
-        for i in range(2):
-            ahead[i] = ahead[i] + self._make_row({MASTER_X: x[..., i], MASTER_V: v[..., i]})
-        return np.stack(np.broadcast_arrays(*ahead), axis=-2)
+def _servo_row(zeros: Array, axis: OneAxis) -> Array:
+    row, kv, kp = zeros.copy(), axis.velocity_gain, axis.position_gain
+    row[..., 0, MASTER_X] = kv * kp * axis.position_scale
+    row[..., 0, SLAVE_X] = -kv * kp
+    row[..., 0, SLAVE_V] = -kv
+    return row
 
-    def servo_rows(self) -> Array:
-        kv, kp = self._axis.velocity_gain, self._axis.position_gain
-        row = self._make_row({MASTER_X: kv * kp * self._axis.position_scale})
-        return (row + self._make_row({SLAVE_X: -kv * kp, SLAVE_V: -kv}))[..., None, :]
 
-    def sensor_rows(self, sections: Array) -> Array:
-        axis = self._axis
-        felt_mass = axis.displayed_tool_mass
-        scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
-        force = {
-            SLAVE_X: scale * axis.wall_stiffness,
-            SLAVE_V: scale * axis.wall_damping,
-            _HELD_ENVIRONMENT_FORCE: scale,
-            SERVO_A: axis.force_scale * felt_mass,
-        }
-        value, memory = self._make_row(force), []
-        for k in range(sections.shape[-2]):
-            b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
-            first, second = FIRST_FILTER_STATE + 2 * k, FIRST_FILTER_STATE + 2 * k + 1
-            filtered = b0 * value + self._make_row({first: 1.0})
-            memory.append(b1 * value - a1 * filtered + self._make_row({second: 1.0}))
-            memory.append(b2 * value - a2 * filtered)
-            value = filtered
-        return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
+def _sensor_rows(zeros: Array, axis: OneAxis, sections: Array) -> Array:
+    rows, felt_mass = zeros.copy(), axis.displayed_tool_mass
+    scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
+    value = rows[..., 0, :]
+    value[..., SLAVE_X] = scale * axis.wall_stiffness
+    value[..., SLAVE_V] = scale * axis.wall_damping
+    value[..., _HELD_ENVIRONMENT_FORCE] = scale
+    value[..., SERVO_A] = axis.force_scale * felt_mass
+    for k in range(sections.shape[-2]):
+        b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
+        first, raw = 1 + 2 * k, value.copy()
+        value[:] = b0 * raw
+        value[..., SAMPLED_FORCE + first] += 1.0
+        rows[..., first, :] = b1 * raw - a1 * value
+        rows[..., first, SAMPLED_FORCE + first + 1] += 1.0
+        rows[..., first + 1, :] = b2 * raw - a2 * value
+    return rows
 
-    def slave_rows(self, time: Array) -> Array:
-        mass = self._axis.slave_mass
-        stiffness, damping = self._axis.wall_stiffness / mass, self._axis.wall_damping / mass
-        x, v, push = mass_spring_responses_to_unit_x_v_u(stiffness, damping, time)
-        by_force = -push / np.asarray(mass)[..., None]
-        ahead = {SLAVE_X: x, SLAVE_V: v, SERVO_A: push, _HELD_ENVIRONMENT_FORCE: by_force}
-        rows = [self._make_row({k: y[..., i] for k, y in ahead.items()}) for i in range(2)]
-        return np.stack(rows, axis=-2)
+
+def _slave_rows(zeros: Array, axis: OneAxis, time: Array) -> Array:
+    rows, mass = zeros.copy(), axis.slave_mass
+    springs = axis.wall_stiffness / mass, axis.wall_damping / mass
+    responses = mass_spring_responses_to_unit_x_v_u(*springs, time)
+    rows[..., [SLAVE_X, SLAVE_V, SERVO_A]] = responses
+    rows[..., _HELD_ENVIRONMENT_FORCE] = -responses[..., 2] / np.asarray(mass)[..., None]
+    return rows
 
 
 def mass_spring_responses_to_unit_x_v_u(
     stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike
-) -> tuple[Array, Array, Array]:
-    """Return (x, x') of x'' = u - b x' - k x after `time`: of x = 1, of x' = 1, and of u = 1."""
+) -> Array:
+    """Return (x, x') after `time` of x'' = u - b x' - k x: columns of x = 1, x' = 1, and u = 1."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
-    E = _matrix_exponential(M)
-    return E[..., :2, 0], E[..., :2, 1], E[..., :2, 2]
+    return _matrix_exponential(M)[..., :2, :]
 
 
 def _matrix_exponential(M: Array) -> Array:

@@ -15,18 +15,18 @@ from matplotlib.figure import Figure
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, VERMILION, Picture, plot_style
-from drake_teleop.lab.analysis import absolute_stability, transparency, two_port
+from drake_teleop.lab.analysis import absolute_stability, two_port
 from drake_teleop.lab.analysis.maps import StabilityMap
-from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
-#: Parameter of a map -> label of its axis, and the factor to its unit.
-_AXIS_LABELS = {
-    "delay": ("round trip [ms]", 2e3),
-    "wall_stiffness": ("stiffness of the wall [kN/m]", 1e-3),
-    "sigma": ("σ", 1.0),
-    "mass_error": ("estimated minus true mass [kg]", 1.0),
-    "rate": ("rate of the hand [kHz]", 1e-3),
+#: Parameter of a map -> label of its axis, factor to its unit, and scale.
+_MAP_AXES = {
+    "delay": ("round trip [ms]", 2e3, "linear"),
+    "wall_stiffness": ("stiffness of the wall [kN/m]", 1e-3, "log"),
+    "sigma": ("σ", 1.0, "linear"),
+    "mass_error": ("estimated minus true mass [kg]", 1.0, "linear"),
+    "rate": ("rate of the hand [kHz]", 1e-3, "log"),
 }
 
 
@@ -34,11 +34,9 @@ _AXIS_LABELS = {
 class ReportCurves:
     """Data of the report's pictures that the summary does not contain."""
 
-    axis: OneAxis
+    axis: OneAxis  #: in contact with the wall
     omega: Array  #: (n,) [rad/s]
     H: Complex  #: (n, 2, 2) two-port of the Diagram, without the hand's mass
-    closed_form: Complex  #: (n, 2, 2) two-port of the one-axis model
-    wall: tuple[float, float]  #: stiffness [N/m] and damping [N s/m]
     nyquist: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
     maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
 
@@ -56,7 +54,7 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
         "drake_teleop.lab.analysis",
         pictures,
         s=summary,
-        wall=curves.wall[0],
+        wall=curves.axis.wall_stiffness,
         axis_rows=axis_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
     )
@@ -92,79 +90,67 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
 
 def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
-    stiffness, damping = curves.wall
-    environments = {
-        "free motion": np.zeros_like(s),
-        f"wall of {stiffness / 1e3:.3g} kN/m": damping + stiffness / s,
-    }
+    wall = f"wall of {curves.axis.wall_stiffness / 1e3:.3g} kN/m"
+    environments = {"free motion": np.zeros_like(s), wall: environment_impedance(curves.axis, s)}
+    closed_form = two_port.hybrid_matrix(curves.axis, s)
     with plot_style():
         figure = Picture(figsize=(9.0, 5.4))
         grid = figure.subplots(2, 2, sharex=True, sharey="row")
+
+        def draw(column: int, hertz: Array, felt: Complex, label: str, **style: Any) -> None:
+            grid[0, column].loglog(hertz, np.abs(felt), label=label, **style)
+            phase = np.degrees(np.unwrap(np.angle(felt)))
+            grid[1, column].semilogx(hertz, phase, **style)
+
         for column, (name, environment) in enumerate(environments.items()):
-            shown = {
-                "ideal": transparency.ideal_impedance(curves.axis, s, environment),
-                "closed form": two_port.transmitted_impedance(curves.closed_form, environment),
-                "Diagram, linearised": two_port.transmitted_impedance(curves.H, environment),
-            }
-            styles = ((GREY, "--", 1.0), (COLOURS[3], "-", 2.4), (COLOURS[0], "-", 1.1))
-            for (label, felt), (colour, line, width) in zip(shown.items(), styles, strict=True):
-                kind: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
-                grid[0, column].loglog(hertz, np.abs(felt), label=label, **kind)
-                grid[1, column].semilogx(hertz, _phase_degrees(felt), **kind)
+            ideal = two_port.ideal_impedance(curves.axis, s, environment)
+            one_axis = two_port.transmitted_impedance(closed_form, environment)
+            linear = two_port.transmitted_impedance(curves.H, environment)
+            draw(column, hertz, ideal, "ideal", color=GREY, linestyle="--", linewidth=1.0)
+            draw(column, hertz, one_axis, "closed form", color=COLOURS[3], linewidth=2.4)
+            draw(column, hertz, linear, "Diagram, linearised", color=COLOURS[0], linewidth=1.1)
             grid[0, column].set_title(name)
             grid[1, column].set_xlabel("frequency [Hz]")
         if measured is not None:
             felt = np.array(measured["felt_re"]) + 1j * np.array(measured["felt_im"])
             dots: dict[str, Any] = {"color": VERMILION, "linestyle": "", "marker": "o", "ms": 3.5}
-            label = "Diagram, simulated"
-            grid[0, 0].loglog(measured["frequency_Hz"], np.abs(felt), label=label, **dots)
-            grid[1, 0].semilogx(measured["frequency_Hz"], _phase_degrees(felt), **dots)
+            draw(0, measured["frequency_Hz"], felt, "Diagram, simulated", **dots)
         grid[0, 0].set_ylabel("|Z| displayed [N s/m]")
         grid[1, 0].set_ylabel("phase [deg]")
         grid[0, 0].legend()
     return figure
 
 
-def _phase_degrees(felt: Complex) -> Any:
-    return np.degrees(np.unwrap(np.angle(felt)))
-
-
 def draw_nyquist(curves: ReportCurves) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9.0, 4.2))
         whole, near = figure.subplots(1, 2)
-        near.set_xlim(-2.0, 1.0)
-        near.set_ylim(-1.3, 1.3)
+        near.set(title="around -1", xlim=(-2.0, 1.0), ylim=(-1.3, 1.3))
+        title = f"Loop at the displayed force, wall of {curves.axis.wall_stiffness / 1e3:.3g} kN/m"
+        whole.set(title=title, ylabel="imaginary part")
         for axes, adjusted in ((whole, "datalim"), (near, "box")):
             for grip, loop in curves.nyquist.items():
                 axes.plot(loop.real, loop.imag, color=_GRIP_COLOURS[grip], label=grip)
             axes.plot(-1, 0, color=BLACK, marker="+", ms=11, mew=2)
             axes.set_xlabel("real part")
             axes.set_aspect("equal", adjustable=adjusted)
-        whole.set_ylabel("imaginary part")
-        whole.set_title(f"Loop at the displayed force, wall of {curves.wall[0] / 1e3:.3g} kN/m")
-        near.set_title("around -1")
         whole.legend(title="grip")
     return figure
 
 
 def draw_absolute_stability(curves: ReportCurves) -> Figure:
     """Draw Llewellyn's parameter, the scattering norm, and structured singular values mu."""
-    hertz, axis = curves.omega / (2 * np.pi), curves.axis
-    ratio = two_port.power_ratio(axis)
-    scaled = two_port.scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
-    S = two_port.scattering_matrix(scaled, two_port.reference_impedances(axis))
-    wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
+    hertz, stiffest = curves.omega / (2 * np.pi), curves.axis.wall_stiffness
+    _, S = two_port.power_scaled_matrices(curves.H, curves.axis)
+    wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, stiffest))
     hands = absolute_stability.impedance_range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
     with plot_style():
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
         left.semilogx(hertz, absolute_stability.llewellyn_parameter(curves.H), color=COLOURS[0])
-        left.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
-        left.set_ylim(-1.2, 5.0)
-        left.set_title("Llewellyn's parameter: absolutely stable from 1 on")
-        realistic = f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ"
+        left.set(ylim=(-1.2, 5.0), title="Llewellyn's parameter: absolutely stable from 1 on")
+        realistic = f"hands from light to firm, walls up to {stiffest / 1e3:.3g} kN/m: μ"
         mu = absolute_stability.structured_singular_value(S)
         for label, value, colour in (
             ("passive: norm of S", absolute_stability.scattering_norm(S), COLOURS[2]),
@@ -172,17 +158,16 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
             (realistic, bounded, COLOURS[3]),
         ):
             right.semilogx(hertz, value, color=colour, label=label)
-        right.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
-        right.set_ylim(0.0, 3.0)
-        right.set_title("stable below 1")
+        right.set(ylim=(0.0, 3.0), title="stable below 1")
         right.legend(fontsize=7.5)
         for axes in (left, right):
+            axes.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
             axes.set_xlabel("frequency [Hz]")
     return figure
 
 
 def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
-    hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_z_width(curves.H)
+    hertz, width = curves.omega / (2 * np.pi), two_port.transmitted_z_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
     with plot_style():
@@ -192,8 +177,7 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
         left.fill_between(hertz, free, rigid, color=COLOURS[5], alpha=0.35)
         left.loglog(hertz, rigid, color=COLOURS[0], label="rigid environment")
         left.loglog(hertz, free, color=COLOURS[2], label="free motion")
-        left.set_xlabel("frequency [Hz]")
-        left.set_ylabel("|Z| displayed [N s/m]")
+        left.set(xlabel="frequency [Hz]", ylabel="|Z| displayed [N s/m]")
         left.set_title("Transmitted through the station")
         left.legend()
         shown = {
@@ -203,8 +187,7 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
         }
         for label, (key, colour) in shown.items():
             right.plot(damping, [1e-3 * row[key] for row in walls], color=colour, label=label)
-        right.set_xlabel("damping of the virtual wall [N s/m]")
-        right.set_ylabel("stiffness [kN/m]")
+        right.set(xlabel="damping of the virtual wall [N s/m]", ylabel="stiffness [kN/m]")
         right.set_title(f"Virtual walls of the device at {z_width['rate_Hz'] / 1e3:g} kHz")
         right.legend()
     return figure
@@ -232,7 +215,8 @@ def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
 
 def _draw_stability_map(axes: Axes, map_of_grip: Mapping[str, StabilityMap], grip: str) -> Any:
     one = map_of_grip[grip]
-    (x_label, x_factor), (y_label, y_factor) = _AXIS_LABELS[one.x_name], _AXIS_LABELS[one.y_name]
+    x_label, x_factor, x_scale = _MAP_AXES[one.x_name]
+    y_label, y_factor, y_scale = _MAP_AXES[one.y_name]
     x, y = x_factor * one.x, y_factor * one.y
     distortion = np.ma.masked_where(~one.stable, np.clip(one.distortion, 0.01, 1.0))
     axes.set_facecolor("#D5D8DD")
@@ -242,13 +226,8 @@ def _draw_stability_map(axes: Axes, map_of_grip: Mapping[str, StabilityMap], gri
     for name, other in map_of_grip.items():
         edge = other.boundary * (x_factor, y_factor)
         axes.plot(*edge.T, color=_GRIP_COLOURS[name], linestyle="", marker=".", ms=2.2)
-    for scale, name in ((axes.set_xscale, one.x_name), (axes.set_yscale, one.y_name)):
-        if name in ("wall_stiffness", "rate"):
-            scale("log")
-    axes.set_xlim(x[0], x[-1])
-    axes.set_ylim(y[0], y[-1])
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
+    axes.set(xscale=x_scale, xlim=(x[0], x[-1]), xlabel=x_label)
+    axes.set(yscale=y_scale, ylim=(y[0], y[-1]), ylabel=y_label)
     axes.grid(False)
     return mesh
 

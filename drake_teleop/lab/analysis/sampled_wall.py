@@ -39,7 +39,7 @@ def stable_stiffness(
     and hand together.
     """
     device = mass, damping, hand_stiffness
-    push = _sampled_device_responses_to_unit_x_v_f(*device, period)[2]
+    push = _sampled_device_responses_to_unit_x_v_f(*device, period)[..., 2]
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     high = 5 / push[..., 0] + np.abs(wall_damping) / period
     low = np.zeros_like(high)
@@ -61,22 +61,23 @@ def sampled_poles(
 ) -> Complex:
     """Return the eigenvalues (..., 3) of device, hand and wall over one period."""
     K, B = np.broadcast_arrays(wall_stiffness, wall_damping)
-    x, v, push = _sampled_device_responses_to_unit_x_v_f(mass, damping, hand_stiffness, period)
+    responses = _sampled_device_responses_to_unit_x_v_f(mass, damping, hand_stiffness, period)
     # States: position, velocity, last sampled position
     force = np.stack([K + B / period, np.zeros_like(B, dtype=float), -B / period], axis=-1)
-    held = push[..., :, None] * force[..., None, :]
+    held = responses[..., 2:] * force[..., None, :]
     step = np.zeros((*held.shape[:-2], 3, 3))
-    step[..., :2, 0], step[..., :2, 1], step[..., 2, 0] = x, v, 1
+    step[..., :2, :2], step[..., 2, 0] = responses[..., :2], 1
     step[..., :2, :] -= held
     return np.linalg.eigvals(step).astype(complex)
 
 
 def _sampled_device_responses_to_unit_x_v_f(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
-) -> tuple[Array, Array, Array]:
+) -> Array:
     m = positive_array("mass", mass, *np.shape(mass))
     b = positive_array("damping", damping, *np.shape(damping))
     k = nonnegative_array("hand_stiffness", stiffness, *np.shape(stiffness))
     positive_array("period", period)
-    x, v, push = mass_spring_responses_to_unit_x_v_u(k / m, b / m, period)
-    return x, v, push / m[..., None]
+    responses = mass_spring_responses_to_unit_x_v_u(k / m, b / m, period)
+    responses[..., 2] /= m[..., None]
+    return responses

@@ -1,4 +1,4 @@
-"""Two-port of the station between hand and environment, along one direction.
+"""Two-port of the station between hand and environment, along one direction, and transparency.
 
     [F_h; -V_s] = H [V_m; F_e]
 
@@ -9,17 +9,15 @@ arrays (..., 2, 2), frequencies first; s in rad/s, impedances in N s/m, delays o
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.one_axis import (
-    Complex,
-    OneAxis,
-    device_impedance,
-    servo_admittance,
-    servo_response,
-)
+from drake_teleop.common.numeric import Array
+from drake_teleop.lab.analysis import one_axis
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 
 
 def two_port_matrix(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
@@ -40,12 +38,13 @@ def hybrid_matrix(
 
     `servo` replaces the axis' servo response and admittance.
     """
-    response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
+    servo = servo or (one_axis.servo_response(axis, s), one_axis.servo_admittance(axis, s))
+    response, slave_admittance = servo
     delay_factor = np.exp(-s * axis.delay)
     tool = axis.displayed_tool_mass * s
     slave = axis.position_scale * delay_factor * response
     return two_port_matrix(
-        device_impedance(axis, s) + axis.force_scale * delay_factor * tool * slave,
+        one_axis.device_impedance(axis, s) + axis.force_scale * delay_factor * tool * slave,
         axis.force_scale * delay_factor * (axis.gamma - tool * slave_admittance),
         -slave,
         slave_admittance,
@@ -92,6 +91,13 @@ def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
     return two_port_matrix(h11, h12 / root, h21 * root, h22)
 
 
+def power_scaled_matrices(H: Complex, axis: OneAxis) -> tuple[Complex, Complex]:
+    """Return H and its scattering matrix S, with the slave's power at the hand's scale."""
+    ratio = power_ratio(axis)
+    scaled = scale_slave_power(H, ratio) if ratio > 0 else H
+    return scaled, scattering_matrix(scaled, reference_impedances(axis))
+
+
 def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
     """Return H that includes parallel impedances [N s/m] of the hand and of the environment."""
     h11, h12, h21, h22 = matrix_entries(H)
@@ -104,3 +110,77 @@ def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
     """Return the impedance displayed to the hand with this impedance of the environment [N s/m]."""
     return absorb_impedances(H, environment=environment)[..., 0, 0]
+
+
+def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
+    """Return the ideal displayed impedance, set by the scales of force and motion (T52)."""
+    felt = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
+    return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * felt
+
+
+class ApparentImpedance(NamedTuple):
+    """Displayed impedance as mass, damping and stiffness."""
+
+    mass: Array  #: kg
+    damping: Array  #: N s/m
+    stiffness: Array  #: N/m
+
+
+def fit_apparent_impedance(felt: Complex, omega: Array) -> ApparentImpedance:
+    """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
+    basis = np.stack([omega, -1 / omega], axis=-1)
+    flat = felt.imag.reshape(len(omega), -1)
+    # Normalised columns: from 0.1 to 1000 rad/s they differ by eight orders of magnitude.
+    size = np.linalg.norm(basis, axis=0)
+    parts, *_ = np.linalg.lstsq(basis / size, flat, rcond=None)
+    mass, stiffness = (parts / size[:, None]).reshape(2, *felt.shape[1:])
+    return ApparentImpedance(mass, felt.real.mean(axis=0), stiffness)
+
+
+class ZWidth(NamedTuple):
+    """Impedances displayed in free motion and at a rigid wall [N s/m]."""
+
+    free: Complex
+    rigid: Complex
+
+    @property
+    def decades(self) -> Array:
+        """Dynamic range log10(|rigid| / |free|)."""
+        return np.log10(np.abs(self.rigid) / np.abs(self.free))
+
+
+def transmitted_z_width(H: Complex) -> ZWidth:
+    """Return the impedances displayed in free motion and at a rigid wall."""
+    h11, h12, h21, h22 = matrix_entries(H)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)
+    return ZWidth(h11, rigid)
+
+
+#: Smallest relative change of a stiffness that a human hand can detect: Jones and Hunter 1990, by
+#: matching of both arms, as commonly cited. Other studies: 0.19 to 0.34 for damping, 0.21 for mass.
+WEBER_FRACTION = 0.23
+
+
+def is_difference_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
+    """Return, for each frequency, whether a human notices the difference of the impedances."""
+    return np.abs(felt / ideal - 1) > WEBER_FRACTION
+
+
+def smallest_stiffness_change(H: Complex, omega: Array, stiffness: ArrayLike) -> Array:
+    """Return the smallest increase [N/m] of a wall's stiffness that a human detects, or inf."""
+    _, h12, h21, h22 = matrix_entries(H)
+    s = 1j * omega
+    environment = np.asarray(stiffness) / s
+    # |Z_to(Z_e + x / s) - Z_to(Z_e)| = |h12 h21 x / s| / |a (a + b x)| with a = 1 + h22 Z_e and
+    # b = h22 / s: at the threshold a quadratic in the increase x.
+    a, b = 1 + h22 * environment, h22 / s
+    share = WEBER_FRACTION * np.abs(transmitted_impedance(H, environment) * a * s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (share / np.abs(h12 * h21)) ** 2
+        q2 = 1 - share * np.abs(b) ** 2
+        half = share * (a * b.conj()).real
+        root = np.sqrt(half**2 + q2 * share * np.abs(a) ** 2)
+        # The smaller positive root, without cancellation.
+        change = share * np.abs(a) ** 2 / (root - half)
+    return np.where(np.isfinite(change) & (change >= 0), change, np.inf)

@@ -1,7 +1,7 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies: the whole station presses on sheet springs (`delayed_contact`), a hand lets go and
-taps (`release_and_taps`), and the longest stable round trip (`one_dof`).
+Three studies: the whole station presses on sheet springs (`whole_station`), a hand lets go and
+taps, and the longest stable round trip (`one_dof`).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,8 @@ from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.comparison import delayed_contact, one_dof
-from drake_teleop.lab.comparison.decision import decision_table
-from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
+from drake_teleop.lab.comparison import one_dof, whole_station
+from drake_teleop.lab.comparison.one_dof import PERIOD, TAP_RATES_HZ, OneDof, RunMeasures, Task
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
@@ -41,6 +41,7 @@ WALL_STIFFNESSES_N_M = (500.0, 5100.0, 20000.0)  #: N/m
 JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
+_NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
 _SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _RATES_OF_EVERY_RUN = Rates(
@@ -48,9 +49,6 @@ _RATES_OF_EVERY_RUN = Rates(
 )
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_SIMULATION_STEP_S = 2e-3
-#: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
-#: needs 9,000 to 16,000 steps per second instead of 1,500.
-_LEAF_SLIP_SPEED_M_S = 1e-3
 
 
 def compare_command(
@@ -93,6 +91,11 @@ def compare_command(
         "one_dof": limits,
         "covering": covering,
     }
+    # Workers import this module without matplotlib and polars.
+    import polars as pl
+
+    from drake_teleop.lab.comparison.report import decision_table, print_tables, write_report
+
     summary["decision"] = [
         {
             "method": method,
@@ -104,10 +107,6 @@ def compare_command(
         }
         for (method, network), cell in decision_table(summary).items()
     ]
-    import polars as pl
-
-    from drake_teleop.lab.comparison.report import print_tables, write_report
-
     with output_folder(out):
         write_table(out / "runs.parquet", pl.DataFrame(runs, infer_schema_length=None))
         write_report(summary, traces, out)
@@ -118,7 +117,7 @@ def compare_command(
 
 
 def longest_round_trip(
-    method: str, model: one_dof.OneDof, jitter: float, loss: float, seeds: Sequence[int]
+    method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
     """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
 
@@ -150,23 +149,22 @@ def simulate_press(
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Simulate a press on a sheet spring; return its table row and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
-    names = [entry.name for entry in dataclasses.fields(one_dof.RunMeasures)]
+    names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     channel, passivity = Channel(network=network), PassivityConfig(method=method)
-    setup, task = delayed_contact.delayed_contact(scenario, channel, passivity, leaf)
-    setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
+    setup, task = whole_station.delayed_contact(scenario, channel, passivity, leaf)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    shown = delayed_contact.force_and_energy_traces(result, setup)
-    held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
+    shown = whole_station.force_and_energy_traces(result, setup)
+    held = task.is_held(shown["t"])
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
-        "felt_share": max(1 + found.force_error, 0.0),
+        "felt_share": found.rendered_share,
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }
@@ -176,8 +174,8 @@ def simulate_press(
 
 
 def _run_while_stable(
-    station: Diagram, scenario: Scenario, task: one_dof.Task
-) -> tuple[SimulationResult, one_dof.RunMeasures]:
+    station: Diagram, scenario: Scenario, task: Task
+) -> tuple[SimulationResult, RunMeasures]:
     settle = scenario.simulation.settle
     simulator = simulation.MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
@@ -186,37 +184,100 @@ def _run_while_stable(
         end = 1e-3 * round(1e3 * (settle + part.end))  # exactly at the event
         simulation.advance_without_garbage_collection(simulator, end)
         result = simulation.read_recorded_signals(simulator, settle)
-        found = delayed_contact.figures_of_station_run(result, scenario, part)
+        found = whole_station.figures_of_station_run(result, scenario, part)
         if not found.stable:
             break
     # Without rest in the hold the drift is not defined.
     return result, found if part is task else dataclasses.replace(found, drift=float("nan"))
 
 
+@dataclass(frozen=True)
+class ReleaseAndTaps:
+    """Measures after the hand lets go (release) and while it taps, all >= 0."""
+
+    release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
+    release_speed: float  #: largest speed of the device in the 2 s after release [m/s]
+    release_way: float  #: largest displacement of the device in these 2 s [m]
+    tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `TAP_RATES_HZ`
+    leaked: float  #: largest energy out between hand and actual motion, beyond the stores' [J]
+
+
+def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
+    round_trip, model = 2 * PRESETS[network].delay, OneDof()
+
+    def simulate_hand(intent: Array, grip: Array | None = None) -> one_dof.OneDofRun:
+        return one_dof.run_one_dof(
+            model,
+            PassivityConfig(method=method),
+            PRESETS[network],
+            seed=seed,
+            timeout=Channel(network=network).timeout_s(PERIOD),
+            intent=intent,
+            grip=grip,
+        )
+
+    release_time = 3.0 + 3 * round_trip
+    end = release_time + 2.0
+    task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, rest_window=0.1)
+    pressing = one_dof.operator_intent(task)
+    release_row = round(release_time / PERIOD)
+    grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
+    grip[release_row:] = 0.0
+    released = simulate_hand(pressing, grip)
+    after = released.master_position[release_row:]
+    tapping = [simulate_hand(_intended_tap_motion(rate, round_trip)) for rate in TAP_RATES_HZ]
+    scale = model.force_scale * model.gamma
+    return ReleaseAndTaps(
+        release_force=float(np.abs(released.hand_force[release_row - 100 : release_row]).mean()),
+        release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
+        release_way=float(np.abs(after - after[0]).max()),
+        tap_shares=tuple(
+            _tap_impulse_share(found, scale, rate, 0.5 * round_trip)
+            for found, rate in zip(tapping, TAP_RATES_HZ, strict=True)
+        ),
+        leaked=max(0.0, *(-run.least_energy_sum(one_dof.ACTUAL) for run in (released, *tapping))),
+    )
+
+
+def _intended_tap_motion(rate: float, round_trip: float) -> Array:
+    t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
+    moving = (t > 0.0) & (t < _NUM_TAPS / rate)
+    x = np.where(moving, -_TAP_AMPLITUDE_ABOUT_WALL_M * np.sin(2 * np.pi * rate * t), 0.0)
+    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+
+
+def _tap_impulse_share(
+    run: one_dof.OneDofRun, scale: float, rate: float, one_way_delay_s: float
+) -> float:
+    first = int(np.argmax(run.wall_force < 0.0))
+    second = first + round(0.75 / rate / PERIOD)  # between first and second contact
+    pressed = scale * run.wall_force[second:].sum()
+    felt = run.hand_force[second + round(one_way_delay_s / PERIOD) :].sum()
+    return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0
+
+
 def _run_one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
-    cases = list(itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS))
+    cases = [
+        (method, wall, jitter, loss)
+        for method in methods
+        for wall, (jitter, loss) in itertools.product(WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
+    ]
     # Compile here once, so that the parallel processes read the cache.
-    longest_round_trip(methods[0], one_dof.OneDof(), 0.0, 0.0, [seed])
+    longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
-    seeds = range(seed, seed + 2)
+    seeds = [seed, seed + 1]
     runs = [
-        (method, one_dof.OneDof(wall_stiffness=wall), *impairment, seeds)
-        for method, wall, impairment in cases
+        (method, OneDof(wall_stiffness=wall), jitter, loss, seeds)
+        for method, wall, jitter, loss in cases
     ]
     found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
+    names, grid = ("method", "wall_N_per_m", "jitter", "loss"), list(ROUND_TRIPS_S)
     return [
-        {
-            "method": method,
-            "wall_N_per_m": wall,
-            "jitter": jitter,
-            "loss": loss,
-            "longest_s": longest,
-            "grid_s": list(ROUND_TRIPS_S),
-        }
-        for (method, wall, (jitter, loss)), longest in zip(cases, found, strict=True)
+        dict(zip(names, case, strict=True)) | {"longest_s": longest, "grid_s": grid}
+        for case, longest in zip(cases, found, strict=True)
     ]
 
 
@@ -238,10 +299,10 @@ def _run_station_study(
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
-    cases = list(itertools.product(slowest, delayed_contact.LEAF_THICKNESSES_M, methods))
+    cases = list(itertools.product(slowest, whole_station.LEAF_THICKNESSES_M, methods))
     runs = [(base, method, network, leaf, estimate) for network, leaf, method in cases]
     results = _run_in_processes(simulate_press, runs, jobs, stage("The whole station"))
-    leaves = list(delayed_contact.LEAF_THICKNESSES_M)
+    leaves = list(whole_station.LEAF_THICKNESSES_M)
     rows = [row for row, _ in results]
     rows.sort(key=lambda row: (networks.index(row["network"]), leaves.index(row["leaf"])))
     traces = {
@@ -255,7 +316,7 @@ def _run_station_study(
 def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
     for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
-        model = one_dof.OneDof(sigma=sigma, wall_stiffness=wall)
+        model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
         row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.ACTUAL))

@@ -38,6 +38,7 @@ HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
+TAP_RATES_HZ = (1.0, 1.5)  #: Hz
 WRIST_TO_TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
@@ -54,6 +55,10 @@ class Task:
     release_end: float = 12.5
     end: float = 17.0
     rest_window: float = 1.9  #: length of the windows in which rest is required
+
+    def is_held(self, t: Array) -> NDArray[np.bool_]:
+        """Return whether times (N,) [s] are in the window of rest during the hold."""
+        return (t >= self.release_start - self.rest_window) & (t < self.release_start)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +144,11 @@ class RunMeasures:
     free_force: float  #: rms force on the hand in free motion [N]
     rise_delay: float  #: from contact force to felt force at half the steady felt force [s], or NaN
     least_energy: float  #: least energy from both ends into the channel [J]; negative: active
+
+    @property
+    def rendered_share(self) -> float:
+        """Rendered share of the scaled contact force, or NaN."""
+        return max(1.0 + self.force_error, 0.0)
 
 
 def run_one_dof(

@@ -1,8 +1,9 @@
-"""Report of `drake-teleop compare-passivity`: one page with tables and pictures."""
+"""Report of `drake-teleop compare-passivity`: verdicts of docs/delay.md, tables and pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,13 @@ from matplotlib.patches import Rectangle
 from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
-from drake_teleop.lab.comparison.decision import (
-    VERDICT_CHATTERS,
-    VERDICT_HOLDS,
-    VERDICT_LEAKS,
-    VERDICT_POSITION_ERROR,
-    VERDICT_UNSTABLE,
-    decision_table,
-)
-from drake_teleop.lab.comparison.release_and_taps import TAP_RATES_HZ
+from drake_teleop.lab.comparison.one_dof import TAP_RATES_HZ, WRIST_TO_TIP_DISTANCE_M
 from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N
+
+VERDICT_UNSTABLE, VERDICT_POSITION_ERROR = "unstable", "position error"
+VERDICT_CHATTERS, VERDICT_LEAKS, VERDICT_HOLDS = "chatters", "leaks", "holds"
+MAX_POSITION_ERROR_M, MIN_LEAKED_ENERGY_J = 5e-3, 1e-3  #: m; J
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
 RUN_COLUMNS = (
@@ -78,6 +76,70 @@ def run_cells(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
+@dataclass(frozen=True)
+class MethodResult:
+    """Result of one method over one network."""
+
+    verdict: str
+    #: For each leaf, means in the hold of the force on the hand and the scaled contact force [N].
+    force_pairs: tuple[tuple[float, float], ...] = ()
+    motion_texts: tuple[str, ...] = ()  #: for each leaf, motion in the hold as text; stable: empty
+    leaked_J: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
+
+    @property
+    def verdict_text(self) -> str:
+        if self.verdict != VERDICT_LEAKS or self.leaked_J is None:
+            return self.verdict
+        number, unit = (1e3 * self.leaked_J, "mJ") if self.leaked_J < 1.0 else (self.leaked_J, "J")
+        return f"leaks {_format_two_significant_digits(number)} {unit}"
+
+    @property
+    def least_displayed_share_text(self) -> str:
+        """Least displayed over scaled contact force of all sheet springs [%]; "" if unstable."""
+        shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
+        return f"{min(shares):.0%}" if shares else ""
+
+
+def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
+    """Return the result of each (method, network) in a summary."""
+    table = {}
+    for row in summary["hands"]:
+        key = row["method"], row["network"]
+        runs = [run for run in summary["station"] if (run["method"], run["network"]) == key]
+        table[key] = _summarise_runs_of_method(runs, row["leaked"])
+    return table
+
+
+def _summarise_runs_of_method(
+    runs: Sequence[Mapping[str, Any]], leaked_J_in_release_and_taps: float
+) -> MethodResult:
+    if not all(run["stable"] for run in runs):
+        motions = tuple(map(_describe_motion_in_hold, runs))
+        return MethodResult(VERDICT_UNSTABLE, motion_texts=motions)
+    leaked = max(leaked_J_in_release_and_taps, *(run["leaked"] for run in runs))
+    forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
+    if max(run["left_behind"] for run in runs) > MAX_POSITION_ERROR_M:
+        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
+    if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_RMS_AT_REST_N:
+        return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
+    verdict = VERDICT_LEAKS if leaked > MIN_LEAKED_ENERGY_J else VERDICT_HOLDS
+    return MethodResult(verdict, forces, leaked_J=leaked)
+
+
+def _describe_motion_in_hold(run: Mapping[str, Any]) -> str:
+    if run["stable"]:
+        return "at rest"
+    if run["hunting"] is None:
+        return "ended early"
+    if WRIST_TO_TIP_DISTANCE_M * run["turning"] > run["hunting"]:
+        return f"turns by {_format_two_significant_digits(1e3 * run['turning'])} mrad"
+    return f"moves by {_format_two_significant_digits(1e3 * run['hunting'])} mm"
+
+
+def _format_two_significant_digits(number: float) -> str:
+    return f"{float(f'{number:.2g}'):g}"
+
+
 def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
     methods, networks, table = summary["methods"], summary["networks"], decision_table(summary)
     with plot_style():
@@ -89,22 +151,19 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
             lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
             lines += cell.motion_texts
-            offset = 0.12 * len(lines)
             style: dict[str, Any] = {"color": text_colour, "ha": "center", "va": "center"}
-            title = f"{mark} {cell.verdict_text}"
-            axes.text(x, y - offset, title, size=9.5, weight="bold", **style)
-            for place, line in enumerate(lines):
-                axes.text(x, y - offset + 0.27 * (place + 1), line, size=8.5, **style)
-        axes.set_xlim(-0.5, len(networks) - 0.5)
-        axes.set_ylim(len(methods) - 0.5, -0.5)
+            y -= 0.12 * len(lines)
+            axes.text(x, y, f"{mark} {cell.verdict_text}", size=9.5, weight="bold", **style)
+            for place, line in enumerate(lines, 1):
+                axes.text(x, y + 0.27 * place, line, size=8.5, **style)
+        axes.set(xlim=(-0.5, len(networks) - 0.5), ylim=(len(methods) - 0.5, -0.5))
         names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
         axes.set_xticks(range(len(networks)), names)
         axes.set_yticks(range(len(methods)), methods)
         axes.xaxis.tick_top()
         axes.tick_params(length=0)
         axes.grid(False)
-        for side in axes.spines.values():
-            side.set_visible(False)
+        axes.spines[:].set_visible(False)
         figure.suptitle("Verdict of each method over each network", x=0.01, ha="left")
     return figure
 
@@ -128,14 +187,13 @@ def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
                 marker, colour = _NETWORK_MARKERS[place % 5], COLOURS[place % len(COLOURS)]
                 x = [max(value(row), 0.0) for row in shown]
                 axes.plot(x, y, marker, markersize=5, color=colour, label=network)
-            axes.set_xscale(scale)
+            axes.set(xscale=scale, xlabel=title)
             if scale == "log":
                 axes.xaxis.set_major_formatter("{x:g}")
             else:
                 axes.set_xlim(left=0.0)
             axes.set_yticks(range(len(methods)), methods)
             axes.set_ylim(len(methods) - 0.5, -0.5)
-            axes.set_xlabel(title)
         figure.legend(*columns[0].get_legend_handles_labels(), loc="outside upper center", ncols=6)
     return figure
 
@@ -197,12 +255,11 @@ def draw_round_trip_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 shortest, longest = max(min(found), 1.0), max(max(found), 1.0)
                 axes.plot([1.0, shortest], [place, place], color=COLOURS[0], linewidth=5)
                 axes.plot([shortest, longest], [place, place], color=COLOURS[5], linewidth=2)
-            axes.set_xscale("log")
-            axes.set_xlim(1.0, 1e3 * max(rows[0]["grid_s"]))
+            axes.set(xscale="log", xlim=(1.0, 1e3 * max(rows[0]["grid_s"])))
             axes.set_yticks(range(len(methods)), methods)
             axes.invert_yaxis()
-            axes.set_title(f"wall of {wall / 1e3:g} kN/m")
-            axes.set_xlabel("longest stable round trip [ms]")
+            title, label = f"wall of {wall / 1e3:g} kN/m", "longest stable round trip [ms]"
+            axes.set(title=title, xlabel=label)
     return figure
 
 

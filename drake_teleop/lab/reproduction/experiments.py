@@ -32,82 +32,74 @@ _CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class FreeMotionRun:
-    """Recorded free movement.
-
-    `scaled_wrenches`: sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave.
-    """
+class MotionRun:
+    """Recorded movement, with the load's wrench scaled."""
 
     scenario: Scenario
     result: SimulationResult
+    #: Sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave. 1: measured wrench
+    #: without offsets; 0: calculated contact wrench.
     scaled_wrenches: dict[float, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class IdealSensorRun:
-    """Free movement with exact wrench and motion instead of sensor readings.
+    """Free movement with exact wrench and motion instead of sensor readings."""
 
-    Attributes:
-        weld_reaction: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So.
-        sensor_motion: specific force, angular velocity and angular acceleration of S, (N, 3) each.
-        phi: (10,) true load.
-    """
-
-    weld_reaction: Array
+    weld_reaction: Array  #: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So
+    #: Specific force, angular velocity and angular acceleration of S, (N, 3) each.
     sensor_motion: tuple[Array, Array, Array]
-    phi: Array
+    phi: Array  #: (10,) true load
 
 
 @dataclass(frozen=True, eq=False)
 class RunsWithAndWithoutContact:
-    """Recorded contact transition, and the same movement without the sheet spring.
+    """Recorded contact transition, and the same movement without the sheet spring."""
 
-    Attributes:
-        measured_wrench: (N, 6) measured wrench without offsets, F - F_o.
-        calculated_wrench: (N, 6) calculated contact wrench.
-        in_contact: (N,) True in true contact.
-        threshold_N: force threshold of the contact detection [N].
-    """
+    touched: MotionRun
+    free: MotionRun
 
-    scenario: Scenario
-    contact_result: SimulationResult
-    free_result: SimulationResult
-    measured_wrench: Array
-    calculated_wrench: Array
-    measured_wrench_free: Array
-    calculated_wrench_free: Array
-    in_contact: NDArray[np.bool_]
-    threshold_N: float
+    @property
+    def in_contact(self) -> NDArray[np.bool_]:
+        """(N,) True in true contact."""
+        return is_in_contact(self.touched.result)
+
+    @property
+    def response_span_s(self) -> tuple[float, float]:
+        """First contact, and end of the filters' response to the last; inf without contact [s]."""
+        times = self.touched.result.t[self.in_contact]
+        return (times[0], times[-1] + FILTER_TAIL_S) if len(times) else (np.inf, np.inf)
+
+    @property
+    def threshold_N(self) -> float:
+        """Force threshold of the contact detection [N]."""
+        free_force = self.free.scaled_wrenches[0.0][:, :3]
+        return _CONTACT_THRESHOLD_OVER_FREE_PEAK * _largest_norm(free_force)
 
 
-def simulate_free_motion(
-    scenario: Scenario, estimate: Array, progress: UpdateProgress
-) -> FreeMotionRun:
-    """Simulate a free movement and calculate the scaled wrench for each sigma."""
-    result = _run_station(scenario, estimate, progress)
-    scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
-    return FreeMotionRun(scenario, result, scaled)
+def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> MotionRun:
+    """Simulate a movement and calculate the scaled wrench for each sigma."""
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    result = simulate(station, scenario.simulation, progress=progress)
+    wrench, s, omega, alpha = sensor_samples(result)
+    offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
+    scaled = {}
+    for sigma in SIGMAS:
+        scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}
+        parts = wrench, offsets, s, omega, alpha, phi, no_object
+        scaled[sigma] = scaled_wrench(*parts, **scales)
+    return MotionRun(scenario, result, scaled)
 
 
 def simulate_contact(
     scenario: Scenario, estimate: Array, stage: StartStage
 ) -> RunsWithAndWithoutContact:
-    """Simulate the contact transition with and without the sheet spring."""
-    touched = _run_station(scenario, estimate, stage("Fig. 8: contact transition"))
-    free_stage = stage("Fig. 8: the same without contact")
-    free = _run_station(without_leaf_spring_with_next_seed(scenario), estimate, free_stage)
-    calculated_free = _scaled_wrench_at_slave(free, estimate, 0.0)
-    return RunsWithAndWithoutContact(
-        scenario=scenario,
-        contact_result=touched,
-        free_result=free,
-        measured_wrench=_scaled_wrench_at_slave(touched, estimate, 1.0),
-        calculated_wrench=_scaled_wrench_at_slave(touched, estimate, 0.0),
-        measured_wrench_free=_scaled_wrench_at_slave(free, estimate, 1.0),
-        calculated_wrench_free=calculated_free,
-        in_contact=is_in_contact(touched),
-        threshold_N=_CONTACT_THRESHOLD_OVER_FREE_PEAK * float(_force_norms(calculated_free).max()),
-    )
+    """Simulate the contact transition, and it without sheet spring and with the next seed."""
+    seed = scenario.simulation.seed
+    without = replace(scenario, sheet_spring=None, simulation__seed=seed + 1)
+    touched = simulate_motion(scenario, estimate, stage("Fig. 8: contact transition"))
+    free = simulate_motion(without, estimate, stage("Fig. 8: the same without contact"))
+    return RunsWithAndWithoutContact(touched, free)
 
 
 def simulate_ideal_motion(progress: UpdateProgress) -> IdealSensorRun:
@@ -154,7 +146,7 @@ def wrench_errors_of_ideal_run(run: IdealSensorRun) -> NamedValues:
     }
 
 
-def peaks_and_residuals_of_free_run(run: FreeMotionRun, component: int, unit: str) -> NamedValues:
+def peaks_and_residuals_of_free_run(run: MotionRun, component: int, unit: str) -> NamedValues:
     """Return peak, RMS ratio and residuals of a wrench component by name, as in Fig. 6 and 7."""
     raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
@@ -172,23 +164,22 @@ def peaks_and_residuals_of_free_run(run: FreeMotionRun, component: int, unit: st
 
 def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedValues:
     """Return times of contact and detection, peaks and residuals by name, as in Fig. 8."""
-    t, force_norm = run.contact_result.t, _force_norms(run.calculated_wrench)
-    detected = force_norm > run.threshold_N
-    window = _contact_window(run)
-    after = t > t[window][-1] if window.any() else np.zeros(len(t), dtype=bool)
+    result, free_residual = run.touched.result, run.free.scaled_wrenches[0.0]
+    measured, calculated = (run.touched.scaled_wrenches[sigma] for sigma in (1.0, 0.0))
+    t, detected = result.t, np.linalg.norm(calculated[:, :3], axis=1) > run.threshold_N
     return {
         "true_s": _time_of_first_true(t, run.in_contact),
         "detected_s": _time_of_first_true(t, detected),
         "threshold_N": run.threshold_N,
         "raw_detectable": bool(largest_raw_force_beyond_free_range(run).max() > 0),
-        "false_alarm_0_6_s": bool(detected[after].any()),
-        "peak_contact_N": float(force_norm.max()),
-        "peak_true_contact_N": _largest_norm(run.contact_result["true_contact_wrench_W"][:, :3]),
-        "peak_inertial_N": _largest_norm((run.measured_wrench - run.calculated_wrench)[:, :3]),
+        "false_alarm_0_6_s": bool(detected[t > run.response_span_s[1]].any()),
+        "peak_contact_N": _largest_norm(calculated[:, :3]),
+        "peak_true_contact_N": _largest_norm(result["true_contact_wrench_W"][:, :3]),
+        "peak_inertial_N": _largest_norm((measured - calculated)[:, :3]),
         "duration_s": float(np.count_nonzero(run.in_contact) * (t[1] - t[0])),
-        "largest_deflection_mm": 1e3 * float(np.abs(run.contact_result["sheet_state"][:, 0]).max()),
-        "free_residual_norm_max_N": float(_force_norms(run.calculated_wrench_free).max()),
-        "free_residual_norm_max_Nm": _largest_norm(run.calculated_wrench_free[:, 3:]),
+        "largest_deflection_mm": 1e3 * float(np.abs(result["sheet_state"][:, 0]).max()),
+        "free_residual_norm_max_N": _largest_norm(free_residual[:, :3]),
+        "free_residual_norm_max_Nm": _largest_norm(free_residual[:, 3:]),
     }
 
 
@@ -198,12 +189,21 @@ def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array
     Negative: a value stays within, so that no threshold on it detects the contact.
     """
     touched, free = (
-        np.column_stack([raw[:, :3], _force_norms(raw)])
-        for raw in (run.measured_wrench[_contact_window(run)], run.measured_wrench_free)
+        np.column_stack([force, np.linalg.norm(force, axis=1)])
+        for force in (one.scaled_wrenches[1.0][:, :3] for one in (run.touched, run.free))
     )
+    t, (start, end) = run.touched.result.t, run.response_span_s
+    touched = touched[(t >= start) & (t <= end)]
     if not len(touched):
         return np.full(4, -np.inf)
     return np.maximum(touched.max(0) - free.max(0), free.min(0) - touched.min(0))
+
+
+def time_of_largest_raw_force_after_contact(run: RunsWithAndWithoutContact) -> float | None:
+    """Return the time of the largest raw force after contact [s], or None."""
+    t, (_, end) = run.touched.result.t, run.response_span_s
+    force = np.linalg.norm(run.touched.scaled_wrenches[1.0][t > end, :3], axis=1)
+    return float(t[t > end][np.argmax(force)]) if len(force) else None
 
 
 def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> NamedValues:
@@ -228,48 +228,9 @@ def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> Na
     }
 
 
-def without_leaf_spring_with_next_seed(scenario: Scenario) -> Scenario:
-    """Return the scenario without the sheet spring, with the next seed."""
-    return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
-
-
-def _run_station(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> SimulationResult:
-    station = MakeTeleopStation(scenario, load_estimate=estimate)
-    return simulate(station, scenario.simulation, progress=progress)
-
-
 def true_offsets_and_phi(scenario: Scenario) -> Array:
     """Return the true sensor offsets and phi (16,) of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
-
-
-def _scaled_wrench_at_slave(result: SimulationResult, estimate: Array, sigma: float) -> Array:
-    wrench, s, omega, alpha = sensor_samples(result)
-    offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
-    scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}
-    return scaled_wrench(wrench, offsets, s, omega, alpha, phi, no_object, **scales)
-
-
-def _contact_window(run: RunsWithAndWithoutContact) -> NDArray[np.bool_]:
-    t = run.contact_result.t
-    if not run.in_contact.any():
-        return run.in_contact
-    times = t[run.in_contact]
-    return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL_S)
-
-
-def time_of_largest_raw_force_after_contact(run: RunsWithAndWithoutContact) -> float | None:
-    """Return the time of the largest raw force after contact [s], or None."""
-    t, force_norm = run.contact_result.t, _force_norms(run.measured_wrench)
-    window = _contact_window(run)
-    if not window.any():
-        return None
-    force_norm[t <= t[window][-1]] = 0.0
-    return float(t[np.argmax(force_norm)])
-
-
-def _force_norms(wrench: Array) -> Array:
-    return np.linalg.norm(wrench[:, :3], axis=1)
 
 
 def _largest_norm(vectors: Array) -> float:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import math
+import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common import files
 from drake_teleop.common.progress import UpdateProgress, show_progress
@@ -13,14 +16,17 @@ from drake_teleop.lab.identification import (
     LoadIdentification,
     identification_scenario,
     identify_load,
+    true_load,
 )
-from drake_teleop.lab.reproduction import experiments, report, speed
-from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
+from drake_teleop.lab.reproduction import experiments, report
 from drake_teleop.station.replay import write_replay
-from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.station import MakeTeleopStation
 
-_FORCE_Z_INDEX, _TORQUE_X_INDEX = 2, 3
+_NUM_TIMINGS, _SIMULATED_TIME_PER_TIMING_S = 11, 0.1  # simulated time of one measurement [s]
 
 
 def reproduce_command(
@@ -41,25 +47,32 @@ def reproduce_command(
         )
         load = identify_load(identification_scenario(force, seed), stage)
         estimate = load.estimate
-        simulate_free = experiments.simulate_free_motion
-        force_run = simulate_free(force, estimate, stage("Fig. 6: vertical free motion"))
-        torque_run = simulate_free(torque, estimate, stage("Fig. 7: horizontal free motion"))
+        simulate = experiments.simulate_motion
+        force_run = simulate(force, estimate, stage("Fig. 6: vertical free motion"))
+        torque_run = simulate(torque, estimate, stage("Fig. 7: horizontal free motion"))
         about_all_axes = stage("Rotation about all axes, ideal sensor")
         ideal_run = experiments.simulate_ideal_motion(about_all_axes)
         contact_run = experiments.simulate_contact(contact, estimate, stage)
         measure_free_run = experiments.peaks_and_residuals_of_free_run
         summary = {
-            "free_force": measure_free_run(force_run, _FORCE_Z_INDEX, "N"),
-            "free_torque": measure_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
+            "free_force": measure_free_run(force_run, report.FORCE_Z_INDEX, "N"),
+            "free_torque": measure_free_run(torque_run, report.TORQUE_X_INDEX, "Nm"),
             "ideal": experiments.wrench_errors_of_ideal_run(ideal_run),
             "contact": experiments.detection_and_peaks_of_contact_run(contact_run),
             "identification": experiments.errors_of_identification(load, force),
         }
         session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
-        pictures = draw_figures(force_run, torque_run, contact_run, summary)
+        detected_s = summary["contact"]["detected_s"]
+        pictures = {
+            "fig6": report.scaling_figure(force_run, report.FORCE_Z_INDEX, "$f_z$", "N"),
+            "fig7": report.scaling_figure(torque_run, report.TORQUE_X_INDEX, r"$\tau_x$", "N m"),
+            "fig8": report.contact_figure(contact_run, detected_s),
+        }
+        runs = dict(zip(names, (force_run, torque_run, contact_run.touched), strict=True))
+        runs["contact_transition_without_sheet"] = contact_run.free
         written = stage("Write figures, replay and report")
         with files.output_folder(out):
-            _write_results(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
+            _write_results(out, seed, summary, load, runs, pictures)
             files.write_json(out / "session.json", session)
             files.write_json(out / "summary.json", summary)
         written(1.0)
@@ -68,49 +81,55 @@ def reproduce_command(
     return summary | session
 
 
-def draw_figures(
-    force: experiments.FreeMotionRun,
-    torque: experiments.FreeMotionRun,
-    contact: experiments.RunsWithAndWithoutContact,
-    summary: experiments.NamedValues,
-) -> dict[str, Figure]:
-    pictures = {
-        name: scaling_figure(
-            run.result.t,
-            [run.scaled_wrenches[sigma][:, component] for sigma in experiments.SIGMAS],
-            experiments.SIGMAS,
-            symbol=symbol,
-            unit=unit,
-            downscaling=1 / run.scenario.force_scaling.force_scale,
-        )
-        for name, run, component, symbol, unit in (
-            ("fig6", force, _FORCE_Z_INDEX, "$f_z$", "N"),
-            ("fig7", torque, _TORQUE_X_INDEX, r"$\tau_x$", "N m"),
-        )
-    }
-    detected = summary["contact"]["detected_s"]
-    pictures["fig8"] = contact_figure(
-        contact.contact_result.t,
-        contact.measured_wrench[:, _FORCE_Z_INDEX],
-        contact.calculated_wrench[:, _FORCE_Z_INDEX],
-        symbol="$f_z$",
-        contact=contact.in_contact,
-        detected_s=math.nan if detected is None else detected,
-        threshold=contact.threshold_N,
-        turning_s=experiments.time_of_largest_raw_force_after_contact(contact),
-    )
-    return pictures
-
-
 def _measure_simulation_speed(progress: UpdateProgress) -> experiments.NamedValues:
     scenario = LoadScenario("free_motion_force")
-    simulators = {"bare": speed.MakeBarePlantSimulator(scenario)}
-    simulators["station"] = speed.MakeSettledStationSimulator(scenario)
-    cost = speed.cpu_time_per_simulated_second(simulators, progress=progress)
+    simulators = {"bare": MakeBarePlantSimulator(scenario)}
+    simulators["station"] = MakeSettledStationSimulator(scenario)
+    cost = cpu_time_per_simulated_second(simulators, progress=progress)
     return {
         "real_time_factor": 1 / cost["station"],
         "cost_over_bare_plant": cost["station"] / cost["bare"],
     }
+
+
+def MakeBarePlantSimulator(scenario: Scenario) -> Simulator:
+    """Return a simulator of arm and tool under constant holding torque."""
+    builder = DiagramBuilder()
+    slave = AddSlavePlant(builder, scenario.slave, None)
+    step = 1 / scenario.rates.sensor_hz
+    simulation = Simulation(integrator="runge_kutta2", max_step=step)
+    simulator = MakeSimulator(builder.Build(), simulation)
+    context = slave.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    gravity = slave.plant.CalcGravityGeneralizedForces(context)
+    torque = -slave.plant.GetVelocitiesFromArray(slave.instance, gravity)
+    slave.plant.get_actuation_input_port(slave.instance).FixValue(context, list(torque))
+    simulator.Initialize()
+    return simulator
+
+
+def MakeSettledStationSimulator(scenario: Scenario) -> Simulator:
+    """Return a simulator of the station, advanced to the end of its settling time."""
+    # The value of the estimate does not change the cost.
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    simulator = MakeSimulator(station, scenario.simulation)
+    simulator.Initialize()
+    advance_without_garbage_collection(simulator, scenario.simulation.settle)
+    return simulator
+
+
+def cpu_time_per_simulated_second(
+    simulators: Mapping[str, Simulator], *, progress: UpdateProgress = lambda done: None
+) -> dict[str, float]:
+    """Return the least CPU time per simulated second of each simulator."""
+    times_s: dict[str, list[float]] = {name: [] for name in simulators}
+    for k in range(_NUM_TIMINGS):
+        for name, simulator in simulators.items():
+            start = time.thread_time()
+            end = simulator.get_context().get_time() + _SIMULATED_TIME_PER_TIMING_S
+            advance_without_garbage_collection(simulator, end)
+            times_s[name].append((time.thread_time() - start) / _SIMULATED_TIME_PER_TIMING_S)
+        progress((k + 1) / _NUM_TIMINGS)
+    return {name: min(times) for name, times in times_s.items()}
 
 
 def _write_results(
@@ -118,32 +137,25 @@ def _write_results(
     seed: int,
     summary: experiments.NamedValues,
     load: LoadIdentification,
-    runs: tuple[
-        experiments.FreeMotionRun, experiments.FreeMotionRun, experiments.RunsWithAndWithoutContact
-    ],
+    runs: dict[str, experiments.MotionRun],
     pictures: dict[str, Figure],
 ) -> None:
-    force, torque, contact = runs
-    without_sheet = experiments.without_leaf_spring_with_next_seed(contact.scenario)
+    scenario, contact = runs["free_motion_force"].scenario, runs["contact_transition"]
+    logs = {"identification": (load.result, identification_scenario(scenario, seed))}
+    logs |= {name: (run.result, run.scenario) for name, run in runs.items()}
     files.make_folder(out / "logs")
-    for name, result, scenario in (
-        ("identification", load.result, identification_scenario(force.scenario, seed)),
-        ("free_motion_force", force.result, force.scenario),
-        ("free_motion_torque", torque.result, torque.scenario),
-        ("contact_transition", contact.contact_result, contact.scenario),
-        ("contact_transition_without_sheet", contact.free_result, without_sheet),
-    ):
+    for name, (result, of_log) in logs.items():
         result.write_parquet(out / "logs" / f"{name}.parquet")
-        write_scenario(out / "logs" / f"{name}.yaml", scenario)
+        write_scenario(out / "logs" / f"{name}.yaml", of_log)
     files.write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
     # The contact lasts 40 ms.
-    write_replay(out / "replay.html", contact.contact_result, contact.scenario, slow_motion=8.0)
+    write_replay(out / "replay.html", contact.result, contact.scenario, slow_motion=8.0)
     figures = report.values_by_full_name(summary)
     files.write_text(out / "table.md", _markdown_table(report.compare_with_paper(figures)))
-    true = experiments.true_offsets_and_phi(force.scenario)
+    true = experiments.true_offsets_and_phi(scenario)
     rows = report.parameter_rows(true, load.estimate, load.batch.standard_deviations)
-    setup = _describe_setup(seed, force.scenario, load)
+    setup = _describe_setup(seed, scenario, load)
     report.write_report(out, pictures, setup=setup, summary=figures, parameters=rows)
 
 

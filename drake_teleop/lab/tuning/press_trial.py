@@ -1,8 +1,9 @@
-"""Trials of settings: a simulated hand swings, presses and holds."""
+"""Trials of settings for given hands, walls and network: a hand swings, presses and holds."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,35 +11,29 @@ import numpy as np
 from scipy.fft import dct
 from scipy.optimize import bisect
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.analysis.analyze import sampling_of_scenario
+from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
-from drake_teleop.lab.analysis.one_axis import AxisParameters
-from drake_teleop.lab.analysis.summary_values import axis_with_grip
+from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
-from drake_teleop.lab.comparison.delayed_contact import delayed_contact, figures_of_station_run
-from drake_teleop.lab.comparison.one_dof import (
-    OneDof,
-    Task,
-    figures_of_run,
-    operator_intent,
-    run_one_dof,
-)
+from drake_teleop.lab.comparison import one_dof
+from drake_teleop.lab.comparison.one_dof import OneDof, Task
+from drake_teleop.lab.comparison.whole_station import delayed_contact, figures_of_station_run
 from drake_teleop.lab.studies.design import FactorValues
-from drake_teleop.lab.tuning.stated_set import StatedSet
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.tdpa import charged_tdpa_config
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
-MAX_REST_FORCE_N = 0.05
-"""Rms of the rendered force above `MIN_REST_FORCE_FREQUENCY_HZ` that is accepted at rest [N]."""
-MIN_REST_FORCE_FREQUENCY_HZ = 5.0
 MAX_RENDERED_FORCE_ERROR = 0.1
 """Largest accepted error of the rendered force, as a share of the scaled contact force."""
 MAX_TUNED_FORCE_ERROR = 0.075
@@ -49,12 +44,114 @@ _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window 
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_PRESS_DEPTH_M = 0.02
 _USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
-_LEAF_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _FILTER_DELAY_TIMES_BANDWIDTH = 0.416  # of the 4th-order Butterworth filter
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
+_MIN_WALL_N_M, _MAX_WALL_N_M = 100.0, 60e3  # N/m, range of the leaf's model
+_NUM_TESTED_WALLS = 4  # from the softest to the stiffest
+_MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
 GIVEN_SETTINGS_NAME = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
+
+
+@dataclass(frozen=True)
+class TaskRequirements:
+    """Requirements of a task."""
+
+    loop_gain_margin: float  #: factor of the loop gain that must still be stable
+    min_low_pass_hz: float  #: lowest bandwidth of the sensor; a lower one delays the contact force
+
+
+REQUIREMENTS_OF_TASK = {
+    "press": TaskRequirements(1.1, 50.0),
+    "touch": TaskRequirements(1.1, 100.0),
+    "insert": TaskRequirements(1.5, 50.0),
+}
+"""Tasks by name. A peg jams between two walls, which doubles the stiffness: a larger margin."""
+
+
+@dataclass(frozen=True)
+class StatedSet:
+    """Hands, walls and task for which the settings must hold."""
+
+    hands: tuple[str, ...]  #: names of all grips from the softest to the firmest
+    walls: tuple[float, float]  #: lowest and highest stiffness [N/m]
+    task: str  #: key of `REQUIREMENTS_OF_TASK`
+
+    @property
+    def corners(self) -> list[tuple[str, float]]:
+        """Softest and firmest grip at the softest and stiffest wall; the stiffest wall first."""
+        hands = dict.fromkeys((self.hands[0], self.hands[-1]))
+        return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
+
+    @property
+    def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
+        """Factor of gamma, grips and walls of each part of the tests; each has its own seed.
+
+        The softest grip fails first: it is tested twice. The last part has no margin.
+        """
+        low, high = self.walls
+        margin, hands = self.requirements.loop_gain_margin, list(self.hands)
+        walls = np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()
+        parts = [(margin, part, walls) for part in (hands[:1], hands[:1], hands[1:]) if part]
+        return [*parts, (1.0, [*dict.fromkeys((hands[0], hands[-1]))], [high])]
+
+    @property
+    def requirements(self) -> TaskRequirements:
+        return REQUIREMENTS_OF_TASK[self.task]
+
+
+def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
+    """Return the set of these grips, walls [kN/m] and this task."""
+    _check_names("hands", hands, tuple(GRIP_IMPEDANCES))
+    _check_names("task", [task], tuple(REQUIREMENTS_OF_TASK))
+    if not hands:
+        raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
+    if not walls:
+        remedy = "give kN/m, such as 0.5,20"
+        raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
+    for wall in walls:
+        if not _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M:
+            lowest, highest = _MIN_WALL_N_M / 1e3, _MAX_WALL_N_M / 1e3
+            what = f"{wall:g} kN/m is outside {lowest:g} to {highest:g} kN/m"
+            raise DrakeTeleopError(what, where="walls", remedy="give stiffnesses in kN/m")
+    grips = list(GRIP_IMPEDANCES)
+    places = list(map(grips.index, hands))
+    between = tuple(grips[min(places) : max(places) + 1])
+    return StatedSet(between, (1e3 * min(walls), 1e3 * max(walls)), task)
+
+
+def _check_names(where: str, names: Sequence[str], known: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in known:
+            remedy = suggest_name(name, known, f"choose among {', '.join(known)}")
+            raise DrakeTeleopError(f"'{name}' is unknown", where=where, remedy=remedy)
+
+
+def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
+    """Return the scenario with sigma 0, without environment, task and method.
+
+    `network` is a preset; None keeps the scenario's network.
+    """
+    if network is not None:
+        _check_names("network", [network], tuple(PRESETS))
+        scenario = replace(scenario, channel=Channel(network=network))
+    if scenario.has_no_network_or_passivity:
+        what = "the scenario has neither network nor passivity method"
+        what += ", which the energy balances of the runs need"
+        remedy = f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}"
+        raise DrakeTeleopError(what, where="network", remedy=remedy)
+    force_scale = scenario.force_scaling.force_scale
+    simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
+    return replace(
+        scenario.without_environment(),
+        simulation=simulation,
+        passivity=PassivityConfig(),
+        force_scaling=ForceScalingConfig(sigma=0.0, force_scale=force_scale),
+        contact_detection=None,
+        operator__intent=[],
+        operator__task=None,
+    )
 
 
 @dataclass(frozen=True)
@@ -75,12 +172,17 @@ class TunedSettings:
 
     def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
         sensor = base.wrist_sensor
-        if not sensor.ideal:
-            sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
-        scaling = dataclasses.replace(base.force_scaling, sigma=0.0, eta=None, sigma_weight=0.0)
-        scaling = dataclasses.replace(scaling, gamma=self.gamma, sigma_inertia=self.sigma_inertia)
-        method = self.passivity(stated)
-        return replace(base, wrist_sensor=sensor, force_scaling=scaling, passivity=method)
+        low_pass_hz = sensor.bandwidth_hz if sensor.ideal else self.low_pass_hz
+        return replace(
+            base,
+            wrist_sensor__bandwidth_hz=low_pass_hz,
+            force_scaling__sigma=0.0,
+            force_scaling__eta=None,
+            force_scaling__sigma_weight=0.0,
+            force_scaling__sigma_inertia=self.sigma_inertia,
+            force_scaling__gamma=self.gamma,
+            passivity=self.passivity(stated),
+        )
 
 
 def settings_from_values(values: FactorValues) -> TunedSettings:
@@ -90,18 +192,12 @@ def settings_from_values(values: FactorValues) -> TunedSettings:
 
 @dataclass(frozen=True)
 class StationPressTrial:
-    """Function that a study runs: one press in the whole station.
+    """Function that a study runs: one press in the whole station."""
 
-    Args:
-        user_scenario: scenario of the user, with its own passivity and scales.
-        base_scenario: the same without environment, task and passivity method.
-        load_estimate: (16,) [offsets, phi].
-    """
-
-    user_scenario: Scenario
-    base_scenario: Scenario
+    user_scenario: Scenario  #: with the user's passivity and scales
+    base_scenario: Scenario  #: the same without environment, task and passivity method
     stated_set: StatedSet
-    load_estimate: Array
+    load_estimate: Array  #: (16,) [offsets, phi]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
@@ -109,28 +205,24 @@ class StationPressTrial:
         if values["method"] != GIVEN_SETTINGS_NAME:
             scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
-        channel = self.base_scenario.channel
+        channel, passivity = self.base_scenario.channel, scenario.passivity
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         depth = renderable_press_depth(self.base_scenario, grip)
-        method = scenario.passivity
-        setup, _ = delayed_contact(scenario, channel, method, wall, task=task, depth=depth)
-        setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
+        setup, _ = delayed_contact(scenario, channel, passivity, wall, task=task, depth=depth)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
             return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
         found = figures_of_station_run(result, setup, task)
-        hold = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)
+        hold = task.is_held(result.t)
         scaling = scenario.force_scaling
         gain = scaling.force_scale * scaling.scales().gamma
-        contact = float(result["true_contact_wrench_W"][hold, 2].mean())
-        felt = result["force_to_master"][hold, 2]
         free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
-        period = result.t[1] - result.t[0]
-        forces = (felt, *result["force_to_master"][free, :3].T)
-        rest_force = max(rms_above_hz(f, period, MIN_REST_FORCE_FREQUENCY_HZ) for f in forces)
-        share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
+        force, period = result["force_to_master"], result.t[1] - result.t[0]
+        forces = (force[hold, 2], *force[free, :3].T)
+        rest_force = max(rms_above_5_hz(f, period) for f in forces)
+        share = found.rendered_share if np.isfinite(found.rendered_share) else 0.0
         human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
         return {
@@ -138,21 +230,18 @@ class StationPressTrial:
             "rest_force_N": rest_force,
             "share": share,
             "free_force_N": found.free_force,
-            "contact_N": abs(contact),
+            "contact_N": abs(float(result["true_contact_wrench_W"][hold, 2].mean())),
             "threshold_N": (smallest + 2 * rest_force) / (gain * share) if share else np.inf,
         }
 
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Function that a study runs: the largest gamma that is stable in one axis at all corners.
-
-    `gamma_upper_bounds`: low-pass [Hz] -> largest tried gamma.
-    """
+    """Function that a study runs: the largest gamma that is stable in one axis at all corners."""
 
     base_scenario: Scenario
     stated_set: StatedSet
-    gamma_upper_bounds: dict[float, float]
+    gamma_upper_bounds: dict[float, float]  #: low-pass [Hz] -> largest tried gamma
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
@@ -165,26 +254,21 @@ class OneAxisGammaSearch:
         shares: dict[float, float] = {}
 
         def stability_sign(log_gamma: float) -> float:
-            gamma, share = float(np.exp(log_gamma)), np.inf
+            tried, found = dataclasses.replace(settings, gamma=float(np.exp(log_gamma))), []
             for corner in self.stated_set.corners:
-                found = self.share_in_one_axis(axis, settings, gamma, *corner, seed)
-                share = min(share, found)
-                if not is_share_accepted(found, MAX_TUNED_FORCE_ERROR):
+                found.append(self.share_in_one_axis(axis, tried, *corner, seed))
+                if not is_share_accepted(found[-1], MAX_TUNED_FORCE_ERROR):
                     return -1.0
-            shares[gamma] = share
+            shares[tried.gamma] = min(found)
             return 1.0
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
-        limit = high
-        if stability_sign(high) < 0:
-            limit = -np.inf
-            if stability_sign(low) > 0:
-                limit = bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
-        gamma = max((g for g in shares if g <= np.exp(limit) * 1.001), default=0.0)
-        share = shares.get(gamma, 0.0)
-        return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
+        if stability_sign(high) < 0 < stability_sign(low):
+            bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
+        gamma = max(shares, default=0.0)
+        return {"gamma_limit": gamma, "linear_limit": linear, "share": shares.get(gamma, 0.0)}
 
-    def _linear_gamma_limit(self, axis: Any, settings: TunedSettings) -> float:
+    def _linear_gamma_limit(self, axis: OneAxis, settings: TunedSettings) -> float:
         sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
@@ -196,33 +280,22 @@ class OneAxisGammaSearch:
         return float(_TESTED_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
     def share_in_one_axis(
-        self,
-        axis: AxisParameters,
-        settings: TunedSettings,
-        gamma: float,
-        grip: str,
-        wall: float,
-        seed: int,
+        self, axis: OneAxis, settings: TunedSettings, grip: str, wall: float, seed: int
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable or too noisy at rest."""
         forward, backward = self.base_scenario.channel.networks_of_directions()
-        hand = GRIP_IMPEDANCES[grip]
-        shown = {f.name: getattr(axis, f.name) for f in dataclasses.fields(AxisParameters)}
-        model = OneDof(**shown | {
-            "hand_mass": hand.mass, "hand_damping": hand.damping,
-            "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
-        })  # fmt: skip
+        held = axis_with_grip(axis, grip)
+        shown = {f.name: getattr(held, f.name) for f in dataclasses.fields(AxisParameters)}
+        model = OneDof(**shown | {"wall_stiffness": wall, "gamma": settings.gamma})
         ideal = self.base_scenario.wrist_sensor.ideal
         added = 0.0 if ideal else _FILTER_DELAY_TIMES_BANDWIDTH / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
-        passivity, intent = settings.passivity(self.stated_set), operator_intent(task)
+        passivity, intent = settings.passivity(self.stated_set), one_dof.operator_intent(task)
         filtered = dataclasses.replace(backward, delay=backward.delay + added)
-        run = run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
-        found = figures_of_run(run, model, task)
-        hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
-        force, period = run.hand_force[hold], run.t[1] - run.t[0]
-        quiet = rms_above_hz(force, period, MIN_REST_FORCE_FREQUENCY_HZ) <= MAX_REST_FORCE_N
-        return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
+        run = one_dof.run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
+        found, force = one_dof.figures_of_run(run, model, task), run.hand_force[task.is_held(run.t)]
+        noise = rms_above_5_hz(force, run.t[1] - run.t[0])
+        return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 
 
 def is_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
@@ -252,12 +325,12 @@ def renderable_press_depth(base: Scenario, grip: str) -> float:
     return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
-def rms_above_hz(x: Array, period: float, frequency: float) -> float:
-    """Return the rms of x (N,) above a frequency [Hz], without parabola; inf for invalid x."""
+def rms_above_5_hz(x: Array, period: float) -> float:
+    """Return the rms of x (N,) above 5 Hz, without parabola; inf for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
-    # The cosine transform continues x evenly, so that slow motion stays below the frequency.
+    # The cosine transform continues x evenly, so that slow motion stays below 5 Hz.
     spectrum = dct(x - np.polyval(np.polyfit(t, x, 2), t), norm="ortho")
-    high = np.arange(len(x)) / (2 * len(x) * period) > frequency
+    high = np.arange(len(x)) / (2 * len(x) * period) > 5.0
     return float(np.sqrt(np.sum(spectrum[high] ** 2) / len(x)))

@@ -1,9 +1,15 @@
-"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station."""
+"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
+
+The search of settings that hold for all stated hands and walls (`StatedSet`) has three stages:
+limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
+its softest and stiffest wall and between them, with several seeds.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +17,35 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_teleop.common import files
-from drake_teleop.common.html import png_data_url, render_page
-from drake_teleop.common.progress import show_progress
-from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.html import write_report_page_and_pictures
+from drake_teleop.common.progress import UpdateProgress, show_progress
+from drake_teleop.common.style import BLACK, COLOURS, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.tuning import search
+from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.lab.studies.runs import run_study
+from drake_teleop.lab.tuning import press_trial
 from drake_teleop.lab.tuning.press_trial import StationPressTrial, TunedSettings
-from drake_teleop.lab.tuning.stated_set import StatedSet, make_stated_set, without_task_and_method
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
+
+CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
+"""Candidates; others are dominated by them or render too little force."""
+CANDIDATE_SIGMAS = (0.0, 0.3)
+"""Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
+STIFFEST_WALL_FACTORS = (1.2, 2.0)
+"""Factors of the stiffest wall, at which the limits of the settings are searched."""
+BEYOND_MARGIN_FACTOR = 1.2
+"""Factor of the margin of gamma, at which they are searched too."""
+_LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
+_MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
+_MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
+# Gamma fails and holds by this factor above and below that of accepted noise.
+_GAMMA_STEP_ABOUT_NOISE_LIMIT = 1.03
+
+Row = dict[str, Any]
+RunStudy = Callable[[str, Study, Any], list[Row]]
 
 
 def tune(
@@ -53,16 +79,16 @@ def tune(
         DrakeTeleopError: for an invalid set, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
-    out, stated = Path(out), make_stated_set(hands, walls, task)
+    out, stated = Path(out), press_trial.make_stated_set(hands, walls, task)
     if not isinstance(scenario, Scenario):
         files.refuse_to_replace_inputs(out / "tuned.yaml", scenario)
-    base = without_task_and_method(given, network)
+    base = press_trial.without_task_and_method(given, network)
     files.make_folder(out)
     shown = progress and not quiet
     with show_progress(shown) as stage:
         load = identified_load(base, stage)
-    own = dataclasses.replace(given, contact_detection=None)
-    own = replace(own, simulation=base.simulation, operator=base.operator, channel=base.channel)
+    of_trials = {name: getattr(base, name) for name in ("simulation", "operator", "channel")}
+    own = replace(given, contact_detection=None, **of_trials)
     trial = StationPressTrial(own, base, stated, load.estimate)
     basis = {
         "given": to_commented_yaml(given),
@@ -70,23 +96,15 @@ def tune(
         "stated": dataclasses.asdict(stated),
         "estimate": load.estimate.tolist(),
     }
-    found = search.search_settings(trial, search.make_study_executor(out, basis, jobs, shown))
-    tuned = dataclasses.replace(
-        replace(found.settings.apply(base, stated), simulation=given.simulation),
-        operator=given.operator,
-        sheet_spring=given.sheet_spring,
-        slot=given.slot,
-        environment=given.environment,
-        contact_detection=given.contact_detection,
-    )
+    found = search_settings(trial, make_study_executor(out, basis, jobs, shown))
+    tuned = replace(given, channel=base.channel, force_scaling=base.force_scaling)
+    tuned = found.settings.apply(tuned, stated)
     summary = _make_tuning_summary(found, tuned, stated, network)
     with files.output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
-        picture = draw_trade_off(found, summary)
-        files.write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
-        shown_in_page = {"summary": summary, "picture": png_data_url(out / "trade_off.png")}
-        page = render_page("drake_teleop.lab.tuning", "report.html.j2", **shown_in_page)
-        files.write_text(out / "report.html", page)
+        pictures = {"trade_off": draw_trade_off(found, summary)}
+        package = "drake_teleop.lab.tuning"
+        write_report_page_and_pictures(out, package, pictures, summary=summary)
         files.write_json(out / "summary.json", summary)
     if not quiet:
         from rich.console import Console
@@ -97,18 +115,167 @@ def tune(
     return summary
 
 
+@dataclass(frozen=True)
+class SearchResult:
+    """Result of the search."""
+
+    settings: TunedSettings
+    #: Tried settings in one axis, with the predicted `threshold_N` and `gamma`.
+    searched_settings: list[Row]
+    given_runs: list[Row]  #: runs of the user's settings at the stiffest wall
+    #: Runs in the stated set: gamma times margin, then gamma at the stiffest wall.
+    inside_runs: list[Row]
+    beyond_runs: list[Row]  #: runs with a larger gamma, then at stiffer walls
+
+
+def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
+    """Return the stable settings with which the operator detects the smallest force."""
+    base, stated = trial.base_scenario, trial.stated_set
+    margin = stated.requirements.loop_gain_margin
+    own = base.wrist_sensor.bandwidth_hz
+    ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
+    stiffest = stated.walls[1]
+    unscaled = TunedSettings(press_trial.GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
+    given = execute("as_given", _study_of_settings(unscaled, ends, [stiffest]), trial)
+    unscaled = dataclasses.replace(unscaled, method="ledger")
+    quiet = execute("noise", _study_of_settings(unscaled, ends, [stiffest]), trial)
+    noise = max(1e-9, *(row["rest_force_N"] for row in quiet))  # N at gamma = 1
+    lowest = np.inf if base.wrist_sensor.ideal else stated.requirements.min_low_pass_hz
+    low_passes = [own, *(f for f in _LOW_PASSES_HZ if lowest <= f < own)]
+    noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
+    highest = margin / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
+    caps = {f: min(MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
+    factors = [
+        Factor(field="method", words=list(CANDIDATE_METHODS)),
+        Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
+        Factor(field="low_pass_hz", values=low_passes),
+    ]
+    study = Study(factors=factors, measures=press_trial.SEARCH_MEASURES)
+    rows = execute("search", study, press_trial.OneAxisGammaSearch(base, stated, caps))
+    search = [_add_predicted_threshold(row, trial, noises) for row in rows]
+    candidates: dict[str, Row] = {}  # the best of each method
+    for row in sorted(search, key=lambda row: float(row["threshold_N"])):
+        if row["gamma"] > 0.0:
+            candidates.setdefault(row["method"], row)
+    found: list[tuple[float, TunedSettings, list[Row]]] = []
+    for row in candidates.values():
+        if found and found[0][0] <= row["threshold_N"]:
+            break
+        gamma, inside = _find_station_gamma(press_trial.settings_from_values(row), trial, execute)
+        if inside:
+            chosen = dataclasses.replace(press_trial.settings_from_values(row), gamma=gamma)
+            found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
+            found.sort(key=lambda entry: entry[0])
+    if not found:
+        what = "no settings were stable for all given hands and walls"
+        remedy = "state firmer hands, softer walls or a faster network"
+        raise DrakeTeleopError(what, where="tune", remedy=remedy)
+    _, chosen, inside = found[0]
+    larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
+    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
+    walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
+    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
+    return SearchResult(chosen, search, given, inside, beyond)
+
+
+def _find_station_gamma(
+    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
+) -> tuple[float, list[Row]]:
+    """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
+
+    def holds(rows: list[Row]) -> bool:
+        return all(meets_requirements(row, press_trial.MAX_TUNED_FORCE_ERROR) for row in rows)
+
+    gamma, stable, failed = settings.gamma, 0.0, np.inf
+    smallest = gamma / _MAX_GAMMA_REDUCTION
+    inside: list[Row] = []
+    while gamma >= smallest:
+        rows: list[Row] = []
+        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
+            tried = dataclasses.replace(settings, gamma=factor * gamma)
+            name = f"station_{settings.method}_{gamma:.6g}_{seed}"
+            rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
+            if not holds(rows):
+                break
+        else:
+            stable, inside = gamma, rows
+        if stable < gamma:
+            failed, smaller = gamma, gamma / 2
+            if holds([row | {"rest_force_N": 0.0} for row in rows]):
+                # Noise grows with gamma.
+                quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
+                smaller = max(smaller, quiet / _GAMMA_STEP_ABOUT_NOISE_LIMIT)
+                failed = min(failed, quiet * _GAMMA_STEP_ABOUT_NOISE_LIMIT)
+        if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
+            break
+        gamma = float(np.sqrt(stable * failed)) if stable else smaller
+    return stable, inside
+
+
+def meets_requirements(
+    row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
+) -> bool:
+    """Return whether a run comes to rest, is quiet and renders the contact force."""
+    exact = press_trial.is_share_accepted(row["share"], max_force_error)
+    return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
+
+
+def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
+    """Return a function that runs a named study in a folder of `out`."""
+
+    def execute(name: str, study: Study, work: Any) -> list[Row]:
+        with show_progress(progress) as stage:
+
+            def name_progress(_: str) -> UpdateProgress:
+                return stage(f"Trials {name}")
+
+            found = run_study(study, out / name, work, basis, jobs=jobs, progress=name_progress)
+        for row in found.rows(named=True):
+            if row["error"]:
+                raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
+        return found.rows(named=True)
+
+    return execute
+
+
+def _add_predicted_threshold(
+    row: Row, trial: StationPressTrial, noise_N_by_low_pass_hz: dict[float, float]
+) -> Row:
+    gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
+    human = trial.base_scenario.operator.perception
+    scale = trial.base_scenario.force_scaling.force_scale
+    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # of the swing, as `delayed_contact`
+    rms_load_force = float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
+    masked = row["sigma_inertia"] * scale * rms_load_force
+    smallest = max(human.absolute_threshold, human.weber_fraction * masked)
+    noise = 2 * noise_N_by_low_pass_hz[row["low_pass_hz"]] * gamma
+    rendered = scale * gamma * row["share"]
+    threshold = (smallest + noise) / rendered if rendered > 0.0 else np.inf
+    return row | {"gamma": gamma, "threshold_N": float(threshold)}
+
+
+def _study_of_settings(
+    settings: TunedSettings, hands: list[str], walls: list[float], seed: int = 0, repeats: int = 1
+) -> Study:
+    numbers = dataclasses.asdict(settings)
+    factors = [Factor(field="method", words=[numbers.pop("method")])]
+    factors += [Factor(field=name, values=[number]) for name, number in numbers.items()]
+    factors += [Factor(field="hand", words=hands), Factor(field="wall", values=walls)]
+    return Study(factors=factors, measures=press_trial.TRIAL_MEASURES, seed=seed, repeats=repeats)
+
+
 def _make_tuning_summary(
-    found: search.SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
+    found: SearchResult, tuned: Scenario, stated: press_trial.StatedSet, network: str | None
 ) -> dict[str, Any]:
     scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
-    failed = [row for row in found.beyond_runs if not search.meets_requirements(row)]
+    failed = [row for row in found.beyond_runs if not meets_requirements(row)]
     fails_at: dict[str, Any] | None = None
     if failed:
         hand, wall, failing = (failed[0][name] for name in ("hand", "wall", "gamma"))
         fails_at = {"hand": hand, "wall_N_per_m": wall, "gamma_factor": failing / gamma}
     shares = [row["share"] for row in found.inside_runs]
     edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
-    holds = all(map(search.meets_requirements, found.given_runs))
+    holds = all(map(meets_requirements, found.given_runs))
     worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
         "share": min(shares),
@@ -173,7 +340,7 @@ def _tuning_result_sentences(
     return [*lines, last]
 
 
-def draw_trade_off(found: search.SearchResult, summary: dict[str, Any]) -> Figure:
+def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
     """Draw the detection threshold against the margin of gamma for each method."""
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
@@ -189,8 +356,7 @@ def draw_trade_off(found: search.SearchResult, summary: dict[str, Any]) -> Figur
             axes.plot(margins, at_limit * margins, color=colour, label=method)
         figures = summary["figures"]
         axes.plot(figures["margin"], figures["threshold_N"], "o", color=BLACK, label="chosen")
-        axes.set_yscale("log")
+        axes.set(yscale="log", ylabel="smallest detected contact force [N]")
         axes.set_xlabel("margin: factor by which gamma may grow")
-        axes.set_ylabel("smallest detected contact force [N]")
         axes.legend()
     return figure

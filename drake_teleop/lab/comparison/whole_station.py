@@ -1,0 +1,241 @@
+"""The whole station: task (swing, press on a sheet spring, rest), measures and energy balances.
+
+The balances are those of `one_dof.OneDofRun.accounts`, at the master's scale, positive inwards [J],
+by translation and rotation. MOTOR is from the motor torque minus weight, as a wrench at So.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.lab.comparison import one_dof
+from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR, RunMeasures, Task
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.station.passivity import methods
+from drake_teleop.station.passivity.energy import energy_balance, port_work
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.slave import arm as serial_arm
+from drake_teleop.station.slave.plant import NominalSlave
+
+_TIP_LEAF_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
+_LEAF_SPRING_LENGTH_M, _LEAF_WIDTH_M = 0.12, 0.05  # m
+# m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
+# needs 9,000 to 16,000 steps per second instead of 1,500.
+_LEAF_SLIP_SPEED_M_S = 1e-3
+#: Leaves by name: thickness [m], light enough not to oscillate.
+LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
+
+
+def task_for_round_trip(round_trip: float) -> Task:
+    """Return the times of the task; longer round trips [s] have longer waits."""
+    return Task(
+        swing_start=0.3,
+        swing_end=1.8,
+        press_start=2.3 + round_trip,
+        press_end=3.1 + round_trip,
+        release_start=5.1 + 4 * round_trip,
+        release_end=5.9 + 4 * round_trip,
+        end=8.1 + 6 * round_trip,
+        rest_window=1.0,
+    )
+
+
+def delayed_contact(
+    base: Scenario,
+    channel: Channel,
+    passivity: PassivityConfig,
+    leaf: str | float,
+    *,
+    task: Task | None = None,
+    depth: float = _PRESS_DEPTH_M,
+) -> tuple[Scenario, Task]:
+    """Return the scenario with this task and the task's times.
+
+    `leaf` is a key of `LEAF_THICKNESSES_M` or a stiffness [N/m]; `depth` [m] is the hand's intended
+    displacement beyond the contact.
+    """
+    task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
+    settle = 0.5
+    swing = Sine(
+        t_start=settle + task.swing_start,
+        duration=task.swing_end - task.swing_start,
+        ramp=min(0.5, 0.5 * (task.swing_end - task.swing_start)),
+        frequency=1.5,
+        translation=[0.005, 0.0, 0.02],
+        rotation=[0.0, 0.05, 0.0],
+    )
+    scale = base.kinematic_scaling.translation_scale
+    reach = [0.0, 0.0, -(_TIP_LEAF_GAP_M / scale + depth)]
+    press, retreat = (
+        MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
+        for start, end, translation in (
+            (task.press_start, task.press_end, reach),
+            (task.release_start, task.release_end, [-x for x in reach]),
+        )
+    )
+    x, y, z = NominalSlave(base.slave).start_tip.tolist()
+    sheet = SheetSpring(
+        position=[x, y, z - _TIP_LEAF_GAP_M],
+        length=_LEAF_SPRING_LENGTH_M,
+        width=_LEAF_WIDTH_M,
+        thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
+        slip_speed=_LEAF_SLIP_SPEED_M_S,
+    )
+    scenario = replace(
+        base.without_environment(),
+        simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
+        operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
+        channel=channel,
+        passivity=passivity,
+        sheet_spring=sheet,
+    )
+    return scenario, task
+
+
+def leaf_thickness(stiffness: float) -> float:
+    """Return the thickness [m] of a sheet spring with this stiffness [N/m]."""
+    unit = SheetSpring(length=_LEAF_SPRING_LENGTH_M, width=_LEAF_WIDTH_M, thickness=1e-3)
+    return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
+
+
+def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
+    """Return the measures of a station's run of the task, along z of the world."""
+    traces = force_and_energy_traces(result, scenario)
+    traces |= {"master": result["pose_command"][:, 6]}
+    traces["slave"], traces["turned"] = _slave_height_and_rotation(result, scenario)
+    return one_dof.figures_of_traces(**traces, task=task)
+
+
+def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
+    """Return a run's t [s], vertical forces at the master's scale [N] and `injected_energy` [J].
+
+    "felt" is the displayed force, "pressed" the scaled true contact force.
+    """
+    scaling = scenario.force_scaling
+    return {
+        "t": result.t,
+        "felt": result["force_to_master"][:, 2],
+        "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
+        "energy": injected_energy(result, scenario),
+    }
+
+
+def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
+    """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
+    accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
+    if any(scenario.force_scaling.scales().load_scales):
+        accounts += work_of_displayed_load_wrench(result, scenario)
+    return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
+
+
+def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> tuple[Array, Array]:
+    arm = slave_arm(scenario)
+    poses = np.empty((len(result.t), 7))
+    for pose, state in zip(poses, result["slave_state"], strict=True):
+        serial_arm.pose_into(arm.table, np.ascontiguousarray(state[: arm.num_joints]), pose)
+    rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
+    return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
+
+
+def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
+    """Return the energies (N, 4, 2) [J] at `HAND` to `ACTUAL`, for translation and rotation.
+
+    `MOTOR` is NaN if the log is slower than the joint control.
+    """
+    needed = ("ports", "slave_state", "joint_torque")
+    if missing := [name for name in needed if name not in result]:
+        what = f"lacks the signals {', '.join(missing)}, which the energy balances need"
+        remedy = "run a station with a network or a passivity method"
+        raise DrakeTeleopError(what, where="result", remedy=remedy)
+    t, torque = result.t, result["joint_torque"]
+    q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
+    poses, motor = _poses_and_motor_wrenches(scenario, q, torque)
+    contact = np.zeros_like(motor)
+    if "true_contact_wrench_W" in result:
+        force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
+        contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
+    gamma = scenario.force_scaling.scales().gamma
+    power = scenario.force_scaling.force_scale * gamma / _kinematic_scales(scenario)
+    rates = scenario.rates
+    accounts = np.empty((len(t), 4, 2))
+    # A row contains the torque of the period before the row.
+    has_torques = rates.log_hz >= rates.joint_control_hz
+    accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
+    accounts[:, ACTUAL] = power * port_work(contact, poses, "mean")
+    # A row contains the channel's sum of one period ago.
+    channel_times = t - 1 / rates.hand_hz
+    for place, first in ((HAND, 0), (COMMAND, 6)):
+        for g in range(2):
+            so_far = np.interp(t, channel_times, result["ports"][:, first + g])
+            accounts[:, place, g] = so_far - so_far[0]
+    return accounts
+
+
+def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
+    """Return the cumulative work (N, 2) [J] of the load's displayed wrench on the hand.
+
+    Columns: translation, rotation.
+    """
+    arm, t = slave_arm(scenario), result.t
+    q, v = np.split(np.ascontiguousarray(result["slave_state"]), [arm.num_joints], axis=1)
+    a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))
+    for k in range(len(t)):
+        serial_arm.pose_into(arm.table, q[k], poses[k])
+        serial_arm.sensor_motion(arm.table, q[k], v[k], a[k], motion[k])
+    held = scenario.force_scaling.gripper_phi
+    of_gripper = arm.phi_load if held is None else np.asarray(held)
+    R_WS = motion[:, np.newaxis, 12:].reshape(-1, 1, 3, 3)
+    column = serial_arm.LAST_ROW_GRAVITY_COLUMN
+    gravity = arm.table[-1, column : column + 3] @ R_WS[:, 0]
+    inertias, weights = np.split(np.array(scenario.force_scaling.scales().load_scales), 2)
+    kept, excess = (
+        part[0] * of_gripper + part[1] * (arm.phi_load - of_gripper)
+        for part in (inertias, weights - inertias)
+    )
+    rest = np.zeros_like(gravity)
+    wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
+    wrench -= non_contact_wrench(-gravity, rest, rest, excess)
+    at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
+    power = scenario.force_scaling.force_scale / _kinematic_scales(scenario)
+    return np.asarray(power * port_work(at_So, poses, "mean"))
+
+
+def start_energy(scenario: Scenario) -> Array:
+    """Return the energy (2,) stored at both ends at the start [J], by translation and rotation."""
+    scales = _kinematic_scales(scenario)
+    power = scenario.force_scaling.force_scale / scales
+    p = methods.method_parameters(scenario.passivity, list(power), list(scales))
+    pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    memory = methods.initial_method_memory(scenario.passivity.method, p, pose)
+    return 2 * energy_balance(memory).stored
+
+
+def _kinematic_scales(scenario: Scenario) -> Array:
+    scaling = scenario.kinematic_scaling
+    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    return np.where(scales > 0.0, scales, 1.0)
+
+
+def _poses_and_motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
+    # X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight.
+    n = q.shape[1]
+    arm, zero = slave_arm(scenario).table, np.zeros(n)
+    poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))
+    for k in range(len(q)):
+        serial_arm.pose_into(arm, q[k], poses[k])
+        serial_arm.inverse_dynamics(arm, q[k], zero, zero, weight[k])
+        serial_arm.jacobian(arm, q[k], J[k])
+    to_torque, excess = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
+    wrench = np.linalg.solve(to_torque, excess) if n == 6 else np.linalg.pinv(to_torque) @ excess
+    return poses, wrench[:, :, 0]
