@@ -28,13 +28,16 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.load import regressor
 from drake_teleop.station.sensor.sensor_chain import (
+    LOST_READING_FLAG_SAMPLES,
     READ_ANGLES,
     READ_SATURATED,
     WristSensorConfig,
+    are_values_plausible,
     butterworth_sections,
     check_bandwidth,
     group_delay_samples,
     low_pass_in_place,
+    read_sensor_into,
     settle_low_pass,
     shift_delay_line,
 )
@@ -234,39 +237,52 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
     Args:
         constants, memory: results of `initialize_motion_estimator`; memory is updated.
+        arm: `ArmModel.table`. Without rows, the first three of the n "joint angles" are the
+            measured angular velocity of S, in S [rad/s] (source `accelerometer`).
         reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
-    n = arm.shape[0] - 1
+    n = sample.shape[0] - regressor.FIRST_JOINT_INDEX
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
-    joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
-    angles = sample[regressor.SAMPLE_JOINT_POSITION]
+    angles, gravity = sample[regressor.SAMPLE_JOINT_POSITION], motion[:3]
     _align_signal_paths(constants, memory, n, reading, sample)
-    if memory[0] == 0.0:
-        for i in range(3 * n):
-            joints[2 * n + i] = angles[i % n]
-    _differentiate_joint_angles(constants, joints, angles)
-    sensor_motion(arm, angles, joints[:n], joints[n:], motion)
+    if arm.shape[0] == 0:
+        copy_into(motion, 3, angles, 0, 3)
+    else:
+        joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
+        _differentiate_joint_angles(constants, memory[0] == 0.0, joints, angles)
+        sensor_motion(arm, angles, joints[:n], joints[n:], motion)
+        gravity = arm[n, LAST_ROW_GRAVITY_COLUMN:]
     if constants.encoders_only != 0.0:
         copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        gravity = arm[n, LAST_ROW_GRAVITY_COLUMN:]
         _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
-def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
-    """Convert one reading to one sample without an arm's kinematics (source `accelerometer`).
+def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memory, sample):
+    """Measure true values by sensor chain and motion estimator; flag an implausible sample.
 
-    The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
+    `sensor` is (constants of the chain, constants of the estimator, ideal); the others are
+    arguments of `read_sensor_into` and `estimate_sample_into`.
     """
-    n = sample.shape[0] - regressor.SAMPLE_JOINT_POSITION.start
-    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
-    _align_signal_paths(constants, memory, n, reading, sample)
-    copy_into(motion, 3, sample, regressor.SAMPLE_JOINT_POSITION.start, 3)
-    _convert_and_fuse_accelerometer(constants, memory, motion[:3], motion, sample)
-    memory[0] += 1.0
+    chain, estimator, ideal = sensor
+    flag = regressor.SATURATION_FLAG_INDEX
+    if not are_values_plausible(chain, truth):  # keeps it out of the filters
+        sample[flag] = regressor.LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        return
+    lost = sample[flag] - 1.0
+    if ideal:
+        copy_into(sample, 0, truth, 0, flag)
+        sample[flag] = 0.0
+        copy_into(sample, flag + 1, truth, flag, truth.shape[0] - flag)
+    else:
+        reading = np.empty(truth.shape[0] - 2)
+        read_sensor_into(chain, chain_memory, noise, truth, reading)
+        estimate_sample_into(estimator, estimator_memory, arm, reading, sample)
+    if lost >= regressor.LOST_SAMPLE_FLAG:
+        sample[flag] = lost
 
 
 @njit(cache=True)
@@ -304,9 +320,11 @@ def _align_signal_paths(constants, memory, n, reading, sample):
 
 
 @njit(cache=True)
-def _differentiate_joint_angles(constants, joints, angles):
+def _differentiate_joint_angles(constants, is_first, joints, angles):
     n, period = angles.shape[0], constants.period
     for i in range(n):
+        if is_first:
+            joints[2 * n + i] = joints[3 * n + i] = joints[4 * n + i] = angles[i]
         q0, q1, q2, q3 = angles[i], joints[2 * n + i], joints[3 * n + i], joints[4 * n + i]
         joints[i] = (3.0 * q0 - 4.0 * q1 + q2) / (2.0 * period)
         if constants.encoders_only != 0.0:

@@ -45,8 +45,8 @@ from drake_teleop.station.environment.moving_bodies import interpolate_joint_sta
 from drake_teleop.station.sensor import sensor_chain
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_sample_into,
     initialize_motion_estimator,
+    measure_sample_into,
 )
 from drake_teleop.station.slave.arm import (
     SENSOR_MOTION_SIZE,
@@ -116,7 +116,7 @@ def _interpolate_state(h, u, x, xdot, end, end_dot, out):
 @njit(cache=True)
 def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     arm, phi, _, _, _, _ = physics
-    constants, motion_constants, middle, end, ideal = sensor
+    constants, middle, end = sensor
     half = x.shape[0] // 2
     n = half - 1
     truth = np.empty(15 + n)
@@ -125,22 +125,9 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
     copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
-    sample, flag = memory[:size], regressor.SATURATION_FLAG_INDEX
     copy_into(memory, size, memory, 0, size)
-    if not sensor_chain.are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[flag] = regressor.LOST_SAMPLE_FLAG + sensor_chain.LOST_READING_FLAG_SAMPLES
-        return
-    lost = sample[flag] - 1.0
-    if ideal:
-        copy_into(sample, 0, truth, 0, regressor.SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[flag] = 0.0
-        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, x, 0, n)
-    else:
-        reading = np.empty(13 + n)
-        sensor_chain.read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
-        estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
-    if lost >= regressor.LOST_SAMPLE_FLAG:
-        sample[flag] = lost
+    filters = memory[2 * size : middle], memory[middle:end]
+    measure_sample_into(constants, arm, noise, truth, *filters, memory[:size])
 
 
 @njit(cache=True)
@@ -178,8 +165,8 @@ def take_due_samples(
     Args:
         physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
             damping, gravity; joint table of other moving bodies; wrenches from Drake).
-        sensor: (constants of sensor chain and of motion estimator, start of the estimator's memory
-            and of `tail`, ideal).
+        sensor: (argument `sensor` of `measure_sample_into`, start of the estimator's memory and of
+            `tail`).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         surroundings: [deflection and rate of the sheet, plant's state if other bodies move] now.
@@ -198,7 +185,7 @@ def take_due_samples(
     width = 1 + full
     after = result[size + 1 :]
     copy_into(after, 0, memory, 0, memory.shape[0])
-    tail = after[sensor[3] :]
+    tail = after[sensor[2] :]
     count, queued = tail[0], int(tail[1])
     now, between = scratch[0, :full], scratch[1, :full]
     now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
@@ -313,7 +300,7 @@ class WristSensor(LeafSystem):
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
-        self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
+        self._sensor = ((constants, motion_constants, config.ideal), *ends[1:].tolist())
         self._monitored_pairs = contact.monitored_pairs
         #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
         moving = contact.moving_bodies
@@ -365,7 +352,7 @@ class WristSensor(LeafSystem):
     @property
     def motion_dependent_state_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
-        _, _, chain_end, end, _ = self._sensor
+        _, chain_end, end = self._sensor
         size = regressor.sample_size(self._n)
         before_and_walks = range(size, 2 * size + sensor_chain.FILTER_MEMORY_START)
         others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
@@ -381,7 +368,7 @@ class WristSensor(LeafSystem):
     def reset_queue(self, context: Context) -> None:
         """Reset the queue of steps to the current time; call this after setting states manually."""
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
-        tail, time = memory[self._sensor[3] :], context.get_time()
+        tail, time = memory[self._sensor[2] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _EQUAL_TIME_TOLERANCE_PERIODS), 0.0
         append_step_to_queue(tail, time, *self._states_of_arm_and_environment(context))
 
@@ -459,7 +446,7 @@ class WristSensor(LeafSystem):
             )
             if not monitored or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
-                if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
+                if _try_queue_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
