@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import Context
 
 from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
@@ -18,8 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
-from drake_teleop.station.master.dynamics import HapticDeviceBase
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
+from drake_teleop.station.master.dynamics import HapticDeviceBase, add_runge_kutta_stage
 from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
@@ -125,20 +123,15 @@ def step_leader(
         for i in range(4):
             copy_into(slope, 0, stage, n, n)
             leader_acceleration_into(arm, joint_table, q, v, applied, motor, vdot)
-            weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
-            ahead = 1.0 if i == 2 else 0.5
-            for k in range(2 * n):
-                total[k] += weight * slope[k]
-                stage[k] = state[k] + ahead * period * slope[k]
-        for k in range(2 * n):
-            state[k] += period * total[k]
+            add_runge_kutta_stage(i, period, slope, total, stage, state)
         _update_pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
         display[i] = pose[4 + i] if are_finite_and_in_range(state) else math.nan
 
 
 @njit(cache=True)
-def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
+def limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
+    """Write a wrench (6,), shortened to the torque limits beside the weight, to `shortened`."""
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
@@ -194,6 +187,12 @@ class LeaderDevice(HapticDeviceBase):
     @property
     def num_joints(self) -> int:
         return self.arm.num_joints
+
+    @property
+    def hand_weight(self) -> float:
+        """Weight of the hand [N]."""
+        gravity = np.linalg.norm(self.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])
+        return float(self.parameters.hand_mass * gravity)
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
@@ -265,61 +264,3 @@ def make_leader_joint_table(
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_NATURAL_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
     return np.array([*rows, np.full(len(home), weight_share)])
-
-
-class LeaderArm(DeviceBlock):
-    """Leader arm with n joints and the hand's passive mass, advanced once per period.
-
-    .. pydrake_system::
-
-        name: LeaderArm
-        input_ports:
-        - hand_wrench_E: (6,) as for `MasterDevice`
-        - drive: (27,) from `LeaderDisplay`: wrench F (6) to display, the display's memory
-        output_ports:
-        - state: (2 n,) [q; qdot] [rad, rad/s]
-        - pose_master: (7,) X_BE
-        - twist_master: (6,) [v; omega] of E in B
-        - for_display: (27,) position of E (3), three unused zeros, the display's memory
-    """
-
-    __slots__ = ()
-
-    def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        gravity = np.linalg.norm(device.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])
-        hand_weight = float(device.parameters.hand_mass * gravity)
-        constants = (*device.compiled_constants, hand_weight)
-        super().__init__(period, device, q_initial, step_leader, constants)
-
-
-class LeaderDisplay(ForceDisplay):
-    """Force display of a leader arm, limited by motor torques after weight compensation.
-
-    .. pydrake_system::
-
-        name: LeaderDisplay
-        input_ports:
-        - wrench_command: (6,) F_E_B to render
-        - for_display: from `LeaderArm`
-        - state: (2 n,) of `LeaderArm`
-        output_ports:
-        - drive: for `LeaderArm`
-        - force_to_master: (6,) wrench F, displayed within the limits [N, N m]
-        - fault_at_hand: code of `blocks.Fault`
-        - displayed_and_fault: (7,) the last two ports in one vector
-    """
-
-    __slots__ = ()
-
-    def __init__(self, period: float, device: LeaderDevice) -> None:
-        super().__init__(period, device)
-        self._joints = self.DeclareVectorInputPort("state", 2 * device.num_joints)
-        self._constants, self._n = device.compiled_constants, device.num_joints
-        self._shortened = np.zeros(6)
-
-    def _wrench_to_display(self, context: Context) -> Array:
-        wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
-        if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _limit_wrench_to_motor_torques(*self._constants, q, wrench, self._shortened)
-            return self._shortened
-        return wrench
