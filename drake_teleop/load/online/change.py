@@ -66,6 +66,10 @@ _MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_
 
 MEMORY_SIZE = _KNOWN_LOAD_START + 816
 """Length of the memory of `update_change_detector`."""
+KNOWN_LOAD = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
+NEW_LOAD = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
+"""Parts of the memory: [offsets; phi] of the known and of the new load."""
+_NEW_LOAD_COVARIANCE = slice(NEW_LOAD.stop, MEMORY_SIZE)
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
@@ -170,8 +174,7 @@ def _restart_filter_from_known_load(memory, filter_start):
 
 @njit(cache=True)
 def _is_new_load_identified(memory, mass_std_ratio):
-    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
-    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = mass_std_ratio * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
@@ -181,8 +184,7 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 @njit(cache=True)
 def _widen_inertias_by_alpha_noise(memory, noise, block):
-    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
-    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
@@ -197,12 +199,8 @@ def update_change_detector(memory, sample, block, noise, window, hold, mass_std_
     V = np.empty((6, 10))
     motion = sample[SAMPLE_MOTION]
     regressor_into(motion[:3], motion[3:6], motion[6:], V)
-    known = sample[SAMPLE_WRENCH_AND_MOTION]
-    for i in range(15):
-        memory[_WRENCH_SUM_START + i] += known[i]
-    for i in range(6):
-        for j in range(10):
-            memory[_REGRESSOR_SUM_START + 10 * i + j] += V[i, j]
+    memory[_WRENCH_SUM_START:_REGRESSOR_SUM_START] += sample[SAMPLE_WRENCH_AND_MOTION]
+    memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START] += V.ravel()
     memory[_SAMPLE_COUNT_INDEX] += 1.0
     memory[_BLOCK_SAMPLES_INDEX] += 1.0
     if memory[_BLOCK_SAMPLES_INDEX] >= block:
@@ -328,15 +326,10 @@ def initial_change_memory(
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
     memory = np.zeros(MEMORY_SIZE)
-    memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 16] = np.concatenate([theta[:6], phi])
+    memory[KNOWN_LOAD] = np.concatenate([theta[:6], phi])
     memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START] = P.ravel()
     copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
     return memory
-
-
-@njit(cache=True)
-def stored_known_load(memory):
-    return memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 16]
 
 
 @njit(cache=True)
@@ -344,11 +337,6 @@ def current_change_state(memory):
     """Return the state as index into `STATE_NAMES`; a new load becomes known once identified."""
     is_known = memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
     return STATE_KNOWN if is_known else int(memory[_STATE_INDEX])
-
-
-@njit(cache=True)
-def stored_new_load(memory):
-    return memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
 
 
 @njit(cache=True)
@@ -376,7 +364,7 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    theta = stored_known_load(memory).copy()
+    theta = memory[KNOWN_LOAD].copy()
     covariance = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START].reshape(16, 16).copy()
     return replace(
         known,

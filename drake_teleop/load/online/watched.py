@@ -114,7 +114,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
-    known, residual, target = change.stored_known_load(watch), np.empty(6), np.empty(16)
+    known, residual, target = watch[change.KNOWN_LOAD], np.empty(6), np.empty(16)
     wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
@@ -129,7 +129,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
             for i in range(6):
                 known[i] += period / OFFSET_TRACKING_S * residual[i]
     elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_of_change_within_reach(known, change.stored_new_load(watch))
+        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD])
         other = verdict == change.STATE_CHANGED and force_changed and near
         memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
