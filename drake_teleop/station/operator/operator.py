@@ -150,7 +150,7 @@ def intended_motion_into(packed, start, t, pose, twist):
     `start` (7,) is X_BE before the first segment. Translations add; rotations apply in the order of
     the list, each about axes of B.
     """
-    orientation = (start[0], start[1], start[2], start[3])
+    orientation = vectors.quaternion_at(start, 0)
     omega = (0.0, 0.0, 0.0)
     vectors.copy_into(pose, 4, start, 4, 3)
     twist[:3] = 0.0
@@ -196,8 +196,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     f = K (x_intent - x) + B (v_intent - v); tau likewise. `impedance` (4,) is [K, B, rotational K,
     rotational B].
     """
-    intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    inverse = vectors.conjugate_quaternion((pose[0], pose[1], pose[2], pose[3]))
+    intended = vectors.quaternion_at(intent_pose, 0)
+    inverse = vectors.conjugate_quaternion(vectors.quaternion_at(pose, 0))
     error = vectors.quaternion_logarithm(vectors.quaternion_product(intended, inverse))
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])

@@ -9,6 +9,7 @@ Sources of specific force s of So, angular velocity omega and acceleration alpha
 
 from collections import namedtuple
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,8 +92,7 @@ class MotionEstimationConfig:
     )
 
 
-@dataclass(frozen=True)
-class PathDelays:
+class PathDelays(NamedTuple):
     """Delays of the signal paths at low frequencies [s].
 
     `sample_s` is the delay of the slowest path in use, for which the others wait.
@@ -197,10 +197,9 @@ def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[_EstimatorConstants, Array]:
     """Return constants and initial memory of `estimate_sample_into`."""
-    delays = path_delays(config, sensor, period)
-    paths = np.array([delays.wrench_s, delays.acceleration_s, delays.encoders_s])
+    *paths, sample = path_delays(config, sensor, period)
     used = np.array([True, config.source != "encoders", True])
-    waits = np.where(used, delays.sample_s - paths, 0.0) / period
+    waits = np.where(used, sample - np.array(paths), 0.0) / period
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
     constants = _EstimatorConstants(
@@ -293,28 +292,22 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    width = 12 + n
-    line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :]
-    rows = line.shape[0] // width
-    shift_delay_line(line, width)
-    copy_into(line, 0, reading, 0, 12)
-    copy_into(line, 12, angles, 0, n)
+    line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :].reshape((-1, 12 + n))
+    shift_delay_line(line)
+    copy_into(line[0], 0, reading, 0, 12)
+    copy_into(line[0], 12, angles, 0, n)
     if memory[0] == 0.0:
-        for k in range(1, rows):
-            copy_into(line, k * width, line, 0, width)
-    wrench = int(constants.wait_samples[0]) * width
-    acceleration = int(constants.wait_samples[1]) * width
-    copy_into(sample, regressor.SAMPLE_WRENCH.start, line, wrench, 6)
-    copy_into(sample, regressor.SAMPLE_MOTION.start, line, acceleration + 6, 6)
-    wait = int(constants.wait_samples[2])
-    older = constants.wait_samples[2] - wait
-    encoders = wait * width + 12
-    before = min(wait + 1, rows - 1) * width + 12
+        line[1:] = line[0]
+    waits = constants.wait_samples
+    copy_into(sample, regressor.SAMPLE_WRENCH.start, line[int(waits[0])], 0, 6)
+    copy_into(sample, regressor.SAMPLE_MOTION.start, line[int(waits[1])], 6, 6)
+    wait, older = int(waits[2]), waits[2] - int(waits[2])
+    now, before = line[wait], line[min(wait + 1, line.shape[0] - 1)]
     for i in range(n):
-        angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
+        angles[i] = (1.0 - older) * now[12 + i] + older * before[12 + i]
     flagged = memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
     if reading[READ_SATURATED] != 0.0:
-        flagged = float(rows)
+        flagged = float(line.shape[0])
     memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
     sample[regressor.SATURATION_FLAG_INDEX] = 1.0 if flagged > 0.0 else 0.0
 

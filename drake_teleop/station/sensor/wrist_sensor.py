@@ -42,12 +42,7 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.load import regressor
 from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
-from drake_teleop.station.sensor import sensor_chain
-from drake_teleop.station.sensor.motion_estimation import (
-    MotionEstimationConfig,
-    initialize_motion_estimator,
-    measure_sample_into,
-)
+from drake_teleop.station.sensor import motion_estimation, sensor_chain
 from drake_teleop.station.slave.arm import (
     SENSOR_MOTION_SIZE,
     ArmModel,
@@ -85,11 +80,8 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
     """
     sensor_motion(arm, q, v, vdot, motion)
     copy_into(out, regressor.SAMPLE_MOTION.start, motion, 0, 9)
-    s = out[regressor.SAMPLE_SPECIFIC_FORCE]
-    omega = out[regressor.SAMPLE_ANGULAR_VELOCITY]
-    alpha = out[regressor.SAMPLE_ANGULAR_ACCELERATION]
     wrench = out[regressor.SAMPLE_WRENCH]
-    regressor.non_contact_wrench_into(s, omega, alpha, phi, wrench)
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:9], phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
     tau = minus(vector_at(contact_W, 3), cross(p_WS, f))
@@ -127,7 +119,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = regressor.FIRST_JOINT_INDEX + n
     copy_into(memory, size, memory, 0, size)
     filters = memory[2 * size : middle], memory[middle:end]
-    measure_sample_into(constants, arm, noise, truth, *filters, memory[:size])
+    motion_estimation.measure_sample_into(constants, arm, noise, truth, *filters, memory[:size])
 
 
 @njit(cache=True)
@@ -270,7 +262,7 @@ class WristSensor(LeafSystem):
         self,
         slave: SlavePlant,
         config: sensor_chain.WristSensorConfig,
-        motion: MotionEstimationConfig,
+        motion: motion_estimation.MotionEstimationConfig,
         period: float,
         hold_time: float,
         *,
@@ -280,7 +272,9 @@ class WristSensor(LeafSystem):
         arm = slave.arm
         n = self._n = arm.num_joints
         constants, chain = sensor_chain.initialize_sensor_chain(config, n, period)
-        motion_constants, estimator = initialize_motion_estimator(motion, config, n, period)
+        motion_constants, estimator = motion_estimation.initialize_motion_estimator(
+            motion, config, n, period
+        )
         self._physics, contact = slave.physics_of_plant, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
@@ -440,10 +434,8 @@ class WristSensor(LeafSystem):
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         time = context.get_time()
         if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(time):
-            seen, monitored = (
-                self._states_of_arm_and_environment(context),
-                self._monitored_pairs.size,
-            )
+            seen = self._states_of_arm_and_environment(context)
+            monitored = self._monitored_pairs.size
             if not monitored or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
                 if _try_queue_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
@@ -497,7 +489,7 @@ def AddCompiledWristSensor(
     builder: DiagramBuilder,
     slave: SlavePlant,
     config: sensor_chain.WristSensorConfig,
-    motion: MotionEstimationConfig,
+    motion: motion_estimation.MotionEstimationConfig,
     period: float,
     hold_time: float,
     torque: Mapping[str, OutputPort],
