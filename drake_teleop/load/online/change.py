@@ -21,15 +21,10 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
 from drake_teleop.common.vectors import cholesky, copy_into
+from drake_teleop.load import regressor
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
-from drake_teleop.load.regressor import (
-    SAMPLE_MOTION,
-    SAMPLE_WRENCH_AND_MOTION,
-    non_contact_wrench_into,
-    regressor_into,
-)
 
 STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the change detector, by index."""
@@ -84,7 +79,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
     """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
-    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
     f = above[0] ** 2 + above[1] ** 2 + above[2] ** 2
     tau = above[3] ** 2 + above[4] ** 2 + above[5] ** 2
     arm = (phi[1] ** 2 + phi[2] ** 2 + phi[3] ** 2) / max(phi[0] ** 2, 1e-12)
@@ -95,9 +90,9 @@ def whitening_matrix(motion, phi, noise, model_var, n):
             continue
         # The wrench is quadratic in the motion, so the central difference is exact.
         shifted[k] = motion[k] + 1.0
-        non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, above)
+        regressor.non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, above)
         shifted[k] = motion[k] - 1.0
-        non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, below)
+        regressor.non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, below)
         shifted[k] = motion[k]
         for i in range(6):
             for j in range(i + 1):
@@ -197,9 +192,9 @@ def _widen_inertias_by_alpha_noise(memory, noise, block):
 def update_change_detector(memory, sample, block, noise, window, hold, mass_std_ratio):
     """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
-    motion = sample[SAMPLE_MOTION]
-    regressor_into(motion[:3], motion[3:6], motion[6:], V)
-    memory[_WRENCH_SUM_START:_REGRESSOR_SUM_START] += sample[SAMPLE_WRENCH_AND_MOTION]
+    motion = sample[regressor.SAMPLE_MOTION]
+    regressor.regressor_into(motion[:3], motion[3:6], motion[6:], V)
+    memory[_WRENCH_SUM_START:_REGRESSOR_SUM_START] += sample[regressor.SAMPLE_WRENCH_AND_MOTION]
     memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START] += V.ravel()
     memory[_SAMPLE_COUNT_INDEX] += 1.0
     memory[_BLOCK_SAMPLES_INDEX] += 1.0

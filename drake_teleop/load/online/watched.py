@@ -14,14 +14,8 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.load import regressor
 from drake_teleop.load.online import change
-from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    non_contact_wrench_into,
-)
 
 LOAD_STATE_NAMES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning": the load is not identified yet."""
@@ -67,7 +61,7 @@ def load_state_index(memory):
 @njit(cache=True)
 def _update_and_test_rest(memory, sample, period):
     share = period / (_LOW_PASS_TIME_CONSTANT_S + period)
-    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
+    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
     shift, rate = 0.0, 0.0
     for i in range(3):
         memory[_SPECIFIC_FORCE_START + i] += share * (s[i] - memory[_SPECIFIC_FORCE_START + i])
@@ -115,8 +109,8 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
     known, residual, target = watch[change.KNOWN_LOAD], np.empty(6), np.empty(16)
-    wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
-    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
+    wrench, motion = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
     at_rest = _update_and_test_rest(memory, sample, period)

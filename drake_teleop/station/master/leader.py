@@ -15,7 +15,13 @@ from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
+from drake_teleop.common.vectors import (
+    add_vector_into,
+    copy_into,
+    cross,
+    quaternion_of_matrix,
+    vector_at,
+)
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 from drake_teleop.station.master.dynamics import HapticDeviceBase, add_runge_kutta_stage
 from drake_teleop.station.slave import arm as serial_arm
@@ -43,9 +49,7 @@ def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, m
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
     serial_arm.forward_kinematics(arm, q, R_BE, p_BE)
     copy_into(wrench, 0, hand_wrench_minus_weight, 0, 6)  # becomes the wrench about the origin of B
-    moment = cross(vector_at(p_BE, 0), vector_at(hand_wrench_minus_weight, 0))
-    for i in range(3):
-        wrench[3 + i] += moment[i]
+    add_vector_into(wrench, 3, cross(vector_at(p_BE, 0), vector_at(wrench, 0)))
     for i in range(n):
         tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(
             v[i] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
@@ -67,8 +71,7 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
         same += turn[i] * pose[i]
     for i in range(4):
         pose[i] = turn[i] if same >= 0.0 else -turn[i]
-    for i in range(3):
-        pose[4 + i] = x[9 + i]
+    copy_into(pose, 4, x, 9, 3)
     for i in range(6):
         twist[i] = 0.0
         for k in range(n):

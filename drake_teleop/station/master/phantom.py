@@ -212,11 +212,9 @@ def pose_into(q, pose):
     # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
     a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
     b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    w, x, y, z = vectors.quaternion_product(a, b)
-    pose[0] = w * c6 - x * s6
-    pose[1] = x * c6 + w * s6
-    pose[2] = y * c6 + z * s6
-    pose[3] = z * c6 - y * s6
+    yawed = vectors.quaternion_product(a, b)
+    turned = vectors.quaternion_product(yawed, (c6, s6, 0.0, 0.0))
+    pose[0], pose[1], pose[2], pose[3] = turned
     reach = L1 * math.cos(q[1]) + L2 * math.sin(q[2])
     pose[4] = math.cos(q[0]) * reach
     pose[5] = math.sin(q[0]) * reach

@@ -42,11 +42,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     settle_low_pass,
     shift_delay_line,
 )
-from drake_teleop.station.slave.arm import (
-    LAST_ROW_GRAVITY_COLUMN,
-    SENSOR_MOTION_SIZE,
-    sensor_motion,
-)
+from drake_teleop.station.slave import arm as serial_arm
 
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
@@ -71,7 +67,7 @@ _ANGULAR_FUSION_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
 _LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
 _KINEMATICS_SCRATCH_START = _LINEAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
-_JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + SENSOR_MOTION_SIZE
+_JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + serial_arm.SENSOR_MOTION_SIZE
 _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 
 
@@ -250,8 +246,8 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     else:
         joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
         _differentiate_joint_angles(constants, memory[0] == 0.0, joints, angles)
-        sensor_motion(arm, angles, joints[:n], joints[n:], motion)
-        gravity = arm[n, LAST_ROW_GRAVITY_COLUMN:]
+        serial_arm.sensor_motion(arm, angles, joints[:n], joints[n:], motion)
+        gravity = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN :]
     if constants.encoders_only != 0.0:
         copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:

@@ -43,12 +43,7 @@ from drake_teleop.common.vectors import (
 from drake_teleop.load import regressor
 from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
 from drake_teleop.station.sensor import motion_estimation, sensor_chain
-from drake_teleop.station.slave.arm import (
-    SENSOR_MOTION_SIZE,
-    ArmModel,
-    forward_kinematics,
-    sensor_motion,
-)
+from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.drake_contact import ContactPlantCopy, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
@@ -72,13 +67,14 @@ _USE_COMPILED_CONTACT = np.zeros(0)
 
 
 @njit(cache=True)
-def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write the true wrench, specific force, omega and alpha of S into `out` (15,).
+def true_sample_into(arm, phi, q, v, vdot, contact_W, out):
+    """Write the true wrench, specific force, omega and alpha of S into `out[:15]`.
 
     `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
     `phi` (10,) are the tool's inertial parameters.
     """
-    sensor_motion(arm, q, v, vdot, motion)
+    motion = np.empty(serial_arm.SENSOR_MOTION_SIZE)
+    serial_arm.sensor_motion(arm, q, v, vdot, motion)
     copy_into(out, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     wrench = out[regressor.SAMPLE_WRENCH]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:9], phi, wrench)
@@ -113,8 +109,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    rigid = truth[regressor.SAMPLE_WRENCH_AND_MOTION]
-    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
+    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, truth)
     copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
     copy_into(memory, size, memory, 0, size)
@@ -460,7 +455,7 @@ class WristSensor(LeafSystem):
         near = self._tool_proximity(state, around)
         if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
             contact_W, p_WS = self._plant_contact_wrench_W(context).copy(), np.empty(3)
-            forward_kinematics(physics[0], state[:n], np.empty((3, 3)), p_WS)
+            serial_arm.forward_kinematics(physics[0], state[:n], np.empty((3, 3)), p_WS)
             contact_W[3:] -= np.cross(p_WS, contact_W[:3])  # about So instead of the world's origin
             applied = applied + contact_W
             physics = (*physics[:2], physics[2][:0], *physics[3:])
@@ -475,12 +470,10 @@ class WristSensor(LeafSystem):
         return EventStatus.Succeeded()
 
 
-def sample_at_rest(arm: ArmModel, q: Array) -> Array:
+def sample_at_rest(arm: serial_arm.ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
-    no_contact, motion = np.zeros(6), np.zeros(SENSOR_MOTION_SIZE)
-    truth = sample[regressor.SAMPLE_WRENCH_AND_MOTION]
-    true_sample_into(arm.table, arm.phi_load, q, still, still, no_contact, motion, truth)
+    true_sample_into(arm.table, arm.phi_load, q, still, still, np.zeros(6), sample)
     sample[regressor.SAMPLE_JOINT_POSITION] = q
     return sample
 
