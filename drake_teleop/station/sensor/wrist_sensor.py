@@ -349,9 +349,7 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Take the due samples, and store them in the context."""
-        seen = self._states_of_arm_and_environment(context)
-        near = self._tool_proximity(*seen)
-        self._take_samples(context, seen, near, False, _USE_COMPILED_CONTACT, self._result)
+        self._take_samples(context, False, self._result)
         context.SetDiscreteState(self._result[self._memory_slice])
 
     def reset_queue(self, context: Context) -> None:
@@ -384,25 +382,15 @@ class WristSensor(LeafSystem):
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._states_of_arm_and_environment(context)
-        near = self._tool_proximity(*seen)
-        if near == PROXIMITY_FAR:
-            touching_W = self._zero_wrench
-        elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
-            touching_W = self._plant_contact_wrench_W(context)
-        else:
-            touching_W = _USE_COMPILED_CONTACT
-        self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
+        self._take_samples(context, True, output.get_mutable_value())
 
-    def _take_samples(
-        self,
-        context: Context,
-        seen: tuple[Array, Array],
-        near: int,
-        until_now: bool,
-        touching_W: Array,
-        result: Array,
-    ) -> None:
+    def _take_samples(self, context: Context, until_now: bool, result: Array) -> None:
+        seen = self._states_of_arm_and_environment(context)
+        near, touching_W = self._tool_proximity(*seen), _USE_COMPILED_CONTACT
+        if until_now and near == PROXIMITY_FAR:
+            touching_W = self._zero_wrench
+        elif until_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
+            touching_W = self._plant_contact_wrench_W(context)
         rate = self._no_rate if self._rate is None else self._rate.Eval(context)
         held, applied = (self._torque.Eval(context), rate), self._evaluate_applied_wrench(context)
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
