@@ -85,7 +85,7 @@ class MasterDevice(LeafSystem):
         self._constants: tuple[Any, ...] = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
         if isinstance(device, LeaderDevice):
             self._advance = step_leader
-            self._constants = *device.compiled_constants, device.hand_weight
+            self._constants = device.compiled_constants, device.hand_weight
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
         coordinates = device.coordinates_for_force_display(q_initial)

@@ -150,9 +150,10 @@ class ForceDisplay(LeafSystem):
         super().__init__()
         self._period, self._parameters = period, device.parameters
         self._jacobian, self._shortened = np.zeros((6, 6)), np.zeros(6)
+        self._num_joints = device.num_joints
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLOTS.stop)
-        self._leader = device if isinstance(device, LeaderDevice) else None
+        self._leader = device.compiled_constants if isinstance(device, LeaderDevice) else None
         if self._leader is not None:
             self._state = self.DeclareVectorInputPort("state", 2 * device.num_joints)
         inputs = {self.all_input_ports_ticket()}
@@ -170,10 +171,9 @@ class ForceDisplay(LeafSystem):
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         wrench = self._command.Eval(context)
         if self._leader is not None:
-            q = self._state.Eval(context)[: self._leader.num_joints]
+            q = self._state.Eval(context)[: self._num_joints]
             if np.isfinite(wrench).all() and np.isfinite(q).all():
-                constants = self._leader.compiled_constants
-                limit_wrench_to_motor_torques(*constants, q, wrench, self._shortened)
+                limit_wrench_to_motor_torques(self._leader, q, wrench, self._shortened)
                 wrench = self._shortened
         constants = self._parameters, self._period, self._jacobian
         step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())

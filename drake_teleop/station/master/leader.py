@@ -79,11 +79,12 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
 
 
 @njit(cache=True)
-def limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, F, torque):
+def limited_leader_motor_torques_into(leader, q, F, torque):
     """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
 
-    F (6,) is the wrench at E; `arm_without_hand` is `ArmModel.table` without the hand.
+    F (6,) is the wrench at E; `leader` is `LeaderDevice.compiled_constants`.
     """
+    arm_without_hand, arm, joint_table = leader
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
     serial_arm.inverse_dynamics(arm_without_hand, q, still, still, torque)
@@ -97,15 +98,12 @@ def limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, F, 
 
 
 @njit(cache=True)
-def step_leader(
-    arm_without_hand, arm, joint_table, hand_weight, state, pose, twist, display,
-    hand_wrench, drive, period,
-):  # fmt: skip
+def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive, period):
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `arm_without_hand` and `arm` are `ArmModel.table`. The operator carries the hand's weight
-    `hand_weight` [N].
+    `leader` is `LeaderDevice.compiled_constants`. The operator carries the hand's weight [N].
     """
+    _, arm, joint_table = leader
     n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
     valid = are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6])
@@ -118,8 +116,8 @@ def step_leader(
         g = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN : serial_arm.LAST_ROW_GRAVITY_COLUMN + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
-            applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
-        limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
+            applied[i] -= weight * g[i] / size if size > 0.0 else 0.0
+        limited_leader_motor_torques_into(leader, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
         q, v, vdot = stage[:n], stage[n:], slope[n:]
         copy_into(stage, 0, state, 0, 2 * n)
@@ -133,11 +131,12 @@ def step_leader(
 
 
 @njit(cache=True)
-def limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
+def limit_wrench_to_motor_torques(leader, q, wrench, shortened):
     """Write a wrench (6,), shortened to the torque limits beside the weight, to `shortened`."""
+    _, arm, joint_table = leader
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
-    limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
+    limited_leader_motor_torques_into(leader, q, np.zeros(6), weight)
     serial_arm.jacobian(arm, q, J)
     for i in range(n):
         torque = 0.0
@@ -151,15 +150,13 @@ def limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench,
 
 
 @njit(cache=True)
-def _flag_rows_with_motor_at_limit(arm_without_hand, arm, joint_table, q, F, share):
+def _flag_rows_with_motor_at_limit(leader, q, F, share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
     for row in range(rows):
-        limited_leader_motor_torques_into(
-            arm_without_hand, arm, joint_table, q[row], F[row], torque
-        )
+        limited_leader_motor_torques_into(leader, q[row], F[row], torque)
         for i in range(n):
-            flags[row] |= abs(torque[i]) >= share * joint_table[_TORQUE_LIMIT_ROW, i]
+            flags[row] |= abs(torque[i]) >= share * leader[2][_TORQUE_LIMIT_ROW, i]
     return flags
 
 
@@ -199,6 +196,7 @@ class LeaderDevice(HapticDeviceBase):
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
+        """Tables of the arm without and with the hand, and `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:
@@ -236,8 +234,8 @@ class LeaderDevice(HapticDeviceBase):
 
         The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
         """
-        tables = self.compiled_constants
-        return np.asarray(_flag_rows_with_motor_at_limit(*tables, q.copy(), F.copy(), share))
+        constants = self.compiled_constants
+        return np.asarray(_flag_rows_with_motor_at_limit(constants, q.copy(), F.copy(), share))
 
     def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
