@@ -83,24 +83,8 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
         add_runge_kutta_stage(i, period, slope, total, stage, state)
 
 
-class HapticDeviceBase:
-    """Base class of haptic devices."""
-
-    parameters: DeviceParameters
-
-    @property
-    def peak_force(self) -> float:
-        """Largest displayed force [N]; some postures of a leader arm allow less."""
-        return self.parameters.peak_force
-
-    @property
-    def peak_torque(self) -> Array:
-        """Largest displayed torques (3,) about the rotational axes [N m]."""
-        return self.parameters.peak_torque
-
-
 @dataclass(frozen=True)
-class HapticDevice(HapticDeviceBase):
+class HapticDevice:
     """Dynamics of a haptic device (Phantom or `task_space`) with the hand's passive mass.
 
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.

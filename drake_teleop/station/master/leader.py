@@ -23,7 +23,7 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
-from drake_teleop.station.master.dynamics import HapticDeviceBase, add_runge_kutta_stage
+from drake_teleop.station.master.dynamics import add_runge_kutta_stage
 from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
@@ -161,7 +161,7 @@ def _flag_rows_with_motor_at_limit(leader, q, F, share):
 
 
 @dataclass(frozen=True)
-class LeaderDevice(HapticDeviceBase):
+class LeaderDevice:
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
