@@ -264,7 +264,8 @@ def _read_covariance(where: str, value: Any) -> Array:
         raw = np.empty(0)
     if raw.shape != (16, 16):
         raise _file_error("is not a (16, 16) table of numbers", where)
-    unknown = np.eye(16, dtype=bool) & np.equal(raw, None)
+    is_null = np.reshape([each is None for each in raw.flat], (16, 16))
+    unknown = np.eye(16, dtype=bool) & is_null
     _check_numbers(where, raw[~unknown].tolist())
     covariance = finite_array(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
