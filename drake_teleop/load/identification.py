@@ -160,10 +160,8 @@ class Identification:
                 raise _file_error("is not a field of identification.json", f"{path}:{name}")
             if name not in document and name not in _OPTIONAL_FILE_FIELDS:
                 raise _file_error("is missing", f"{path}:{name}")
-        fields = {name: _read_field(f"{path}:{name}", name, document[name]) for name in document}
-        if check_nonzero_load(f"{path}:phi", fields["phi"])[0] == 0.0:
-            # The natural scale is proportional to the mass.
-            raise _file_error("has the mass 0", f"{path}:phi")
+        names = [name for name in known if name in document]  # phi first
+        fields = {name: _read_field(f"{path}:{name}", name, document[name]) for name in names}
         result = cls(**{name: fields[name] for name in cls.__dataclass_fields__ if name in fields})
         if fields.get("verdicts", list(result.verdicts)) != list(result.verdicts):
             others = "phi, covariance, identifiable or prior_dominated"
@@ -235,6 +233,9 @@ def _read_field(where: str, name: str, value: Any) -> Any:
         array = finite_array(where, value, *_SHAPES.get(name, ()))
         if name in _LIMITED_FIELDS and np.abs(array).max() > _MAX_FILE_VALUE:
             raise _file_error(f"has an absolute value above {_MAX_FILE_VALUE:g}", where)
+        # The natural scale is proportional to the mass.
+        if name == "phi" and check_nonzero_load(where, array)[0] == 0.0:
+            raise _file_error("has the mass 0", where)
         return array if array.shape else (int if name == "samples" else float)(array)
     if name == "covariance":
         return _read_covariance(where, value)
