@@ -119,9 +119,8 @@ def draw(seed: int, index: int) -> Drawn:
     action, sigma, gamma = choose(ACTIONS), choose((0.0, 0.5, 1.0)), 1.0 + 2.0 * rng.random()
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
-    peak = (
-        Master(model=device, figures=copy.deepcopy(FIGURES.get(device))).device(0.0, 0.0).peak_force
-    )
+    master = Master(model=device, figures=copy.deepcopy(FIGURES.get(device)))
+    peak = master.device(0.0, 0.0).parameters.peak_force
     force = min(force, PEAK_SHARE * peak, scale * ARMS[arm][4], scale * stiffness * MAX_DEPTH)
     grips = [name for name, hand in GRIP_IMPEDANCES.items() if force / hand.stiffness < 0.04]
     return Drawn(

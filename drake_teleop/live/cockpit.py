@@ -64,7 +64,7 @@ class PageValueCalculator:
             ("speed", "slave_state", slice(n, None), _WARNED_LIMIT_FRACTION * arm.velocity_limit),
             ("torque", "joint_torque", slice(None), _WARNED_LIMIT_FRACTION * arm.effort_limit),
         )
-        self._peak = scenario.master.device(0.0, 0.0).peak_force
+        self._peak = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
         self._last_row = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))

@@ -48,22 +48,12 @@ def add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, exc
 
 
 @njit(cache=True)
-def _add_excess_weights_of_rows(
-    gravity, phi_gripper, phi_object, excess_gripper, excess_object, out
-):
-    for i in range(out.shape[0]):
-        add_excess_weight_into(
-            gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i]
-        )
-
-
-@njit(cache=True)
-def _scaled_wrenches_of_rows(
-    wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
-):
-    scales = phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
+def _scaled_wrenches_of_rows(wrench, offsets, s, omega, alpha, phis, scales, gravity, excess, out):
+    scales = *phis, *scales
     for i in range(wrench.shape[0]):
         scaled_wrench_into(wrench[i], offsets[i], s[i], omega[i], alpha[i], *scales, out[i])
+        if gravity.shape[0] > 0:
+            add_excess_weight_into(gravity[i], *phis, *excess, out[i])
 
 
 def contact_wrench(
@@ -122,20 +112,19 @@ def scaled_wrench(
         None if sigma_weight is None else _check_scale("sigma_weight", sigma_weight),
         None if sigma_inertia is None else _check_scale("sigma_inertia", sigma_inertia),
     )
-    scales = [*inertias, _check_scale("gamma", gamma)]
+    scales = *inertias, _check_scale("gamma", gamma)
     if weights != inertias and gravity is None:
         raise unknown_gravity_error("gravity", "pass gravity, g in S, for each sample")
     phis = finite_array("phi_gripper", phi_gripper, 10), finite_array("phi_object", phi_object, 10)
     leading, rows = broadcast_to_rows(
         wrench=(wrench, 6), offsets=(offsets, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
     )
-    out = np.empty_like(rows[0])
-    _scaled_wrenches_of_rows(*rows, *phis, *scales, out)
+    out, down = np.empty_like(rows[0]), np.empty((0, 3))
+    excess = weights[0] - inertias[0], weights[1] - inertias[1]
     if weights != inertias and gravity is not None:
         wrenches = rows[0].reshape(*leading, 6)
         _, (down, _) = broadcast_to_rows(gravity=(gravity, 3), wrench=(wrenches, 6))
-        excess = [weight - inertia for weight, inertia in zip(weights, inertias, strict=True)]
-        _add_excess_weights_of_rows(down, *phis, *excess, out)
+    _scaled_wrenches_of_rows(*rows, phis, scales, down, excess, out)
     return out.reshape(*leading, 6)
 
 

@@ -32,10 +32,13 @@ MAX_IDENTIFIED_STD_SHARE = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
 _MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
-_MAX_FILE_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
 _OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 # Names in the file that are computed from the fields.
 _DERIVED_FIELDS = ("mass", "com", "inertia_com", "physically_consistent")
+# Shapes of the numbers in the file, and those with a limit: fourth powers must not overflow.
+_SCALAR_FIELDS = ("condition_number", "delay_s", "mass", "samples")
+_SHAPES = dict(phi=(10,), offsets=(6,), residual_rms=(6,), com=(3,), inertia_com=(3, 3))
+_LIMITED_FIELDS, _MAX_FILE_VALUE = ("phi", "offsets", "residual_rms", "delay_s"), 1e9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -157,53 +160,16 @@ class Identification:
                 raise _file_error("is not a field of identification.json", f"{path}:{name}")
             if name not in document and name not in _OPTIONAL_FILE_FIELDS:
                 raise _file_error("is missing", f"{path}:{name}")
-
-        def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
-            where = f"{path}:{name}"
-            if not _contains_only_numbers(document[name]):
-                raise _file_error("contains values that are not numbers", where)
-            array = finite_array(where, document[name], *shape)
-            if np.abs(array).max() > largest:
-                raise _file_error(f"has an absolute value above {largest:g}", where)
-            return array
-
-        if not isinstance(document["method"], str):
-            raise _file_error("is not a text", f"{path}:method")
-        optional: dict[str, Any] = {}
-        for name, read in (
-            ("weight_removed", _read_flag),
-            ("degrees_of_freedom", _read_degrees_of_freedom),
-            ("prior_dominated", _read_flags),
-        ):
-            if name in document:
-                optional[name] = read(f"{path}:{name}", document[name])
-        phi = read_number_array("phi", 10, largest=_MAX_FILE_VALUE)
-        check_nonzero_load(f"{path}:phi", phi)
-        if phi[0] == 0.0:  # the natural scale is proportional to the mass
-            raise _file_error("has the mass 0", f"{path}:phi")
-        result = cls(
-            phi=phi,
-            offsets=read_number_array("offsets", 6, largest=_MAX_FILE_VALUE),
-            covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
-            identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
-            condition_number=float(read_number_array("condition_number")),
-            delay_s=float(read_number_array("delay_s", largest=_MAX_FILE_VALUE)),
-            residual_rms=read_number_array("residual_rms", 6, largest=_MAX_FILE_VALUE),
-            method=document["method"],
-            samples=int(read_number_array("samples")),
-            **optional,
-        )
-        if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
+        names = [name for name in known if name in document]  # phi first
+        fields = {name: _read_field(f"{path}:{name}", name, document[name]) for name in names}
+        result = cls(**{name: fields[name] for name in cls.__dataclass_fields__ if name in fields})
+        if fields.get("verdicts", list(result.verdicts)) != list(result.verdicts):
             others = "phi, covariance, identifiable or prior_dominated"
             raise _file_error(f"contradicts {others}", f"{path}:verdicts")
         for name in _DERIVED_FIELDS:
-            value = getattr(result, name)
-            if isinstance(value, bool):
-                follows = document[name] is value
-            else:
-                stated = read_number_array(name, *np.shape(value))
-                follows = np.allclose(stated, value, rtol=1e-6, atol=1e-9)
-            if not follows:
+            stated, value = fields[name], getattr(result, name)
+            is_flag = isinstance(value, bool)
+            if not (stated is value if is_flag else np.allclose(stated, value, 1e-6, 1e-9)):
                 raise DrakeTeleopError("contradicts phi", where=f"{path}:{name}", remedy="edit phi")
         return result
 
@@ -257,10 +223,39 @@ def _read_document(path: str | Path) -> dict[str, Any]:
     return document
 
 
-def _contains_only_numbers(value: Any) -> bool:
-    if isinstance(value, list):
-        return all(map(_contains_only_numbers, value))
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+def _file_error(what: str, where: str) -> DrakeTeleopError:
+    return DrakeTeleopError(what, where=where, remedy="run `identify` again")
+
+
+def _read_field(where: str, name: str, value: Any) -> Any:
+    if name in _SHAPES or name in _SCALAR_FIELDS:
+        _check_numbers(where, value)
+        array = finite_array(where, value, *_SHAPES.get(name, ()))
+        if name in _LIMITED_FIELDS and np.abs(array).max() > _MAX_FILE_VALUE:
+            raise _file_error(f"has an absolute value above {_MAX_FILE_VALUE:g}", where)
+        # The natural scale is proportional to the mass.
+        if name == "phi" and check_nonzero_load(where, array)[0] == 0.0:
+            raise _file_error("has the mass 0", where)
+        return array if array.shape else (int if name == "samples" else float)(array)
+    if name == "covariance":
+        return _read_covariance(where, value)
+    if name in ("identifiable", "prior_dominated"):
+        flags = value if isinstance(value, list) else []
+        if len(flags) != 16 or not all(isinstance(flag, bool) for flag in flags):
+            raise _file_error("is not a list of 16 true or false", where)
+        return np.array(flags, dtype=bool)
+    if name == "degrees_of_freedom":
+        given = value if isinstance(value, list) else [""]
+        _check_numbers(where, [v for v in given if v is not None], "a list of 16 numbers or null")
+        degrees = finite_array(where, [1.0 if v is None else v for v in given], 16)
+        if (degrees <= 0.0).any():
+            raise _file_error(f"has a value that is not positive ({degrees.min():g})", where)
+        return np.where([v is None for v in given], np.inf, degrees)
+    kinds = {"method": (str, "a text"), "weight_removed": (bool, "true or false")}
+    kind, expected = kinds.get(name, (object, ""))
+    if not isinstance(value, kind):
+        raise _file_error(f"is not {expected}", where)
+    return value
 
 
 def _read_covariance(where: str, value: Any) -> Array:
@@ -270,40 +265,22 @@ def _read_covariance(where: str, value: Any) -> Array:
         raw = np.empty(0)
     if raw.shape != (16, 16):
         raise _file_error("is not a (16, 16) table of numbers", where)
-    unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
-    if not _contains_only_numbers(raw[~unknown].tolist()):
-        raise _file_error("contains values that are not numbers", where)
+    is_null = np.reshape([each is None for each in raw.flat], (16, 16))
+    unknown = np.eye(16, dtype=bool) & is_null
+    _check_numbers(where, raw[~unknown].tolist())
     covariance = finite_array(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
         raise _file_error(f"has a negative variance ({np.diag(covariance).min():g})", where)
     return np.where(unknown, np.inf, covariance)
 
 
-def _file_error(what: str, where: str) -> DrakeTeleopError:
-    return DrakeTeleopError(what, where=where, remedy="run `identify` again")
-
-
-def _read_flag(where: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise _file_error("is not true or false", where)
-    return value
-
-
-def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
-    flags = value if isinstance(value, list) else []
-    if len(flags) != 16 or not all(isinstance(flag, bool) for flag in flags):
-        raise _file_error("is not a list of 16 true or false", where)
-    return np.array(flags, dtype=bool)
-
-
-def _read_degrees_of_freedom(where: str, value: Any) -> Array:
-    given = value if isinstance(value, list) else [""]
-    if not _contains_only_numbers([v for v in given if v is not None]):
-        raise _file_error("is not a list of 16 numbers or null", where)
-    degrees = finite_array(where, [1.0 if v is None else v for v in given], 16)
-    if (degrees <= 0.0).any():
-        raise _file_error(f"has a value that is not positive ({degrees.min():g})", where)
-    return np.where([v is None for v in given], np.inf, degrees)
+def _check_numbers(where: str, value: Any, expected: str = "") -> None:
+    if isinstance(value, list):
+        for each in value:
+            _check_numbers(where, each, expected)
+    elif isinstance(value, bool) or not isinstance(value, (int, float)):
+        what = f"is not {expected}" if expected else "contains values that are not numbers"
+        raise _file_error(what, where)
 
 
 SIGNIFICANT_STDS_BELOW_ZERO = 3.0

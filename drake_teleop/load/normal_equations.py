@@ -143,8 +143,7 @@ class SecondMoments:
         return Q
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        inverse, undetermined, condition_number = self._pseudo_inverse()
-        theta = inverse @ self.normal_equations()[1]
+        theta, inverse, undetermined, condition_number = self._minimum_norm_solution()
         if theta[6] == 0.0:
             raise unidentifiable_mass_error("the fitted mass is 0")
         covariance, degrees = self._covariance_and_degrees(theta, inverse)
@@ -165,8 +164,7 @@ class SecondMoments:
 
     def covariance(self) -> Array:
         """Return the finite covariance (16, 16) of the minimum-norm solution [offsets; phi]."""
-        inverse, _, _ = self._pseudo_inverse()
-        return self._covariance_and_degrees(inverse @ self.normal_equations()[1], inverse)[0]
+        return self._covariance_and_degrees(*self._minimum_norm_solution()[:2])[0]
 
     def _covariance_and_degrees(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
         variances, degrees, _ = self._long_run_variances(theta, inverse)
@@ -180,12 +178,13 @@ class SecondMoments:
         known, infinite = (total > 0.0) & (square_sums > 0.0), np.full(16, np.inf)
         return parts.sum(axis=0), np.divide(total**2, square_sums, out=infinite, where=known)
 
-    def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
-        return _pseudo_inverse(self.normal_equations()[0], self.unexcited_columns)
+    def _minimum_norm_solution(self) -> tuple[Array, Array, NDArray[np.bool_], float]:
+        gram, right = self.normal_equations()
+        inverse, undetermined, condition_number = _pseudo_inverse(gram, self.unexcited_columns)
+        return inverse @ right, inverse, undetermined, condition_number
 
-    def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        weights = self._weights if weights is None else finite_array("weights", weights, 6)
-        return normal_equations(self._sums, np.diag(weights))
+    def normal_equations(self) -> tuple[Array, Array]:
+        return normal_equations(self._sums, np.diag(self._weights))
 
     def _channel_grams(self) -> Array:
         T = regressor_coefficients()
@@ -201,13 +200,12 @@ class SecondMoments:
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
         """Return residual variances (6,) with correlation in time, and their degrees of freedom."""
-        inverse, _, _ = self._pseudo_inverse()
+        inverse = self._minimum_norm_solution()[1]
         return self._long_run_variances(finite_array("theta", theta, 16), inverse)[:2]
 
     def has_slow_noise(self) -> NDArray[np.bool_]:
         """Return (6,) True for wrench channels whose noise is slower than the record resolves."""
-        inverse, _, _ = self._pseudo_inverse()
-        return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
+        return self._long_run_variances(*self._minimum_norm_solution()[:2])[2]
 
     def _long_run_variances(
         self, theta: Array, inverse: Array
@@ -219,12 +217,13 @@ class SecondMoments:
             absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
             rest_variances = self._residual_variances_of_poses_at_rest(power, absorbed, theta)
             return *rest_variances, np.zeros(6, dtype=bool)
-        variances, degrees = self._unbiased_residual_variances(power, n, grams, grams, inverse)
+        variances, degrees, sample_absorbed = self._unbiased_residual_variances(
+            power, n, grams, grams, inverse
+        )
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
         wrench = np.diag(self._sums)[_WRENCH_COLUMNS]
         found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
-        sample_absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
         longest, longest_degrees = variances, degrees
         last, length, filled = (int(number) for number in self._state)
         # An unfinished last block would have the weight of a full one.
@@ -233,7 +232,7 @@ class SecondMoments:
             rows = _regressors_of_blocks(blocks)
             power = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
-            estimated, counted = self._unbiased_residual_variances(
+            estimated, counted, absorbed = self._unbiased_residual_variances(
                 power, len(blocks), between, grams, inverse
             )
             usable = ~found & (counted >= _MIN_DOF_OF_VARIANCE)
@@ -246,7 +245,6 @@ class SecondMoments:
             variances = np.where(take, corrected, variances)
             degrees = np.where(take, counted, degrees)
             found |= enough
-            absorbed = self._absorbed_degrees_of_freedom(between, inverse)
             has_motion = absorbed >= _MIN_FIT_DOF_SHARE_IN_BLOCKS * sample_absorbed
             is_longest = has_motion & (counted >= _MIN_DOF_OF_LONGEST_BLOCKS)
             longest = np.where(is_longest, estimated, longest)
@@ -289,17 +287,17 @@ class SecondMoments:
 
     def _unbiased_residual_variances(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, Array]:
         w = self._weights
         absorbed = self._absorbed_degrees_of_freedom(between, inverse)
         shares = np.einsum("cij,kji->ck", between, inverse @ grams @ inverse) * w**2
         degrees = np.maximum(count - absorbed, 0.0)
         equations = np.diag(count - 2.0 * absorbed) + shares
         if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
-            return power / np.maximum(degrees, 1.0), degrees
+            return power / np.maximum(degrees, 1.0), degrees, absorbed
         solution = np.linalg.solve(equations, power)
         # Errors of the other channels can make a small solution negative.
-        return np.maximum(solution, power / count), degrees
+        return np.maximum(solution, power / count), degrees, absorbed
 
 
 def identify(

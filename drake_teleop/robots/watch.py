@@ -69,7 +69,7 @@ class ContactAndLoadMonitor:
         watched.monitor_load(
             self._out, self._memory, values, self._fallback, self._dt, *self._parameters
         )
-        state = watched.load_state_index(self._memory)
+        state = self._memory[watched.STATE_INDEX]
         if state == watched.STATE_OTHER_LOAD:
             return int(ReadingFlag.OTHER_LOAD)
         return int(ReadingFlag.IN_CONTACT) if state == watched.STATE_DISTURBED else 0

@@ -79,8 +79,8 @@ def _passivity_with_arm_and_device(scenario: Scenario) -> PassivityConfig:
     return dataclasses.replace(
         passivity,
         ledger=ledger,
-        force_limit=min(passivity.force_limit, device.peak_force),
-        torque_limit=min(passivity.torque_limit, float(device.peak_torque.min())),
+        force_limit=min(passivity.force_limit, device.parameters.peak_force),
+        torque_limit=min(passivity.torque_limit, float(device.parameters.peak_torque.min())),
     )
 
 

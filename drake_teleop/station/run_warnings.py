@@ -145,12 +145,13 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
             yield f"joint {joint + 1} is at its largest {what}", spans, advice
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
+        limits = device.parameters
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * limits.peak_force
         if isinstance(device, LeaderDevice):
-            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
+            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * limits.peak_torque[0]
             joints = result["master_state"][:, : device.num_joints]
             full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
-        elif device.peak_torque.all():
+        elif limits.peak_torque.all():
             full |= _is_torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
         yield "the device displays its largest force or torque", spans, _REDUCE_FORCE_ADVICE
@@ -324,7 +325,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
 
 
 def _is_torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.peak_torque
+    full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.parameters.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])

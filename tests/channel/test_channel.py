@@ -42,7 +42,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     scenario = Scenario()
     scenario.master.model = model
     device = scenario.master.device(0.0, 0.0)
-    force, torque = device.peak_force, min(device.peak_torque)
+    force, torque = device.parameters.peak_force, min(device.parameters.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
     limited = _passivity_with_arm_and_device(replace(scenario, passivity=own))
     assert limited.method == "wave"

@@ -15,6 +15,7 @@ from drake_teleop.load.online.watched import (
     LOAD_FADE_TIME_S,
     MEMORY_SIZE,
     STATE_DISTURBED,
+    STATE_INDEX,
     STATE_LEARNING,
     STATE_OTHER_LOAD,
     STATE_SETTLED,
@@ -22,7 +23,6 @@ from drake_teleop.load.online.watched import (
     _update_and_test_force_change,
     _update_and_test_rest,
     initial_monitor_memory,
-    load_state_index,
     monitor_load,
 )
 from drake_teleop.load.regressor import non_contact_wrench
@@ -238,7 +238,7 @@ def monitor_samples(prior, rows, fallback=None):
     rest = np.zeros(10) if fallback is None else fallback
     for k, row in enumerate(rows):
         monitor_load(out, memory, row, rest, 1e-3, *options)
-        handed[k], states[k] = out, load_state_index(memory)
+        handed[k], states[k] = out, memory[STATE_INDEX]
     return handed, states
 
 

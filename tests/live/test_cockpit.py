@@ -45,7 +45,7 @@ def test_joints_at_their_limits_are_named(scenario, rows):
 
 
 def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
-    peak = scenario.master.device(0.0, 0.0).peak_force
+    peak = scenario.master.device(0.0, 0.0).parameters.peak_force
     strongest = f"the device renders its largest force, {peak:g} N"
     for name, change, said in (
         ("ik_status", IkStatus.OUT_OF_REACH, "the arm cannot reach the position of the hand"),

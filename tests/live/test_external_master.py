@@ -57,7 +57,8 @@ def test_side_of_a_real_device_has_the_limits_of_the_device(model):
     device = scenario.master.device(0.0, 0.0)
     side = MakeExternalMasterSide(scenario)
     limits = side.GetSubsystemByName("live_hand")._limits
-    np.testing.assert_array_equal(limits, [device.peak_force, max(device.peak_torque)])
+    peaks = device.parameters.peak_force, max(device.parameters.peak_torque)
+    np.testing.assert_array_equal(limits, peaks)
     assert limits[0] > 2.0 * limits[1]
 
 

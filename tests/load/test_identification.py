@@ -110,7 +110,7 @@ def test_variances_of_channels_follow_from_their_residuals():
     left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
     power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
     equations = SecondMoments(weights**-0.5)
-    found, degrees = equations._unbiased_residual_variances(power, n, grams, grams, inverse)
+    found, degrees, _ = equations._unbiased_residual_variances(power, n, grams, grams, inverse)
     np.testing.assert_allclose(found, variances, rtol=1e-9)
     assert degrees.sum() == pytest.approx(6 * n - 16)
 

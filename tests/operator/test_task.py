@@ -125,13 +125,13 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
         "_contact_force_at_tool_along_approach",
         decision._contact_force_at_tool_along_approach.py_func,
     )
-    force_W, across = np.array([3.0, -5.0, 8.0]), np.zeros(3)
+    force_W = np.array([3.0, -5.0, 8.0])
     packed, felt = decision.pack_task_parameters(task), 0.3 * R_WB.T @ force_W
     axis = np.array(task.translation) / np.linalg.norm(task.translation)
     assert decision._contact_force_at_tool_along_approach(packed, person, felt) == pytest.approx(
         -force_W @ axis
     )
-    size = decision._lateral_force_into.py_func(packed, person, felt, across)
+    across, size = decision._lateral_force_and_size.py_func(packed, person, felt)
     np.testing.assert_allclose(across, force_W - (force_W @ axis) * axis, atol=1e-12)
     assert size == pytest.approx(np.linalg.norm(across))
 
@@ -141,9 +141,7 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     training = decision.OperatorTraining(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_operator_parameters(training, Perception(), movement), []
-    monkeypatch.setattr(
-        decision, "_convert_to_hand_motion", decision._convert_to_hand_motion.py_func
-    )
+    monkeypatch.setattr(decision, "_hand_motion", decision._hand_motion.py_func)
     monkeypatch.setattr(decision, "_draw_normal_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._plan_submovement.py_func(

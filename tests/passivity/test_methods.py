@@ -263,8 +263,8 @@ def test_limits_and_servo_have_their_own_scales(power, motion, limits):
 
 def test_limits_are_those_of_the_default_device_unless_given():
     device, config = Master().device(0.0, 0.0), PassivityConfig()
-    assert config.force_limit == device.peak_force
-    assert config.torque_limit == min(device.peak_torque)
+    assert config.force_limit == device.parameters.peak_force
+    assert config.torque_limit == min(device.parameters.peak_torque)
 
 
 def test_unknown_method_is_rejected():

@@ -74,12 +74,32 @@ def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorF
 
 
 def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    exact_motion = replace(options, noise=NoiseStd(options.noise.wrench))
-    return _fit_moments_and_wrench_noise(record.moments, exact_motion, record)
+    return _fit_total(record, replace(options, noise=NoiseStd(options.noise.wrench)))
 
 
-def _fit_total_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_moments_and_wrench_noise(record.moments, options, record)
+def _fit_total(
+    record: SampleRecord, options: EstimatorOptions, moments: SecondMoments | None = None
+) -> EstimatorFit:
+    moments = moments or record.moments
+    noise, Z = options.noise, moments.mean_products
+    if noise.wrench is not None:
+        std = np.asarray(noise.wrench, np.float64)
+    else:
+        std = np.ones(6)
+        floor = _MIN_NOISE_OVER_RMS * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = np.where(floor > 0.0, floor, 1.0)
+        for known in (NoiseStd(), noise):
+            theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
+            squares = np.diag(residual_covariance(Z, theta))
+            motion = moments.mean_noise_covariance_of_z(noise, np.zeros(6))
+            explained = np.diag(residual_covariance(motion, theta))
+            if options.shared_noise:
+                squares = squares.reshape(2, 3).mean(axis=1).repeat(3)
+                explained = explained.reshape(2, 3).mean(axis=1).repeat(3)
+            variances = np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL * squares)
+            std = np.sqrt(variances.clip(floor**2))
+    form = total_least_squares(moments, noise, std, offsets=options.offsets)
+    return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 
 
 def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -92,7 +112,7 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
 
 
 def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    whole = _fit_total_least_squares(record, options)
+    whole = _fit_total(record, options)
     n = len(record.s)
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
@@ -107,7 +127,7 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
             return replace(whole, note=_NOTHING_REJECTED_NOTE)
-        fit = _fit_moments_and_wrench_noise(moments, options, record)
+        fit = _fit_total(record, options, moments)
         form = fit.form
         if (rejected == previous).all():
             break
@@ -118,7 +138,7 @@ def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> SolvedNormalE
     moments, weights = record.moments, np.ones(len(record.s))
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
-        form = _fit_moments_and_wrench_noise(moments, options, record).form
+        form = _fit_total(record, options, moments).form
         distances = _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
         weights = np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
@@ -152,7 +172,7 @@ METHODS = Registry(
         "ordinary": Method("batch least squares", _fit_ordinary),
         "whitened": Method("whitened least squares", _fit_whitened),
         "robust": Method("robust least squares", _fit_robust),
-        "total": Method("total least squares", _fit_total_least_squares),
+        "total": Method("total least squares", _fit_total),
         "consistent": Method("physically consistent least squares", _fit_consistent),
     },
     Method,
@@ -219,30 +239,6 @@ def identify_batch(
         method=METHODS[method].name,
     )
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
-
-
-def _fit_moments_and_wrench_noise(
-    moments: SecondMoments, options: EstimatorOptions, record: SampleRecord
-) -> EstimatorFit:
-    noise, Z = options.noise, moments.mean_products
-    if noise.wrench is not None:
-        std = np.asarray(noise.wrench, np.float64)
-    else:
-        std = np.ones(6)
-        floor = _MIN_NOISE_OVER_RMS * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
-        floor = np.where(floor > 0.0, floor, 1.0)
-        for known in (NoiseStd(), noise):
-            theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
-            squares = np.diag(residual_covariance(Z, theta))
-            motion = moments.mean_noise_covariance_of_z(noise, np.zeros(6))
-            explained = np.diag(residual_covariance(motion, theta))
-            if options.shared_noise:
-                squares = squares.reshape(2, 3).mean(axis=1).repeat(3)
-                explained = explained.reshape(2, 3).mean(axis=1).repeat(3)
-            variances = np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL * squares)
-            std = np.sqrt(variances.clip(floor**2))
-    form = total_least_squares(moments, noise, std, offsets=options.offsets)
-    return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 
 
 def _largest_residuals_over_robust_std(record: SampleRecord, theta: Array, shared: bool) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,6 +46,17 @@ NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES = 6.2
 """Level that normal noise reaches once in a million samples."""
 CONTACT_END_LEVEL = 0.7 * NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES
 """Level below which contact may end."""
+
+
+@njit(cache=True)
+def _square_of_innovation_sum(memory, last, n):
+    # The sum before the first sample is zero, as is the initial ring.
+    before = RING_BUFFER_START + 6 * ((last + MAX_SUMMED_SAMPLES - n) % MAX_SUMMED_SAMPLES)
+    total = 0.0
+    for i in range(6):
+        difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
+        total += difference * difference
+    return total
 
 
 @njit(cache=True)
@@ -84,18 +96,12 @@ def update_statistics(
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
         memory[CUSUM_START + i] *= shrink
-    # The sum before the first sample is zero, as is the initial ring.
     here = RING_BUFFER_START + 6 * (count % MAX_SUMMED_SAMPLES)
     best, n = 0.0, 1
     for m in range(NUM_SUM_LENGTHS):
         if n > count + 1:
             break
-        before = RING_BUFFER_START + 6 * ((count + MAX_SUMMED_SAMPLES - n) % MAX_SUMMED_SAMPLES)
-        total = 0.0
-        for i in range(6):
-            difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
-            total += difference * difference
-        best = max(best, total / (n * widths[m] * widths[m]))
+        best = max(best, _square_of_innovation_sum(memory, count, n) / (n * widths[m] * widths[m]))
         n *= 2
     for i in range(6):
         memory[here + i] = memory[INNOVATION_SUM_START + i]
@@ -106,36 +112,12 @@ def update_statistics(
 
 
 @njit(cache=True)
-def _statistics_of_rows(rows, parameters, slack, following, quiet_level, out):
-    contact, s, omega, alpha, acceleration = rows
-    memory = np.zeros(MEMORY_SIZE)
-    for k in range(contact.shape[0]):
-        sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
-        update_statistics(memory, *sample, parameters, slack, following, quiet_level)
-        out[k] = memory[STATISTICS_START : STATISTICS_START + 3]
-
-
-def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUSUM_SLACK) -> Array:
-    """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
-    rows = validate_detector_samples(*samples)
-    out = np.empty((len(rows[0]), 3))
-    sums = float(positive_array("slack", slack)), 0.0, CONTACT_END_LEVEL
-    _statistics_of_rows(tuple(rows), floor.compiled_parameters, *sums, out)
-    return out
-
-
-@njit(cache=True)
 def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
     m = 0
     while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
         m += 1
-    # Sum before that window; zero if there was no sample yet.
     last = int(memory[SAMPLE_COUNT_INDEX]) - 1
-    before = RING_BUFFER_START + 6 * ((last + MAX_SUMMED_SAMPLES - (1 << m)) % MAX_SUMMED_SAMPLES)
-    total = 0.0
-    for i in range(6):
-        difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
-        total += difference * difference
+    total = _square_of_innovation_sum(memory, last, 1 << m)
     return math.sqrt(total / (1 << m)) / sum_widths[m]
 
 
@@ -169,11 +151,29 @@ def update_contact_flag(memory, contact, s, omega, alpha, acceleration, paramete
 
 
 @njit(cache=True)
-def _contact_flags_of_rows(memory, rows, settings, out):
+def _process_rows(memory, rows, settings, statistics, flags):
     contact, s, omega, alpha, acceleration = rows
     for k in range(contact.shape[0]):
         sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
-        out[k] = update_contact_flag(memory, *sample, *settings)
+        flags[k] = update_contact_flag(memory, *sample, *settings)
+        statistics[k] = memory[STATISTICS_START : STATISTICS_START + 3]
+
+
+def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUSUM_SLACK) -> Array:
+    """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
+    # Without contact, which would reset the sums.
+    decision = float(positive_array("slack", slack)), 0.0, 0, np.inf, CONTACT_END_LEVEL, 0
+    settings = floor.compiled_parameters, decision
+    return _statistics_and_flags(np.zeros(MEMORY_SIZE), samples, settings)[0]
+
+
+def _statistics_and_flags(
+    memory: Array, samples: tuple[ArrayLike, ...], settings: tuple[Any, Any]
+) -> tuple[Array, NDArray[np.bool_]]:
+    rows = validate_detector_samples(*samples)
+    statistics, flags = np.empty((len(rows[0]), 3)), np.empty(len(rows[0]), np.bool_)
+    _process_rows(memory, tuple(rows), settings, statistics, flags)
+    return statistics, flags
 
 
 class ContactDetector:
@@ -218,10 +218,7 @@ class ContactDetector:
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
         """Process N `DetectorSamples` of a log; return (N,) True for contact."""
-        rows = validate_detector_samples(*samples)
-        out = np.empty(len(rows[0]), np.bool_)
-        _contact_flags_of_rows(self._memory, tuple(rows), self.settings, out)
-        return out
+        return _statistics_and_flags(self._memory, samples, self.settings)[1]
 
 
 def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:

@@ -21,15 +21,10 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
 from drake_teleop.common.vectors import cholesky, copy_into
+from drake_teleop.load import regressor
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
-from drake_teleop.load.regressor import (
-    SAMPLE_MOTION,
-    SAMPLE_WRENCH_AND_MOTION,
-    non_contact_wrench_into,
-    regressor_into,
-)
 
 STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the change detector, by index."""
@@ -66,6 +61,10 @@ _MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_
 
 MEMORY_SIZE = _KNOWN_LOAD_START + 816
 """Length of the memory of `update_change_detector`."""
+KNOWN_LOAD = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
+NEW_LOAD = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
+"""Parts of the memory: [offsets; phi] of the known and of the new load."""
+_NEW_LOAD_COVARIANCE = slice(NEW_LOAD.stop, MEMORY_SIZE)
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
@@ -80,7 +79,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
     """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
-    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
     f = above[0] ** 2 + above[1] ** 2 + above[2] ** 2
     tau = above[3] ** 2 + above[4] ** 2 + above[5] ** 2
     arm = (phi[1] ** 2 + phi[2] ** 2 + phi[3] ** 2) / max(phi[0] ** 2, 1e-12)
@@ -91,9 +90,9 @@ def whitening_matrix(motion, phi, noise, model_var, n):
             continue
         # The wrench is quadratic in the motion, so the central difference is exact.
         shifted[k] = motion[k] + 1.0
-        non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, above)
+        regressor.non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, above)
         shifted[k] = motion[k] - 1.0
-        non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, below)
+        regressor.non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, below)
         shifted[k] = motion[k]
         for i in range(6):
             for j in range(i + 1):
@@ -170,8 +169,7 @@ def _restart_filter_from_known_load(memory, filter_start):
 
 @njit(cache=True)
 def _is_new_load_identified(memory, mass_std_ratio):
-    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
-    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = mass_std_ratio * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
@@ -181,8 +179,7 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 @njit(cache=True)
 def _widen_inertias_by_alpha_noise(memory, noise, block):
-    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
-    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
@@ -195,14 +192,10 @@ def _widen_inertias_by_alpha_noise(memory, noise, block):
 def update_change_detector(memory, sample, block, noise, window, hold, mass_std_ratio):
     """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
-    motion = sample[SAMPLE_MOTION]
-    regressor_into(motion[:3], motion[3:6], motion[6:], V)
-    known = sample[SAMPLE_WRENCH_AND_MOTION]
-    for i in range(15):
-        memory[_WRENCH_SUM_START + i] += known[i]
-    for i in range(6):
-        for j in range(10):
-            memory[_REGRESSOR_SUM_START + 10 * i + j] += V[i, j]
+    motion = sample[regressor.SAMPLE_MOTION]
+    regressor.regressor_into(motion[:3], motion[3:6], motion[6:], V)
+    memory[_WRENCH_SUM_START:_REGRESSOR_SUM_START] += sample[regressor.SAMPLE_WRENCH_AND_MOTION]
+    memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START] += V.ravel()
     memory[_SAMPLE_COUNT_INDEX] += 1.0
     memory[_BLOCK_SAMPLES_INDEX] += 1.0
     if memory[_BLOCK_SAMPLES_INDEX] >= block:
@@ -328,15 +321,10 @@ def initial_change_memory(
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
     memory = np.zeros(MEMORY_SIZE)
-    memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 16] = np.concatenate([theta[:6], phi])
+    memory[KNOWN_LOAD] = np.concatenate([theta[:6], phi])
     memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START] = P.ravel()
     copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
     return memory
-
-
-@njit(cache=True)
-def stored_known_load(memory):
-    return memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 16]
 
 
 @njit(cache=True)
@@ -344,11 +332,6 @@ def current_change_state(memory):
     """Return the state as index into `STATE_NAMES`; a new load becomes known once identified."""
     is_known = memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
     return STATE_KNOWN if is_known else int(memory[_STATE_INDEX])
-
-
-@njit(cache=True)
-def stored_new_load(memory):
-    return memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
 
 
 @njit(cache=True)
@@ -376,7 +359,7 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    theta = stored_known_load(memory).copy()
+    theta = memory[KNOWN_LOAD].copy()
     covariance = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START].reshape(16, 16).copy()
     return replace(
         known,

@@ -121,7 +121,8 @@ class RecursiveEstimator(ABC):
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, settled_std: float
     ) -> RecursiveEstimator:
         """Return an estimator for standard deviations of wrench (6,) and [s, omega, alpha] (9,)."""
-        return cls(noise_std, forgetting=forgetting, settled_std=settled_std)
+        motion: Any = {"motion_std": motion_std} if cls.allows_for_noisy_motion else {}
+        return cls(noise_std, forgetting=forgetting, settled_std=settled_std, **motion)
 
     @property
     def phi(self) -> Array:

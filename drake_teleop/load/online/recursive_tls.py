@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,12 +20,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array, nonnegative_array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.normal_equations import regressor_coefficients
-from drake_teleop.load.online.recursive import (
-    MAX_SETTLED_RELATIVE_STD,
-    PRIOR_STD,
-    RecursiveEstimator,
-    RecursiveLeastSquares,
-)
+from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
 # Relative increase of diagonal elements against rounding.
@@ -57,15 +53,11 @@ def allocate_scratch():
 
 @njit(cache=True)
 def write_products_vector(wrench, motion, z):
-    s, omega, alpha = motion[:3], motion[3:6], motion[6:]
-    z[0] = 1.0
+    omega = motion[3:6]
+    z[0], z[1:4], z[4:7], z[_WRENCH_START_IN_Z:] = 1.0, motion[:3], motion[6:], wrench
     for i in range(3):
-        z[1 + i] = s[i]
-        z[4 + i] = alpha[i]
         for j in range(i + 1):
             z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
-    for c in range(6):
-        z[_WRENCH_START_IN_Z + c] = wrench[c]
 
 
 @njit(cache=True)
@@ -78,12 +70,8 @@ def add_outer_product(y, z, total):
 @njit(cache=True)
 def discount_samples_and_recentre_prior(memory, theta, information, forgetting):
     """Multiply the sums in the memory by `forgetting`, and centre the prior at theta (16,)."""
-    last = memory.shape[0] - 1
-    for i in range(last):
-        for j in range(19):
-            memory[i, j] *= forgetting
-    for j in range(16):
-        memory[last, j] = information[j] * theta[j]
+    memory[:-1] *= forgetting
+    memory[-1, :16] = information * theta
 
 
 @njit(cache=True)
@@ -190,15 +178,11 @@ def solve_augmented_system_in_place(A):
 @njit(cache=True)
 def write_inverse_6x6(S, A, W):
     """Write S^-1 into W, both (6, 6); A (6, 12) is scratch memory."""
+    A[:, :6], A[:, 6:] = S, 0.0
     for c in range(6):
-        for d in range(6):
-            A[c, d] = S[c, d]
-            A[c, 6 + d] = 0.0
         A[c, 6 + c] = 1.0
     solve_augmented_system_in_place(A)
-    for c in range(6):
-        for d in range(6):
-            W[c, d] = A[c, 6 + d]
+    W[:] = A[:, 6:]
 
 
 class MomentEstimator(RecursiveEstimator):
@@ -257,9 +241,7 @@ def write_rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors,
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
-    for c in range(6):
-        for d in range(6):
-            S[c, d] /= Z[0, 0]
+    S /= Z[0, 0]
     write_inverse_6x6(S, inverse, W)
     residual_products(Z, theta, index, factors, L, LZ, S)
     scale = 0.0
@@ -269,8 +251,7 @@ def write_rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors,
     weighted_gram(Z, W, index, factors, E, G, 0)
     weighted_gram(Q, W, index, factors, E, N, 0)
     weighted_right_side(Z[:, 13:].T, W, index, factors, g)
-    for i in range(16):
-        G[i, 16] = g[i]
+    G[:, 16] = g
     return max(0.0, scale) / (6.0 * Z[0, 0])
 
 
@@ -302,8 +283,7 @@ def rtls_update(
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
         solve_augmented_system_in_place(G)
-        for i in range(16):
-            theta[i] = G[i, 16]
+        theta[:] = G[:, 16]
 
 
 class RecursiveTotalLeastSquares(MomentEstimator):
@@ -316,21 +296,10 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     allows_for_noisy_motion = True
 
     def __init__(
-        self,
-        noise_std: ArrayLike,
-        motion_std: ArrayLike,
-        forgetting: float = 1.0,
-        prior_std: ArrayLike = PRIOR_STD,
-        settled_std: float = MAX_SETTLED_RELATIVE_STD,
+        self, noise_std: ArrayLike, motion_std: ArrayLike, *options: Any, **named: Any
     ) -> None:
         self._motion_std = nonnegative_array("motion_std", motion_std, 9)
-        super().__init__(noise_std, forgetting, prior_std, settled_std)
-
-    @classmethod
-    def for_noise(
-        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, settled_std: float
-    ) -> RecursiveTotalLeastSquares:
-        return cls(noise_std, motion_std, forgetting=forgetting, settled_std=settled_std)
+        super().__init__(noise_std, *options, **named)
 
     @property
     def noise_scale(self) -> float:

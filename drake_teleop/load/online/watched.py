@@ -14,14 +14,8 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.load import regressor
 from drake_teleop.load.online import change
-from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    non_contact_wrench_into,
-)
 
 LOAD_STATE_NAMES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning": the load is not identified yet."""
@@ -44,30 +38,24 @@ _LOW_PASS_TIME_CONSTANT_S, _MAX_REST_ANGULAR_SPEED, _MAX_REST_ACCELERATION_CHANG
 # Indices into the memory, before that of `change`: state; samples at rest; low-passed specific
 # force, angular velocity and residual; specific force at the start of the rest; smallest and
 # largest residual force of the new load; samples with a difference of `MIN_FORCE_CHANGE_N`.
-_STATE_INDEX, _REST_SAMPLES_INDEX, _SPECIFIC_FORCE_START, _OMEGA_START = 0, 1, 2, 5
+STATE_INDEX, _REST_SAMPLES_INDEX, _SPECIFIC_FORCE_START, _OMEGA_START = 0, 1, 2, 5
 _RESIDUAL_START, _REST_FORCE_START, _LOWEST_FORCE_START, _HIGHEST_FORCE_START = 8, 14, 17, 20
 _CHANGED_SAMPLES_INDEX, _CHANGE_DETECTOR_START = 23, 24
 
 MEMORY_SIZE = _CHANGE_DETECTOR_START + change.MEMORY_SIZE
-"""Length of the memory of `monitor_load`."""
+"""Length of the memory of `monitor_load`; `STATE_INDEX` is the index of its state."""
 
 
 def initial_monitor_memory(theta: Array, covariance: Array) -> Array:
     rest = np.zeros(_CHANGE_DETECTOR_START)
-    rest[_STATE_INDEX] = STATE_SETTLED
+    rest[STATE_INDEX] = STATE_SETTLED
     return np.concatenate([rest, change.initial_change_memory(theta, covariance)])
-
-
-@njit(cache=True)
-def load_state_index(memory):
-    """Return the index into `LOAD_STATE_NAMES`; `STATE_LEARNING` for a memory of zeros."""
-    return int(memory[_STATE_INDEX])
 
 
 @njit(cache=True)
 def _update_and_test_rest(memory, sample, period):
     share = period / (_LOW_PASS_TIME_CONSTANT_S + period)
-    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
+    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
     shift, rate = 0.0, 0.0
     for i in range(3):
         memory[_SPECIFIC_FORCE_START + i] += share * (s[i] - memory[_SPECIFIC_FORCE_START + i])
@@ -114,25 +102,25 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
-    known, residual, target = change.stored_known_load(watch), np.empty(6), np.empty(16)
-    wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
-    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
+    known, residual, target = watch[change.KNOWN_LOAD], np.empty(6), np.empty(16)
+    wrench, motion = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
     at_rest = _update_and_test_rest(memory, sample, period)
     verdict, age = change.current_change_state(watch), change.new_load_age(watch)
     force_changed = _update_and_test_force_change(memory, residual, age, period)
     if verdict == change.STATE_KNOWN:
-        memory[_STATE_INDEX] = STATE_SETTLED
+        memory[STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
         if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / OFFSET_TRACKING_S * residual[i]
-    elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_of_change_within_reach(known, change.stored_new_load(watch))
+    elif memory[STATE_INDEX] != STATE_OTHER_LOAD:
+        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD])
         other = verdict == change.STATE_CHANGED and force_changed and near
-        memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
+        memory[STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
-    if memory[_STATE_INDEX] == STATE_OTHER_LOAD:
+    if memory[STATE_INDEX] == STATE_OTHER_LOAD:
         copy_into(target, 6, fallback, 0, 10)
     out += period / (LOAD_FADE_TIME_S + period) * (target - out)

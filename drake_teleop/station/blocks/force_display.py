@@ -7,12 +7,13 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.station.master.dynamics import HapticDeviceBase
+from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.force_display import (
     DISPLAYED_WRENCH_SLOTS,
     initial_display_state,
     step_display,
 )
+from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.stepped_block import SteppedBlock
 
 
@@ -39,7 +40,7 @@ class ForceDisplay(SteppedBlock):
     __slots__ = ()
 
     def __init__(
-        self, device: HapticDeviceBase, period: float, start: ArrayLike = (0.0,) * 6
+        self, device: HapticDevice | LeaderDevice, period: float, start: ArrayLike = (0.0,) * 6
     ) -> None:
         super().__init__()
         self._period, self._parameters, self._jacobian = period, device.parameters, np.zeros((6, 6))

@@ -16,10 +16,10 @@ from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.online.watched import (
     MEMORY_SIZE,
+    STATE_INDEX,
     STATE_LEARNING,
     STATE_SETTLED,
     initial_monitor_memory,
-    load_state_index,
     monitor_load,
 )
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
@@ -143,7 +143,7 @@ class LoadEstimator(LeafSystem):
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
 
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
-        return load_state_index(discrete_state.value(2)) if self._watches else STATE_LEARNING
+        return int(discrete_state.value(2)[STATE_INDEX]) if self._watches else STATE_LEARNING
 
     def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()

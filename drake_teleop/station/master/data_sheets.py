@@ -145,14 +145,12 @@ class Master:
 
     def encoder_steps(self) -> Array:
         """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
-        if self.model in (PHANTOM_NAME, LEADER_NAME):
-            return np.zeros(6)
         figures = self._data_sheet()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
     def sampling_period_if_slower_than_hand(self, hand_hz: float) -> float | None:
         """Return the sampling period [s] of a device slower than `hand_hz` [Hz], else None."""
-        rate = 0.0 if self.model in (PHANTOM_NAME, LEADER_NAME) else self._data_sheet().rate_hz
+        rate = self._data_sheet().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction_and_encoder_steps(self) -> "Master":

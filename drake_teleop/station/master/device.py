@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from collections.abc import Callable
+from typing import Any
 
-from drake_teleop.common.blocks import are_finite_and_in_range
+import numpy as np
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step_device, twist_into
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
-from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
+from drake_teleop.station.master.force_display import ForceDisplay, initial_display_state
+from drake_teleop.station.master.leader import LeaderDevice, step_leader
 
 _MAX_DEVICE_PERIOD_S = 1e-3  # slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
@@ -50,8 +53,8 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
         )
 
 
-class MasterDevice(DeviceBlock):
-    """Haptic device with the hand's passive mass.
+class MasterDevice(LeafSystem):
+    """Haptic device or leader arm with n joints and the hand's passive mass, initially at rest.
 
     Each period, at most 1 ms, is one classical Runge-Kutta step with held inputs.
 
@@ -60,35 +63,57 @@ class MasterDevice(DeviceBlock):
         name: MasterDevice
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
-        - drive: (27,) from the force display: motor torques (6) [N m; N], the display's memory
+        - drive: (27,) from the force display: motor torques (6) [N m; N] (of a leader arm: the
+          wrench F to display), the display's memory
         output_ports:
-        - state: (12,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
+        - state: (2 n,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
         - pose_master: (7,) X_BE of the stylus E in the device's base B
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - for_display: (27,) joint positions (6) [rad; m], the display's memory
+        - for_display: (27,) joint positions (6) [rad; m] (of a leader arm: position of E (3), three
+          unused zeros), the display's memory
     """
 
-    __slots__ = ()
+    __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: HapticDevice, q_initial: Array) -> None:
+    def __init__(
+        self, period: float, device: HapticDevice | LeaderDevice, q_initial: Array
+    ) -> None:
+        super().__init__()
         check_device_period(device, q_initial, period)
-        constants = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
-        super().__init__(period, device, q_initial, _advance_device, constants)
+        self._period = period
+        self._advance: Callable[..., None] = _advance_device
+        self._constants: tuple[Any, ...] = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
+        if isinstance(device, LeaderDevice):
+            self._advance = step_leader
+            self._constants = device.compiled_constants, device.hand_weight
+        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
+        # A separate port for the display's memory would cost a further call.
+        coordinates = device.coordinates_for_force_display(q_initial)
+        display = initial_display_state(coordinates, device.parameters)
+        self._drive = self.DeclareVectorInputPort("drive", len(display))
+        # Pose and twist are states because they are read more often than they change.
+        for name, start in (
+            ("state", np.concatenate([q_initial, np.zeros(len(q_initial))])),
+            ("pose_master", device.forward_kinematics(q_initial)),
+            ("twist_master", np.zeros(6)),
+            ("for_display", display),
+        ):
+            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
+
+    def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
+        states = [discrete_state.get_mutable_value(group) for group in range(4)]
+        inputs = self._hand_wrench.Eval(context), self._drive.Eval(context)
+        self._advance(*self._constants, *states, *inputs, self._period)
 
 
 def AddHapticDevice(
     builder: DiagramBuilder, period: float, device: HapticDevice | LeaderDevice, q_initial: Array
 ) -> tuple[LeafSystem, LeafSystem]:
-    check_device_period(device, q_initial, period)
-    if isinstance(device, LeaderDevice):
-        block: LeafSystem = LeaderArm(period, device, q_initial)
-        display: LeafSystem = LeaderDisplay(period, device)
-    else:
-        block, display = MasterDevice(period, device, q_initial), ForceDisplay(period, device)
-    builder.AddNamedSystem("master_device", block)
-    builder.AddNamedSystem("force_display", display)
-    builder.Connect(block.GetOutputPort("for_display"), display.GetInputPort("for_display"))
+    block = builder.AddNamedSystem("master_device", MasterDevice(period, device, q_initial))
+    display = builder.AddNamedSystem("force_display", ForceDisplay(period, device))
     builder.Connect(display.GetOutputPort("drive"), block.GetInputPort("drive"))
-    if isinstance(device, LeaderDevice):
-        builder.Connect(block.GetOutputPort("state"), display.GetInputPort("state"))
+    for name in ("for_display", "state"):
+        if display.HasInputPort(name):
+            builder.Connect(block.GetOutputPort(name), display.GetInputPort(name))
     return block, display

@@ -52,6 +52,18 @@ def twist_into(q, v, device, J, twist):
 
 
 @njit(cache=True)
+def add_runge_kutta_stage(i, period, slope, total, stage, state):
+    """Add the slope of stage i (0 to 3) to `total`; write the next stage, at last the new state."""
+    weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
+    ahead = 1.0 if i == 2 else 0.5
+    for k in range(state.shape[0]):
+        total[k] += weight * slope[k]
+        stage[k] = state[k] + ahead * period * slope[k]
+        if i == 3:
+            state[k] += period * total[k]
+
+
+@njit(cache=True)
 def step_device(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
@@ -68,33 +80,11 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
             task_space.joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot)
         else:
             phantom.joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot)
-        weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
-        ahead = 1.0 if i == 2 else 0.5
-        for k in range(12):
-            total[k] += weight * slope[k]
-            stage[k] = state[k] + ahead * period * slope[k]
-    for k in range(12):
-        state[k] += period * total[k]
-
-
-class HapticDeviceBase:
-    """Base class of haptic devices."""
-
-    parameters: DeviceParameters
-
-    @property
-    def peak_force(self) -> float:
-        """Largest displayed force [N]; some postures of a leader arm allow less."""
-        return self.parameters.peak_force
-
-    @property
-    def peak_torque(self) -> Array:
-        """Largest displayed torques (3,) about the rotational axes [N m]."""
-        return self.parameters.peak_torque
+        add_runge_kutta_stage(i, period, slope, total, stage, state)
 
 
 @dataclass(frozen=True)
-class HapticDevice(HapticDeviceBase):
+class HapticDevice:
     """Dynamics of a haptic device (Phantom or `task_space`) with the hand's passive mass.
 
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.

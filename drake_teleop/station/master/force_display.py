@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
@@ -15,6 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import dynamics
 from drake_teleop.station.master.device_parameters import DeviceParameters
+from drake_teleop.station.master.leader import LeaderDevice, limit_wrench_to_motor_torques
 from drake_teleop.station.passivity import safe_state
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
@@ -125,49 +124,11 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
         drive[_FAULT_SLOT] = _RESUMING_FAULT
 
 
-class DeviceBlock(LeafSystem):
-    """Base class of Drake blocks of haptic devices, which start at rest at `q_initial`.
-
-    The compiled function `advance` steps the states by one period.
-    """
-
-    __slots__ = ONE_DICT
-
-    def __init__(
-        self,
-        period: float,
-        device: Any,
-        q_initial: Array,
-        advance: Callable[..., None],
-        constants: tuple[Any, ...],
-    ) -> None:
-        super().__init__()
-        self._advance, self._constants, self._period = advance, constants, period
-        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        # A separate port for the display's memory would cost a further call.
-        coordinates = device.coordinates_for_force_display(q_initial)
-        display = initial_display_state(coordinates, device.parameters)
-        self._drive = self.DeclareVectorInputPort("drive", len(display))
-        # Pose and twist are states because they are read more often than they change.
-        for name, start in (
-            ("state", np.concatenate([q_initial, np.zeros(len(q_initial))])),
-            ("pose_master", device.forward_kinematics(q_initial)),
-            ("twist_master", np.zeros(6)),
-            ("for_display", display),
-        ):
-            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
-
-    def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
-        states = [discrete_state.get_mutable_value(group) for group in range(4)]
-        inputs = self._hand_wrench.Eval(context), self._drive.Eval(context)
-        self._advance(*self._constants, *states, *inputs, self._period)
-
-
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    While data are invalid, the displayed wrench fades to zero in 50 ms; then it ramps up again.
+    While data are invalid, the displayed wrench fades to zero in 50 ms; then it ramps up again. The
+    wrench of a leader arm is limited by motor torques after weight compensation.
 
     .. pydrake_system::
 
@@ -175,8 +136,9 @@ class ForceDisplay(LeafSystem):
         input_ports:
         - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
         - for_display: (27,) from the device: joint positions (6) [rad], this block's memory
+        - state: (2 n,) [q; qdot] of the device (only of a leader arm)
         output_ports:
-        - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m], memory
+        - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m] (leader: F), memory
         - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
         - fault_at_hand: code of `blocks.Fault`
         - displayed_and_fault: (7,) the last two ports in one vector
@@ -184,13 +146,16 @@ class ForceDisplay(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: dynamics.HapticDeviceBase) -> None:
+    def __init__(self, period: float, device: dynamics.HapticDevice | LeaderDevice) -> None:
         super().__init__()
-        self._period = period
-        self._parameters = device.parameters
-        self._jacobian = np.zeros((6, 6))
+        self._period, self._parameters = period, device.parameters
+        self._jacobian, self._shortened = np.zeros((6, 6)), np.zeros(6)
+        self._num_joints = device.num_joints
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLOTS.stop)
+        self._leader = device.compiled_constants if isinstance(device, LeaderDevice) else None
+        if self._leader is not None:
+            self._state = self.DeclareVectorInputPort("state", 2 * device.num_joints)
         inputs = {self.all_input_ports_ticket()}
         self._drive = self.DeclareVectorOutputPort(
             "drive", _SAFE_STATE_MONITOR_SLOTS.stop, weak_callback(self._calc_drive), inputs
@@ -203,13 +168,15 @@ class ForceDisplay(LeafSystem):
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
-    def _wrench_to_display(self, context: Context) -> Array:
-        return np.asarray(self._command.Eval(context))
-
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
-        inputs = self._wrench_to_display(context), self._device.Eval(context)
+        wrench = self._command.Eval(context)
+        if self._leader is not None:
+            q = self._state.Eval(context)[: self._num_joints]
+            if np.isfinite(wrench).all() and np.isfinite(q).all():
+                limit_wrench_to_motor_torques(self._leader, q, wrench, self._shortened)
+                wrench = self._shortened
         constants = self._parameters, self._period, self._jacobian
-        step_display(*inputs, *constants, output.get_mutable_value())
+        step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLOTS])

@@ -10,16 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import Context
 
 from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
+from drake_teleop.common.vectors import (
+    add_vector_into,
+    copy_into,
+    cross,
+    quaternion_of_matrix,
+    vector_at,
+)
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
-from drake_teleop.station.master.dynamics import HapticDeviceBase
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
+from drake_teleop.station.master.dynamics import add_runge_kutta_stage
 from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
@@ -45,9 +49,7 @@ def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, m
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
     serial_arm.forward_kinematics(arm, q, R_BE, p_BE)
     copy_into(wrench, 0, hand_wrench_minus_weight, 0, 6)  # becomes the wrench about the origin of B
-    moment = cross(vector_at(p_BE, 0), vector_at(hand_wrench_minus_weight, 0))
-    for i in range(3):
-        wrench[3 + i] += moment[i]
+    add_vector_into(wrench, 3, cross(vector_at(p_BE, 0), vector_at(wrench, 0)))
     for i in range(n):
         tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(
             v[i] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
@@ -69,8 +71,7 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
         same += turn[i] * pose[i]
     for i in range(4):
         pose[i] = turn[i] if same >= 0.0 else -turn[i]
-    for i in range(3):
-        pose[4 + i] = x[9 + i]
+    copy_into(pose, 4, x, 9, 3)
     for i in range(6):
         twist[i] = 0.0
         for k in range(n):
@@ -78,11 +79,12 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
 
 
 @njit(cache=True)
-def limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, F, torque):
+def limited_leader_motor_torques_into(leader, q, F, torque):
     """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
 
-    F (6,) is the wrench at E; `arm_without_hand` is `ArmModel.table` without the hand.
+    F (6,) is the wrench at E; `leader` is `LeaderDevice.compiled_constants`.
     """
+    arm_without_hand, arm, joint_table = leader
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
     serial_arm.inverse_dynamics(arm_without_hand, q, still, still, torque)
@@ -96,15 +98,12 @@ def limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, F, 
 
 
 @njit(cache=True)
-def step_leader(
-    arm_without_hand, arm, joint_table, hand_weight, state, pose, twist, display,
-    hand_wrench, drive, period,
-):  # fmt: skip
+def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive, period):
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `arm_without_hand` and `arm` are `ArmModel.table`. The operator carries the hand's weight
-    `hand_weight` [N].
+    `leader` is `LeaderDevice.compiled_constants`. The operator carries the hand's weight [N].
     """
+    _, arm, joint_table = leader
     n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
     valid = are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6])
@@ -117,31 +116,27 @@ def step_leader(
         g = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN : serial_arm.LAST_ROW_GRAVITY_COLUMN + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
-            applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
-        limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
+            applied[i] -= weight * g[i] / size if size > 0.0 else 0.0
+        limited_leader_motor_torques_into(leader, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
         q, v, vdot = stage[:n], stage[n:], slope[n:]
         copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
             copy_into(slope, 0, stage, n, n)
             leader_acceleration_into(arm, joint_table, q, v, applied, motor, vdot)
-            weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
-            ahead = 1.0 if i == 2 else 0.5
-            for k in range(2 * n):
-                total[k] += weight * slope[k]
-                stage[k] = state[k] + ahead * period * slope[k]
-        for k in range(2 * n):
-            state[k] += period * total[k]
+            add_runge_kutta_stage(i, period, slope, total, stage, state)
         _update_pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
         display[i] = pose[4 + i] if are_finite_and_in_range(state) else math.nan
 
 
 @njit(cache=True)
-def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
+def limit_wrench_to_motor_torques(leader, q, wrench, shortened):
+    """Write a wrench (6,), shortened to the torque limits beside the weight, to `shortened`."""
+    _, arm, joint_table = leader
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
-    limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
+    limited_leader_motor_torques_into(leader, q, np.zeros(6), weight)
     serial_arm.jacobian(arm, q, J)
     for i in range(n):
         torque = 0.0
@@ -155,20 +150,18 @@ def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench
 
 
 @njit(cache=True)
-def _flag_rows_with_motor_at_limit(arm_without_hand, arm, joint_table, q, F, share):
+def _flag_rows_with_motor_at_limit(leader, q, F, share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
     for row in range(rows):
-        limited_leader_motor_torques_into(
-            arm_without_hand, arm, joint_table, q[row], F[row], torque
-        )
+        limited_leader_motor_torques_into(leader, q[row], F[row], torque)
         for i in range(n):
-            flags[row] |= abs(torque[i]) >= share * joint_table[_TORQUE_LIMIT_ROW, i]
+            flags[row] |= abs(torque[i]) >= share * leader[2][_TORQUE_LIMIT_ROW, i]
     return flags
 
 
 @dataclass(frozen=True)
-class LeaderDevice(HapticDeviceBase):
+class LeaderDevice:
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
@@ -196,7 +189,14 @@ class LeaderDevice(HapticDeviceBase):
         return self.arm.num_joints
 
     @property
+    def hand_weight(self) -> float:
+        """Weight of the hand [N]."""
+        gravity = np.linalg.norm(self.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])
+        return float(self.parameters.hand_mass * gravity)
+
+    @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
+        """Tables of the arm without and with the hand, and `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:
@@ -234,8 +234,8 @@ class LeaderDevice(HapticDeviceBase):
 
         The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
         """
-        tables = self.compiled_constants
-        return np.asarray(_flag_rows_with_motor_at_limit(*tables, q.copy(), F.copy(), share))
+        constants = self.compiled_constants
+        return np.asarray(_flag_rows_with_motor_at_limit(constants, q.copy(), F.copy(), share))
 
     def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
@@ -265,61 +265,3 @@ def make_leader_joint_table(
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_NATURAL_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
     return np.array([*rows, np.full(len(home), weight_share)])
-
-
-class LeaderArm(DeviceBlock):
-    """Leader arm with n joints and the hand's passive mass, advanced once per period.
-
-    .. pydrake_system::
-
-        name: LeaderArm
-        input_ports:
-        - hand_wrench_E: (6,) as for `MasterDevice`
-        - drive: (27,) from `LeaderDisplay`: wrench F (6) to display, the display's memory
-        output_ports:
-        - state: (2 n,) [q; qdot] [rad, rad/s]
-        - pose_master: (7,) X_BE
-        - twist_master: (6,) [v; omega] of E in B
-        - for_display: (27,) position of E (3), three unused zeros, the display's memory
-    """
-
-    __slots__ = ()
-
-    def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        gravity = np.linalg.norm(device.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])
-        hand_weight = float(device.parameters.hand_mass * gravity)
-        constants = (*device.compiled_constants, hand_weight)
-        super().__init__(period, device, q_initial, step_leader, constants)
-
-
-class LeaderDisplay(ForceDisplay):
-    """Force display of a leader arm, limited by motor torques after weight compensation.
-
-    .. pydrake_system::
-
-        name: LeaderDisplay
-        input_ports:
-        - wrench_command: (6,) F_E_B to render
-        - for_display: from `LeaderArm`
-        - state: (2 n,) of `LeaderArm`
-        output_ports:
-        - drive: for `LeaderArm`
-        - force_to_master: (6,) wrench F, displayed within the limits [N, N m]
-        - fault_at_hand: code of `blocks.Fault`
-        - displayed_and_fault: (7,) the last two ports in one vector
-    """
-
-    __slots__ = ()
-
-    def __init__(self, period: float, device: LeaderDevice) -> None:
-        super().__init__(period, device)
-        self._joints = self.DeclareVectorInputPort("state", 2 * device.num_joints)
-        self._constants, self._n = device.compiled_constants, device.num_joints
-        self._shortened = np.zeros(6)
-
-    def _wrench_to_display(self, context: Context) -> Array:
-        wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
-        if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _limit_wrench_to_motor_torques(*self._constants, q, wrench, self._shortened)
-            return self._shortened
-        return wrench

@@ -53,9 +53,9 @@ HOME_POSTURE_RAD = np.zeros(6)
 
 # Coulomb friction is proportional to tanh(velocity / FRICTION_TANH_RAD_S): a slower device creeps.
 FRICTION_TANH_RAD_S = 0.01  # rad/s, estimate
-# End stops: spring and damper that never pull, estimate: 7 kN/m at the tip.
-_MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD = 300.0, 1.5  # main axes
-_WRIST_STOP_STIFFNESS_N_M_RAD, _WRIST_STOP_DAMPING_N_M_S_RAD = 5.0, 0.01
+# End stops of main axes and wrist: spring [N m/rad] and damper [N m s/rad] that never pull,
+# estimate: 7 kN/m at the tip.
+_STOP_STIFFNESSES, _STOP_DAMPINGS = np.repeat([300.0, 5.0], 3), np.repeat([1.5, 0.01], 3)
 
 # Moments of inertia of the point masses of the links.
 _LINK_1_INERTIA = L1**2 * (MASS_A + MASS_C / 4)
@@ -175,13 +175,10 @@ def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
 def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
         torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_TANH_RAD_S) + viscous[i] * v[i]
-        stiffness = _MAIN_STOP_STIFFNESS_N_M_RAD if i < 3 else _WRIST_STOP_STIFFNESS_N_M_RAD
-        damping = _MAIN_STOP_DAMPING_N_M_S_RAD if i < 3 else _WRIST_STOP_DAMPING_N_M_S_RAD
-        lower, upper = JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i]
-        torque[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
-    (lower, upper), angle, rate = Q2_MINUS_Q3_RANGE_RAD, q[1] - q[2], v[1] - v[2]
-    stiffness, damping = _MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD
-    five_bar = end_stop_force(angle, rate, lower, upper, stiffness, damping)
+        limits = JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i]
+        torque[i] += end_stop_force(q[i], v[i], *limits, _STOP_STIFFNESSES[i], _STOP_DAMPINGS[i])
+    stop = _STOP_STIFFNESSES[0], _STOP_DAMPINGS[0]
+    five_bar = end_stop_force(q[1] - q[2], v[1] - v[2], *Q2_MINUS_Q3_RANGE_RAD, *stop)
     torque[1] += five_bar
     torque[2] -= five_bar
 
@@ -215,11 +212,9 @@ def pose_into(q, pose):
     # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
     a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
     b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    w, x, y, z = vectors.quaternion_product(a, b)
-    pose[0] = w * c6 - x * s6
-    pose[1] = x * c6 + w * s6
-    pose[2] = y * c6 + z * s6
-    pose[3] = z * c6 - y * s6
+    yawed = vectors.quaternion_product(a, b)
+    turned = vectors.quaternion_product(yawed, (c6, s6, 0.0, 0.0))
+    pose[0], pose[1], pose[2], pose[3] = turned
     reach = L1 * math.cos(q[1]) + L2 * math.sin(q[2])
     pose[4] = math.cos(q[0]) * reach
     pose[5] = math.sin(q[0]) * reach

@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import cross, plus, scale_vector
+from drake_teleop.common.vectors import cross, plus, quaternion_product, scale_vector
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 
 # Coulomb friction is proportional to tanh(speed / FRICTION_TANH_M_S): a slower device creeps.
@@ -100,11 +100,8 @@ def pose_into(q, pose):
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
-    w, x, y, z = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    pose[0] = w * c6 - x * s6
-    pose[1] = x * c6 + w * s6
-    pose[2] = y * c6 + z * s6
-    pose[3] = z * c6 - y * s6
+    yawed = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
+    pose[0], pose[1], pose[2], pose[3] = quaternion_product(yawed, (c6, s6, 0.0, 0.0))
     for i in range(3):
         pose[4 + i] = q[i]
 

@@ -16,10 +16,10 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_bits, random_normal
 from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.common.vectors import apply_matrix, dot, matrix_as_tuple, transposed
 from drake_teleop.station.operator import task as tasks
 from drake_teleop.station.operator.minimum_jerk import (
-    PLAN_SIZE,
-    PLAN_START_INDEX,
+    PLAN,
     STOP_DURATION_S,
     evaluate_plan,
     plan_move,
@@ -115,7 +115,7 @@ search for the slot; finished or given up."""
 # searches; plan.
 _STEP_COUNT, _NEXT_MOVE_TIME, _CRITERION_MET_SINCE, _ASSUMED_CONTACT_STIFFNESS = range(4)
 _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
-MEMORY_SIZE = PLAN_START_INDEX + PLAN_SIZE
+MEMORY_SIZE = PLAN.stop
 
 _EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
 _MOVE_END_TO_EFFECT_S = 0.05  # s, without network and perception, estimate
@@ -138,16 +138,17 @@ def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
     memory[_CRITERION_MET_SINCE] = -1.0
     memory[_ASSUMED_CONTACT_STIFFNESS] = _INITIAL_ASSUMED_STIFFNESS
-    memory[PLAN_START_INDEX + 1] = 1.0
+    memory[PLAN.start + 1] = 1.0
     return memory
 
 
 @njit(cache=True)
-def _convert_to_hand_motion(person, vector_W, out):
+def _hand_motion(person, vector_W):
+    motion = np.zeros(3)
     for i in range(3):
-        out[i] = 0.0
         for k in range(3):
-            out[i] += person.R_WB[k, i] * vector_W[k] / person.translation_scale
+            motion[i] += person.R_WB[k, i] * vector_W[k] / person.translation_scale
+    return motion
 
 
 @njit(cache=True)
@@ -168,9 +169,8 @@ def observe_tool_into(person, step, displacement_W, seen_W):
 
 @njit(cache=True)
 def _plan_submovement(person, memory, step, time, error_W):
-    change = np.empty(3)
-    _convert_to_hand_motion(person, error_W, change)
-    length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
+    change = _hand_motion(person, error_W)
+    length = math.sqrt(dot(change, change))
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person.acceleration)
     duration = max(duration, person.shortest)
@@ -182,13 +182,8 @@ def _plan_submovement(person, memory, step, time, error_W):
 
 @njit(cache=True)
 def _contact_force_at_tool_along_approach(task, person, felt):
-    along = 0.0
-    for i in range(3):
-        axis_B = 0.0
-        for k in range(3):
-            axis_B += person.R_WB[k, i] * task.approach_axis[k]
-        along -= felt[i] * axis_B
-    return along / person.force_gain if person.force_gain > 0.0 else 0.0
+    axis_B = apply_matrix(transposed(matrix_as_tuple(person.R_WB)), task.approach_axis)
+    return -dot(felt, axis_B) / person.force_gain if person.force_gain > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -257,20 +252,20 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 
 
 @njit(cache=True)
-def _perceived_standoff_target_into(task, person, out):
+def _perceived_standoff_target(task, person):
     depth = 0.0
     if task.kind != tasks.KIND_REACH:
         depth = person.depth_error * _draw_normal_number(person, 0, 15)
-    for i in range(3):
-        out[i] = task.goal[i] + (depth - task.standoff) * task.approach_axis[i]
-        if task.kind == tasks.KIND_INSERT and i < 2:
-            out[i] += person.aim_error * _draw_normal_number(person, 0, 13 + i)
+    target = task.goal + (depth - task.standoff) * task.approach_axis
+    if task.kind == tasks.KIND_INSERT:
+        for i in range(2):
+            target[i] += person.aim_error * _draw_normal_number(person, 0, 13 + i)
+    return target
 
 
 @njit(cache=True)
 def _perceived_depth_beyond_surface(task, person, seen_W):
-    target, beyond = np.empty(3), -task.standoff
-    _perceived_standoff_target_into(task, person, target)
+    target, beyond = _perceived_standoff_target(task, person), -task.standoff
     for i in range(3):
         beyond += (seen_W[i] - target[i]) * task.approach_axis[i]
     return beyond
@@ -278,13 +273,8 @@ def _perceived_depth_beyond_surface(task, person, seen_W):
 
 @njit(cache=True)
 def _move_by_vision(task, person, step, time, seen_W, state, memory):
-    error = np.empty(3)
-    _perceived_standoff_target_into(task, person, error)
-    off = 0.0
-    for i in range(3):
-        error[i] -= seen_W[i]
-        off += error[i] * error[i]
-    off = math.sqrt(off)
+    error = _perceived_standoff_target(task, person) - seen_W
+    off = math.sqrt(dot(error, error))
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
     met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
     if task.kind == tasks.KIND_REACH:
@@ -310,14 +300,11 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
     if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
-        velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
+        speed, change = _hand_motion(person, speed_W * task.approach_axis), np.empty(3)
         for i in range(3):
-            velocity_W[i] = speed_W * task.approach_axis[i]
-        _convert_to_hand_motion(person, velocity_W, speed)
-        plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
-        for i in range(3):
-            change[i] = 0.5 * _APPROACH_UPDATE_S * (evaluate_plan(plan, time, i)[1] + speed[i])
+            now = evaluate_plan(memory[PLAN], time, i)[1]
+            change[i] = 0.5 * _APPROACH_UPDATE_S * (now + speed[i])
         plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
         memory[_NEXT_MOVE_TIME] = time + _APPROACH_UPDATE_S
 
@@ -358,21 +345,19 @@ def _control_press_force(task, person, step, time, felt, state, memory):
 
 
 @njit(cache=True)
-def _lateral_force_into(task, person, felt, out):
-    along, size = _contact_force_at_tool_along_approach(task, person, felt), 0.0
-    for i in range(3):
-        out[i] = along * task.approach_axis[i]
-        for k in range(3):
-            if person.force_gain > 0.0:
-                out[i] += person.R_WB[i, k] * felt[k] / person.force_gain
-        size += out[i] * out[i]
-    return math.sqrt(size)
+def _lateral_force_and_size(task, person, felt):
+    lateral = _contact_force_at_tool_along_approach(task, person, felt) * task.approach_axis
+    if person.force_gain > 0.0:
+        for i in range(3):
+            for k in range(3):
+                lateral[i] += person.R_WB[i, k] * felt[k] / person.force_gain
+    return lateral, math.sqrt(dot(lateral, lateral))
 
 
 @njit(cache=True)
 def _is_tool_stuck(task, person, felt):
     limit = _STUCK_SHARE_OF_PUSH_FORCE * task.force
-    sideways = _lateral_force_into(task, person, felt, np.empty(3))
+    _, sideways = _lateral_force_and_size(task, person, felt)
     return _contact_force_at_tool_along_approach(task, person, felt) >= limit or sideways >= limit
 
 
@@ -392,19 +377,16 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     if deep and abs(force - task.force) <= _STUCK_SHARE_OF_PUSH_FORCE * task.force:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
-    move, push = np.empty(3), _displacement_to_set_force(task, memory, force)
-    sideways = _lateral_force_into(task, person, felt, move)
+    push = _displacement_to_set_force(task, memory, force)
+    move, sideways = _lateral_force_and_size(task, person, felt)
     if sideways >= state[FORCE_THRESHOLD_INDEX] / person.force_gain:
-        share = min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
-        for i in range(3):
-            move[i] *= share
+        move *= min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
     else:
         n = memory[_NUM_SLOT_SEARCHES]
         memory[_NUM_SLOT_SEARCHES] += 1.0
         for k in range(2):
             move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
         move[2] = 0.0
-    for i in range(3):
-        move[i] += push * task.approach_axis[i]
+    move += push * task.approach_axis
     duration = _plan_submovement(person, memory, step, time, move)
     memory[_NEXT_MOVE_TIME] = time + duration + person.force_delay

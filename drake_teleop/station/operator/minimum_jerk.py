@@ -10,8 +10,7 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 
-PLAN_START_INDEX, PLAN_SIZE = 7, 20
-"""Start of the plan in the operator's memory, and its size."""
+PLAN = slice(7, 27)  #: place of the plan in the operator's memory
 STOP_DURATION_S = 0.15  # s, stopping time of the hand, estimate
 
 
@@ -33,9 +32,8 @@ def evaluate_plan(plan, time, i):
 @njit(cache=True)
 def add_planned_motion_into(memory, time, pose, twist):
     """Add the plan's displacement and velocity at `time` [s] to a pose (7,) and twist (6,)."""
-    plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
     for i in range(3):
-        x, v, _ = evaluate_plan(plan, time, i)
+        x, v, _ = evaluate_plan(memory[PLAN], time, i)
         pose[4 + i] += x
         twist[i] += v
 
@@ -47,7 +45,7 @@ def plan_move(memory, time, duration, change, end_speed):
     It continues the present motion and ends with the velocity `end_speed` (3,), without
     acceleration.
     """
-    plan, h = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE], duration
+    plan, h = memory[PLAN], duration
     for i in range(3):
         x, v, a = evaluate_plan(plan, time, i)
         v, a, w, d = v * h, a * h * h, end_speed[i] * h, change[i]
@@ -62,7 +60,7 @@ def plan_move(memory, time, duration, change, end_speed):
 @njit(cache=True)
 def plan_stop(memory, time):
     """Plan a stop of the hand within `STOP_DURATION_S`."""
-    plan, change = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE], np.empty(3)
+    change = np.empty(3)
     for i in range(3):
-        change[i] = 0.5 * STOP_DURATION_S * evaluate_plan(plan, time, i)[1]
+        change[i] = 0.5 * STOP_DURATION_S * evaluate_plan(memory[PLAN], time, i)[1]
     plan_move(memory, time, STOP_DURATION_S, change, np.zeros(3))

@@ -150,7 +150,7 @@ def intended_motion_into(packed, start, t, pose, twist):
     `start` (7,) is X_BE before the first segment. Translations add; rotations apply in the order of
     the list, each about axes of B.
     """
-    orientation = (start[0], start[1], start[2], start[3])
+    orientation = vectors.quaternion_at(start, 0)
     omega = (0.0, 0.0, 0.0)
     vectors.copy_into(pose, 4, start, 4, 3)
     twist[:3] = 0.0
@@ -165,10 +165,11 @@ def intended_motion_into(packed, start, t, pose, twist):
         for k in range(3):
             pose[4 + k] += level * row[6 + k]
             twist[k] += rate * row[6 + k]
-        turn = vectors.quaternion_exponential((level * row[9], level * row[10], level * row[11]))
+        rotation = vectors.vector_at(row, 9)
+        turn = vectors.quaternion_exponential(vectors.scale_vector(level, rotation))
         orientation = vectors.quaternion_product(turn, orientation)
         omega = vectors.rotate_vector(turn, omega)
-        omega = (omega[0] + rate * row[9], omega[1] + rate * row[10], omega[2] + rate * row[11])
+        omega = vectors.plus(omega, vectors.scale_vector(rate, rotation))
     for k in range(4):
         pose[k] = orientation[k]
     for k in range(3):
@@ -196,8 +197,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     f = K (x_intent - x) + B (v_intent - v); tau likewise. `impedance` (4,) is [K, B, rotational K,
     rotational B].
     """
-    intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    inverse = vectors.conjugate_quaternion((pose[0], pose[1], pose[2], pose[3]))
+    intended = vectors.quaternion_at(intent_pose, 0)
+    inverse = vectors.conjugate_quaternion(vectors.quaternion_at(pose, 0))
     error = vectors.quaternion_logarithm(vectors.quaternion_product(intended, inverse))
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
@@ -209,7 +210,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 
 @njit(cache=True)
-def _intended_plus_planned_motion_into(packed, start, start_twist, memory, time, pose, twist):
+def _intended_plus_planned_motion_into(intent, time, pose, twist):
+    packed, start, start_twist, memory = intent
     intended_motion_into(packed, start, time, pose, twist)
     for k in range(6):
         twist[k] += start_twist[k]
@@ -218,13 +220,8 @@ def _intended_plus_planned_motion_into(packed, start, start_twist, memory, time,
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _hand_wrench_at_time(
-    packed, start, start_twist, memory, time, impedance, intent_pose, intent_twist, pose, twist,
-    wrench,
-):  # fmt: skip
-    _intended_plus_planned_motion_into(
-        packed, start, start_twist, memory, time, intent_pose, intent_twist
-    )
+def _hand_wrench_at_time(intent, time, impedance, intent_pose, intent_twist, pose, twist, wrench):
+    _intended_plus_planned_motion_into(intent, time, intent_pose, intent_twist)
     hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 
 
@@ -295,7 +292,6 @@ class Operator(LeafSystem):
         self._impedance = np.array(
             [hand.stiffness, hand.damping, hand.rotational_stiffness, hand.rotational_damping]
         )
-        # Segments, their reference pose and the twist of the reference.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
         self._intent_pose, self._intent_twist = np.empty(7), np.empty(6)
         self._commanded_pose = np.empty(7)
@@ -344,14 +340,13 @@ class Operator(LeafSystem):
         slave_q = self._slave.Eval(context)[: self._joints]
         _perceive_and_decide(*self._task_parameters, context.get_time(), *stylus, slave_q, *state)
 
-    def _decision_memory(self, context: Context) -> Array:
-        if not self._has_task:
-            return self._no_memory
-        return context.get_discrete_state(self._groups[1]).value()
-
-    def _intent_segments_and_reference(self, context: Context) -> tuple[Array, ...]:
+    def _intent_at_present(self, context: Context) -> tuple[Array, ...]:
+        """Return segments, their reference pose, the reference's twist, and the decisions."""
+        memory = self._no_memory
+        if self._has_task:
+            memory = context.get_discrete_state(self._groups[1]).value()
         if not self._intended_pose.HasValue(context):
-            return self._intent
+            return *self._intent, memory
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
@@ -359,19 +354,14 @@ class Operator(LeafSystem):
             what = f"the intended motion at {context.get_time():g} s is not a finite pose and twist"
             remedy = "give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s"
             raise DrakeTeleopError(what, where="intended_pose", remedy=remedy)
-        return self._no_segments, self._commanded_pose, twist
+        return self._no_segments, self._commanded_pose, twist, memory
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        intent = *self._intent_segments_and_reference(context), self._decision_memory(context)
+        intent, time = self._intent_at_present(context), context.get_time()
         own = self._impedance, self._intent_pose, self._intent_twist
         stylus = self._pose.Eval(context), self._twist.Eval(context)
-        wrench = output.get_mutable_value()
-        _hand_wrench_at_time(*intent, context.get_time(), *own, *stylus, wrench)
+        _hand_wrench_at_time(intent, time, *own, *stylus, output.get_mutable_value())
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        time = context.get_time()
-        pose = output.get_mutable_value()
-        memory = self._decision_memory(context)
-        _intended_plus_planned_motion_into(
-            *self._intent_segments_and_reference(context), memory, time, pose, self._intent_twist
-        )
+        intent, pose = self._intent_at_present(context), output.get_mutable_value()
+        _intended_plus_planned_motion_into(intent, context.get_time(), pose, self._intent_twist)

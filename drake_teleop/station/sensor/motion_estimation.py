@@ -9,6 +9,7 @@ Sources of specific force s of So, angular velocity omega and acceleration alpha
 
 from collections import namedtuple
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,21 +29,20 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.load import regressor
 from drake_teleop.station.sensor.sensor_chain import (
+    LOST_READING_FLAG_SAMPLES,
     READ_ANGLES,
     READ_SATURATED,
     WristSensorConfig,
+    are_values_plausible,
     butterworth_sections,
     check_bandwidth,
     group_delay_samples,
     low_pass_in_place,
+    read_sensor_into,
     settle_low_pass,
     shift_delay_line,
 )
-from drake_teleop.station.slave.arm import (
-    LAST_ROW_GRAVITY_COLUMN,
-    SENSOR_MOTION_SIZE,
-    sensor_motion,
-)
+from drake_teleop.station.slave import arm as serial_arm
 
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
@@ -67,7 +67,7 @@ _ANGULAR_FUSION_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
 _LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
 _KINEMATICS_SCRATCH_START = _LINEAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
-_JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + SENSOR_MOTION_SIZE
+_JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + serial_arm.SENSOR_MOTION_SIZE
 _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 
 
@@ -88,8 +88,7 @@ class MotionEstimationConfig:
     )
 
 
-@dataclass(frozen=True)
-class PathDelays:
+class PathDelays(NamedTuple):
     """Delays of the signal paths at low frequencies [s].
 
     `sample_s` is the delay of the slowest path in use, for which the others wait.
@@ -194,10 +193,9 @@ def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[_EstimatorConstants, Array]:
     """Return constants and initial memory of `estimate_sample_into`."""
-    delays = path_delays(config, sensor, period)
-    paths = np.array([delays.wrench_s, delays.acceleration_s, delays.encoders_s])
+    *paths, sample = path_delays(config, sensor, period)
     used = np.array([True, config.source != "encoders", True])
-    waits = np.where(used, delays.sample_s - paths, 0.0) / period
+    waits = np.where(used, sample - np.array(paths), 0.0) / period
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
     constants = _EstimatorConstants(
@@ -234,39 +232,52 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
     Args:
         constants, memory: results of `initialize_motion_estimator`; memory is updated.
+        arm: `ArmModel.table`. Without rows, the first three of the n "joint angles" are the
+            measured angular velocity of S, in S [rad/s] (source `accelerometer`).
         reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
-    n = arm.shape[0] - 1
+    n = sample.shape[0] - regressor.FIRST_JOINT_INDEX
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
-    joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
-    angles = sample[regressor.SAMPLE_JOINT_POSITION]
+    angles, gravity = sample[regressor.SAMPLE_JOINT_POSITION], motion[:3]
     _align_signal_paths(constants, memory, n, reading, sample)
-    if memory[0] == 0.0:
-        for i in range(3 * n):
-            joints[2 * n + i] = angles[i % n]
-    _differentiate_joint_angles(constants, joints, angles)
-    sensor_motion(arm, angles, joints[:n], joints[n:], motion)
+    if arm.shape[0] == 0:
+        copy_into(motion, 3, angles, 0, 3)
+    else:
+        joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
+        _differentiate_joint_angles(constants, memory[0] == 0.0, joints, angles)
+        serial_arm.sensor_motion(arm, angles, joints[:n], joints[n:], motion)
+        gravity = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN :]
     if constants.encoders_only != 0.0:
         copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        gravity = arm[n, LAST_ROW_GRAVITY_COLUMN:]
         _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
-def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
-    """Convert one reading to one sample without an arm's kinematics (source `accelerometer`).
+def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memory, sample):
+    """Measure true values by sensor chain and motion estimator; flag an implausible sample.
 
-    The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
+    `sensor` is (constants of the chain, constants of the estimator, ideal); the others are
+    arguments of `read_sensor_into` and `estimate_sample_into`.
     """
-    n = sample.shape[0] - regressor.SAMPLE_JOINT_POSITION.start
-    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
-    _align_signal_paths(constants, memory, n, reading, sample)
-    copy_into(motion, 3, sample, regressor.SAMPLE_JOINT_POSITION.start, 3)
-    _convert_and_fuse_accelerometer(constants, memory, motion[:3], motion, sample)
-    memory[0] += 1.0
+    chain, estimator, ideal = sensor
+    flag = regressor.SATURATION_FLAG_INDEX
+    if not are_values_plausible(chain, truth):  # keeps it out of the filters
+        sample[flag] = regressor.LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        return
+    lost = sample[flag] - 1.0
+    if ideal:
+        copy_into(sample, 0, truth, 0, flag)
+        sample[flag] = 0.0
+        copy_into(sample, flag + 1, truth, flag, truth.shape[0] - flag)
+    else:
+        reading = np.empty(truth.shape[0] - 2)
+        read_sensor_into(chain, chain_memory, noise, truth, reading)
+        estimate_sample_into(estimator, estimator_memory, arm, reading, sample)
+    if lost >= regressor.LOST_SAMPLE_FLAG:
+        sample[flag] = lost
 
 
 @njit(cache=True)
@@ -277,36 +288,32 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    width = 12 + n
-    line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :]
-    rows = line.shape[0] // width
-    shift_delay_line(line, width)
-    copy_into(line, 0, reading, 0, 12)
-    copy_into(line, 12, angles, 0, n)
+    line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :].reshape((-1, 12 + n))
+    shift_delay_line(line)
+    copy_into(line[0], 0, reading, 0, 12)
+    copy_into(line[0], 12, angles, 0, n)
     if memory[0] == 0.0:
-        for k in range(1, rows):
-            copy_into(line, k * width, line, 0, width)
-    wrench = int(constants.wait_samples[0]) * width
-    acceleration = int(constants.wait_samples[1]) * width
-    copy_into(sample, regressor.SAMPLE_WRENCH.start, line, wrench, 6)
-    copy_into(sample, regressor.SAMPLE_MOTION.start, line, acceleration + 6, 6)
-    wait = int(constants.wait_samples[2])
-    older = constants.wait_samples[2] - wait
-    encoders = wait * width + 12
-    before = min(wait + 1, rows - 1) * width + 12
+        line[1:] = line[0]
+    waits = constants.wait_samples
+    copy_into(sample, regressor.SAMPLE_WRENCH.start, line[int(waits[0])], 0, 6)
+    copy_into(sample, regressor.SAMPLE_MOTION.start, line[int(waits[1])], 6, 6)
+    wait, older = int(waits[2]), waits[2] - int(waits[2])
+    now, before = line[wait], line[min(wait + 1, line.shape[0] - 1)]
     for i in range(n):
-        angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
+        angles[i] = (1.0 - older) * now[12 + i] + older * before[12 + i]
     flagged = memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
     if reading[READ_SATURATED] != 0.0:
-        flagged = float(rows)
+        flagged = float(line.shape[0])
     memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
     sample[regressor.SATURATION_FLAG_INDEX] = 1.0 if flagged > 0.0 else 0.0
 
 
 @njit(cache=True)
-def _differentiate_joint_angles(constants, joints, angles):
+def _differentiate_joint_angles(constants, is_first, joints, angles):
     n, period = angles.shape[0], constants.period
     for i in range(n):
+        if is_first:
+            joints[2 * n + i] = joints[3 * n + i] = joints[4 * n + i] = angles[i]
         q0, q1, q2, q3 = angles[i], joints[2 * n + i], joints[3 * n + i], joints[4 * n + i]
         joints[i] = (3.0 * q0 - 4.0 * q1 + q2) / (2.0 * period)
         if constants.encoders_only != 0.0:

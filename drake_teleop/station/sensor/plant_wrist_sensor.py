@@ -7,6 +7,7 @@ step; the block holds pose and velocity of this state to pair them.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
@@ -38,33 +39,18 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.load.regressor import (
-    LOST_SAMPLE_FLAG,
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_JOINT_POSITION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_TIME_INDEX,
-    SAMPLE_WRENCH,
-    SAMPLE_WRENCH_AND_MOTION,
-    SATURATION_FLAG_INDEX,
-    sample_size,
-    signal_sizes_of_sample,
-)
+from drake_teleop.load import regressor
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_sample_with_gyroscope_into,
     initialize_motion_estimator,
+    measure_sample_into,
 )
 from drake_teleop.station.sensor.sensor_chain import (
-    LOST_READING_FLAG_SAMPLES,
     NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
-    are_values_plausible,
     initialize_sensor_chain,
-    read_sensor_into,
 )
 
 _NAME_IN_ERRORS = "AddWristSensor"
@@ -75,6 +61,8 @@ _PLANT_PORT_TYPES |= {"body_spatial_accelerations": SpatialAcceleration}
 _PLANT_PORT_TYPES |= {"reaction_forces": SpatialForce}
 # Configuration: R_WB (9), angular velocity of B in W (3), joint positions.
 _BODY_ROTATION_AND_RATE_SIZE = 12
+# Groups of the discrete state: held configuration; sample; sensor chain and motion estimator.
+_HELD_GROUP, _SAMPLE_GROUP, _FILTER_GROUPS = 0, 1, (2, 3)
 
 
 def AddWristSensor(
@@ -167,14 +155,11 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         constants, chain = initialize_sensor_chain(config, 3 + n, self.period)
         sources = MotionEstimationConfig()
         motion, estimator = initialize_motion_estimator(sources, config, 3 + n, self.period)
-        sample = np.zeros(sample_size(n) + 1)
-        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
-        held = np.full(_BODY_ROTATION_AND_RATE_SIZE + n, np.nan)
-        ends = np.cumsum([len(held), len(sample), len(chain), len(estimator)]).tolist()
-        self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
-        self._sensor = (constants, motion, ends[2] - ends[1], config.ideal)
-        self._filters = slice(ends[1], None)
-        self._no_noise = np.zeros(NOISE_BLOCK_SIZE)
+        self._sensor = constants, motion, config.ideal
+        self._no_noise, self._no_arm = np.zeros(NOISE_BLOCK_SIZE), np.zeros((0, 1))
+        # The sample, with the angular velocity as three more joints, and its time.
+        sample = np.zeros(regressor.sample_size(3 + n) + 1)
+        sample[regressor.SATURATION_FLAG_INDEX] = regressor.LOST_SAMPLE_FLAG
 
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states(*which))
         self._poses, self._velocities, self._accelerations, self._reactions = (
@@ -183,28 +168,29 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         )
         noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self._noise = noise
-        self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
+        held = np.full(_BODY_ROTATION_AND_RATE_SIZE + n, np.nan)
+        for start in (held, sample, chain, estimator):
+            self.DeclareDiscreteState(start)
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
         if self._pairs_steps:
             self.DeclareInitializationDiscreteUpdateEvent(self._store_rotation_rate_and_joints)
-        first = 0
-        for name, size in {**signal_sizes_of_sample(n), "sample_time": 1}.items():
-            self._declare_output("status" if name == "saturated" else name, first, size)
+        first, places = 0, np.delete(np.arange(len(sample)), [16, 17, 18])
+        for name, size in {**regressor.signal_sizes_of_sample(n), "sample_time": 1}.items():
+            place = places[first : first + size]
+            self._declare_output("status" if name == "saturated" else name, place)
             first += size
-        self._declare_output("sample", 0, first)
+        self._declare_output("sample", places)
 
     @property
     def period(self) -> float:
         """Sampling period [s]."""
         return self._step_s * self._steps_per_sample
 
-    def _declare_output(self, name: str, first: int, size: int) -> None:
-        part = slice(self._sample.start + first, self._sample.start + first + size)
-
+    def _declare_output(self, name: str, places: NDArray[np.intp]) -> None:
         def calc_part_of_sample(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(context.get_discrete_state_vector().value()[part])
+            output.SetFromVector(context.get_discrete_state(_SAMPLE_GROUP).value()[places])
 
-        self.DeclareVectorOutputPort(name, size, calc_part_of_sample, {self.xd_ticket()})
+        self.DeclareVectorOutputPort(name, len(places), calc_part_of_sample, {self.xd_ticket()})
 
     def _rotation_rate_and_joints(self, context: Context) -> Array:
         _, body, _ = self._weld
@@ -215,11 +201,11 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
     def _store_rotation_rate_and_joints(
         self, context: Context, discrete_state: DiscreteValues
     ) -> None:
-        discrete_state.get_mutable_value(0)[self._held] = self._rotation_rate_and_joints(context)
+        discrete_state.set_value(_HELD_GROUP, self._rotation_rate_and_joints(context))
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
-        configuration = discrete_state.value(0)[self._held].copy()
+        configuration = discrete_state.value(_HELD_GROUP).copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
             self._store_rotation_rate_and_joints(context, discrete_state)
@@ -233,10 +219,10 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
         truth = np.empty(TRUE_JOINT_ANGLES.start + 3 + self._n)
         _true_values_into(geometry, configuration, acceleration, force, truth)
-        memory = discrete_state.get_mutable_value(0)
-        sample, filters = memory[self._sample], memory[self._filters]
-        _measure_sample_into(self._sensor, truth, noise, filters, sample[:SAMPLE_TIME_INDEX])
-        sample[SAMPLE_TIME_INDEX] = context.get_time()
+        sample = discrete_state.get_mutable_value(_SAMPLE_GROUP)
+        filters = (discrete_state.get_mutable_value(group) for group in _FILTER_GROUPS)
+        measure_sample_into(self._sensor, self._no_arm, noise, truth, *filters, sample[:-1])
+        sample[-1] = context.get_time()
 
 
 @njit(cache=True)
@@ -253,35 +239,11 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
     f = apply_matrix(R_SJc, vector_at(reaction, 3))
     tau = plus(apply_matrix(R_SJc, vector_at(reaction, 0)), cross(p_SoJc_S, f))
     for i in range(3):
-        truth[SAMPLE_WRENCH.start + i] = sign * f[i]
-        truth[SAMPLE_WRENCH.start + 3 + i] = sign * tau[i]
-        truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
-        truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
-        truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
+        truth[i], truth[3 + i] = sign * f[i], sign * tau[i]
+        truth[6 + i], truth[9 + i], truth[12 + i] = s[i], omega[i], alpha[i]
+        truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
     n = configuration.shape[0] - _BODY_ROTATION_AND_RATE_SIZE
     copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_ROTATION_AND_RATE_SIZE, n)
-
-
-@njit(cache=True)
-def _measure_sample_into(sensor, truth, noise, memory, sample):
-    constants, motion_constants, end, ideal = sensor
-    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    if not are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
-        return
-    lost = sample[SATURATION_FLAG_INDEX] - 1.0
-    if ideal:
-        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[SATURATION_FLAG_INDEX] = 0.0
-        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start + 3, n)
-    else:
-        reading, estimate = np.empty(truth.shape[0] - 2), np.empty(truth.shape[0] + 1)
-        read_sensor_into(constants, memory[:end], noise, truth, reading)
-        estimate_sample_with_gyroscope_into(motion_constants, memory[end:], reading, estimate)
-        copy_into(sample, 0, estimate, 0, SAMPLE_JOINT_POSITION.start)
-        copy_into(sample, SAMPLE_JOINT_POSITION.start, estimate, SAMPLE_JOINT_POSITION.start + 3, n)
-    if lost >= LOST_SAMPLE_FLAG:
-        sample[SATURATION_FLAG_INDEX] = lost
 
 
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:

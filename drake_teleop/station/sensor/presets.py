@@ -66,27 +66,4 @@ PRESETS: dict[str, WristSensorConfig] = {
         for name, (side, along, bending, twist, force, torque, step) in _RANGES_AND_NOISE.items()
     },
 }
-"""Sensors by name, with the sources of their values.
-
-jr3_85m35a3: JR3 85M35A3-I40-D 200N12 of the paper. Force and torque ranges: data sheet. S is on the
-flange, the accelerometer in the middle of the 35 mm housing. Noise, quantum and acceleration ranges
-are estimates. Drift: 0.5 N in 10 min, between the ATI records. Walks of force and torque: Allan
-deviation at 1 to 2.5 s of a UR5 force sensor at rest (kkufieta/ur5_modeling_force_estimate, No10);
-of specific force: 0.2 mg at 30 s (typical for MEMS); of angular acceleration: in the ratio of the
-noises. Latency is zero: force and acceleration share converter, filter and line.
-
-ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU, recorded by A. Skrede (doi
-10.5281/zenodo.11075229). White noise: Allan deviation at one sample at rest (698 and 254 Hz), RMS
-over the axes. The spectrum of tz is white up to 349 Hz, so the low-pass (300 Hz, mechanics, an
-estimate) is before the noise. Offsets, IMU axes and its lag of 6 ms: fits to these records. IMU
-quantum and range: steps of 2.44e-4 g, 16 bits of +-8 g. Estimates: ranges of the Gamma (SI-130-10),
-place of the IMU, angular acceleration (gyroscope differences, no walk). Other walks and drift: as
-jr3_85m35a3.
-
-Others: ranges, the noise of FT 300 and Franka and the quantum of the Mini45 are the makers' values
-from memory; the rest are estimates, and the offset is the paper's. All except the Bota sensors get
-the ATI's IMU. `ur5e_built_in`: precision 3.5 N and 0.2 N m (three sigma). `franka_estimated`:
-accuracy 0.8 N, modelled by gain errors, cross-talk and a walk. Set `rates.sensor_hz` to the real
-rate: 7000 (ATI), 800 (Bota), 100 (Robotiq), 500 (OnRobot, UR), 1000 (Franka); reduce `bandwidth_hz`
-accordingly.
-"""
+"""Sensors by name; the sources of their values are in docs/sensor.md, "The presets"."""

@@ -349,11 +349,9 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
-    width = _DELAY_LINE_ROW_SIZE + angles.shape[0]
-    rows = (memory.shape[0] - _DELAY_LINE_START) // width
-    shift_delay_line(memory[_DELAY_LINE_START:], width)
-    row = memory[_DELAY_LINE_START:][:width]
-    channels = row[:_NUM_CHANNELS]
+    line = memory[_DELAY_LINE_START:].reshape((-1, _DELAY_LINE_ROW_SIZE + angles.shape[0]))
+    shift_delay_line(line)
+    row, channels = line[0], line[0, :_NUM_CHANNELS]
     walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
     filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
     sections, place = constants.low_pass, constants.low_pass_stage
@@ -383,25 +381,22 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         turned[i] = quantum * np.rint(angles[i] / quantum) if quantum > 0.0 else angles[i]
 
     if count == 0:
-        for k in range(1, rows):
-            copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
+        line[1:] = row
     memory[0] += 1.0
     late = constants.latency_samples
-    force = _DELAY_LINE_START + int(late[0]) * width
-    acceleration = _DELAY_LINE_START + int(late[1]) * width
-    copy_into(reading, READ_WRENCH.start, memory, force, 6)
-    copy_into(reading, READ_ACCELERATION.start, memory, acceleration + 6, 6)
-    force_flag, acceleration_row = memory[force + _NUM_CHANNELS], acceleration + _NUM_CHANNELS
-    reading[READ_SATURATED] = max(force_flag, memory[acceleration_row + 1])
-    encoders = _DELAY_LINE_START + int(late[2]) * width + _DELAY_LINE_ROW_SIZE
-    copy_into(reading, READ_ANGLES.start, memory, encoders, angles.shape[0])
+    force, acceleration = line[int(late[0])], line[int(late[1])]
+    copy_into(reading, READ_WRENCH.start, force, 0, 6)
+    copy_into(reading, READ_ACCELERATION.start, acceleration, 6, 6)
+    reading[READ_SATURATED] = max(force[_NUM_CHANNELS], acceleration[_NUM_CHANNELS + 1])
+    encoders = line[int(late[2])]
+    copy_into(reading, READ_ANGLES.start, encoders, _DELAY_LINE_ROW_SIZE, angles.shape[0])
 
 
 @njit(cache=True)
-def shift_delay_line(line, width):
-    """Shift the delay line by one row of `width` values; the newest row is first."""
-    for i in range(line.shape[0] - 1, width - 1, -1):
-        line[i] = line[i - width]
+def shift_delay_line(line):
+    """Shift the rows of the delay line by one; the newest is first."""
+    for k in range(line.shape[0] - 1, 0, -1):
+        copy_into(line[k], 0, line[k - 1], 0, line.shape[1])
 
 
 @njit(cache=True)

@@ -42,18 +42,8 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.load import regressor
 from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
-from drake_teleop.station.sensor import sensor_chain
-from drake_teleop.station.sensor.motion_estimation import (
-    MotionEstimationConfig,
-    estimate_sample_into,
-    initialize_motion_estimator,
-)
-from drake_teleop.station.slave.arm import (
-    SENSOR_MOTION_SIZE,
-    ArmModel,
-    forward_kinematics,
-    sensor_motion,
-)
+from drake_teleop.station.sensor import motion_estimation, sensor_chain
+from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
@@ -78,19 +68,17 @@ _USE_COMPILED_CONTACT = np.zeros(0)
 
 
 @njit(cache=True)
-def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write the true wrench, specific force, omega and alpha of S into `out` (15,).
+def true_sample_into(arm, phi, q, v, vdot, contact_W, out):
+    """Write the true wrench, specific force, omega and alpha of S into `out[:15]`.
 
     `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
     `phi` (10,) are the tool's inertial parameters.
     """
-    sensor_motion(arm, q, v, vdot, motion)
+    motion = np.empty(serial_arm.SENSOR_MOTION_SIZE)
+    serial_arm.sensor_motion(arm, q, v, vdot, motion)
     copy_into(out, regressor.SAMPLE_MOTION.start, motion, 0, 9)
-    s = out[regressor.SAMPLE_SPECIFIC_FORCE]
-    omega = out[regressor.SAMPLE_ANGULAR_VELOCITY]
-    alpha = out[regressor.SAMPLE_ANGULAR_ACCELERATION]
     wrench = out[regressor.SAMPLE_WRENCH]
-    regressor.non_contact_wrench_into(s, omega, alpha, phi, wrench)
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:9], phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
     tau = minus(vector_at(contact_W, 3), cross(p_WS, f))
@@ -117,31 +105,17 @@ def _interpolate_state(h, u, x, xdot, end, end_dot, out):
 @njit(cache=True)
 def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     arm, phi, _, _, _, _ = physics
-    constants, motion_constants, middle, end, ideal = sensor
+    constants, middle, end = sensor
     half = x.shape[0] // 2
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    rigid = truth[regressor.SAMPLE_WRENCH_AND_MOTION]
-    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
+    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, truth)
     copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
-    sample, flag = memory[:size], regressor.SATURATION_FLAG_INDEX
     copy_into(memory, size, memory, 0, size)
-    if not sensor_chain.are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[flag] = regressor.LOST_SAMPLE_FLAG + sensor_chain.LOST_READING_FLAG_SAMPLES
-        return
-    lost = sample[flag] - 1.0
-    if ideal:
-        copy_into(sample, 0, truth, 0, regressor.SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[flag] = 0.0
-        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, x, 0, n)
-    else:
-        reading = np.empty(13 + n)
-        sensor_chain.read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
-        estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
-    if lost >= regressor.LOST_SAMPLE_FLAG:
-        sample[flag] = lost
+    filters = memory[2 * size : middle], memory[middle:end]
+    motion_estimation.measure_sample_into(constants, arm, noise, truth, *filters, memory[:size])
 
 
 @njit(cache=True)
@@ -179,8 +153,8 @@ def take_due_samples(
     Args:
         physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
             damping, gravity; joint table of other moving bodies; wrenches from Drake).
-        sensor: (constants of sensor chain and of motion estimator, start of the estimator's memory
-            and of `tail`, ideal).
+        sensor: (argument `sensor` of `measure_sample_into`, start of the estimator's memory and of
+            `tail`).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         surroundings: [deflection and rate of the sheet, plant's state if other bodies move] now.
@@ -199,7 +173,7 @@ def take_due_samples(
     width = 1 + full
     after = result[size + 1 :]
     copy_into(after, 0, memory, 0, memory.shape[0])
-    tail = after[sensor[3] :]
+    tail = after[sensor[2] :]
     count, queued = tail[0], int(tail[1])
     now, between = scratch[0, :full], scratch[1, :full]
     now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
@@ -284,7 +258,7 @@ class WristSensor(LeafSystem):
         self,
         slave: SlavePlant,
         config: sensor_chain.WristSensorConfig,
-        motion: MotionEstimationConfig,
+        motion: motion_estimation.MotionEstimationConfig,
         period: float,
         hold_time: float,
         *,
@@ -294,7 +268,9 @@ class WristSensor(LeafSystem):
         arm = slave.arm
         n = self._n = arm.num_joints
         constants, chain = sensor_chain.initialize_sensor_chain(config, n, period)
-        motion_constants, estimator = initialize_motion_estimator(motion, config, n, period)
+        motion_constants, estimator = motion_estimation.initialize_motion_estimator(
+            motion, config, n, period
+        )
         self._physics, contact = slave.physics_of_plant, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
@@ -314,7 +290,7 @@ class WristSensor(LeafSystem):
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
-        self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
+        self._sensor = ((constants, motion_constants, config.ideal), *ends[1:].tolist())
         self._monitored_pairs = contact.monitored_pairs
         #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
         moving = contact.moving_bodies
@@ -366,7 +342,7 @@ class WristSensor(LeafSystem):
     @property
     def motion_dependent_state_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
-        _, _, chain_end, end, _ = self._sensor
+        _, chain_end, end = self._sensor
         size = regressor.sample_size(self._n)
         before_and_walks = range(size, 2 * size + sensor_chain.FILTER_MEMORY_START)
         others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
@@ -374,15 +350,13 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Take the due samples, and store them in the context."""
-        seen = self._states_of_arm_and_environment(context)
-        near = self._tool_proximity(*seen)
-        self._take_samples(context, seen, near, False, _USE_COMPILED_CONTACT, self._result)
+        self._take_samples(context, False, self._result)
         context.SetDiscreteState(self._result[self._memory_slice])
 
     def reset_queue(self, context: Context) -> None:
         """Reset the queue of steps to the current time; call this after setting states manually."""
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
-        tail, time = memory[self._sensor[3] :], context.get_time()
+        tail, time = memory[self._sensor[2] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _EQUAL_TIME_TOLERANCE_PERIODS), 0.0
         append_step_to_queue(tail, time, *self._states_of_arm_and_environment(context))
 
@@ -409,25 +383,15 @@ class WristSensor(LeafSystem):
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._states_of_arm_and_environment(context)
-        near = self._tool_proximity(*seen)
-        if near == PROXIMITY_FAR:
-            touching_W = self._zero_wrench
-        elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
-            touching_W = self._plant_contact_wrench_W(context)
-        else:
-            touching_W = _USE_COMPILED_CONTACT
-        self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
+        self._take_samples(context, True, output.get_mutable_value())
 
-    def _take_samples(
-        self,
-        context: Context,
-        seen: tuple[Array, Array],
-        near: int,
-        until_now: bool,
-        touching_W: Array,
-        result: Array,
-    ) -> None:
+    def _take_samples(self, context: Context, until_now: bool, result: Array) -> None:
+        seen = self._states_of_arm_and_environment(context)
+        near, touching_W = self._tool_proximity(*seen), _USE_COMPILED_CONTACT
+        if until_now and near == PROXIMITY_FAR:
+            touching_W = self._zero_wrench
+        elif until_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
+            touching_W = self._plant_contact_wrench_W(context)
         rate = self._no_rate if self._rate is None else self._rate.Eval(context)
         held, applied = (self._torque.Eval(context), rate), self._evaluate_applied_wrench(context)
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
@@ -454,13 +418,11 @@ class WristSensor(LeafSystem):
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         time = context.get_time()
         if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(time):
-            seen, monitored = (
-                self._states_of_arm_and_environment(context),
-                self._monitored_pairs.size,
-            )
+            seen = self._states_of_arm_and_environment(context)
+            monitored = self._monitored_pairs.size
             if not monitored or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
-                if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
+                if _try_queue_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
@@ -482,7 +444,7 @@ class WristSensor(LeafSystem):
         near = self._tool_proximity(state, around)
         if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
             contact_W, p_WS = self._plant_contact_wrench_W(context).copy(), np.empty(3)
-            forward_kinematics(physics[0], state[:n], np.empty((3, 3)), p_WS)
+            serial_arm.forward_kinematics(physics[0], state[:n], np.empty((3, 3)), p_WS)
             contact_W[3:] -= np.cross(p_WS, contact_W[:3])  # about So instead of the world's origin
             applied = applied + contact_W
             physics = (*physics[:2], physics[2][:0], *physics[3:])
@@ -497,12 +459,10 @@ class WristSensor(LeafSystem):
         return EventStatus.Succeeded()
 
 
-def sample_at_rest(arm: ArmModel, q: Array) -> Array:
+def sample_at_rest(arm: serial_arm.ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
-    no_contact, motion = np.zeros(6), np.zeros(SENSOR_MOTION_SIZE)
-    truth = sample[regressor.SAMPLE_WRENCH_AND_MOTION]
-    true_sample_into(arm.table, arm.phi_load, q, still, still, no_contact, motion, truth)
+    true_sample_into(arm.table, arm.phi_load, q, still, still, np.zeros(6), sample)
     sample[regressor.SAMPLE_JOINT_POSITION] = q
     return sample
 
@@ -511,7 +471,7 @@ def AddCompiledWristSensor(
     builder: DiagramBuilder,
     slave: SlavePlant,
     config: sensor_chain.WristSensorConfig,
-    motion: MotionEstimationConfig,
+    motion: motion_estimation.MotionEstimationConfig,
     period: float,
     hold_time: float,
     torque: Mapping[str, OutputPort],
