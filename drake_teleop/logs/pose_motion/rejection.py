@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.pose_motion.linear_model import MIN_NOISE_STD_OVER_WRENCH_RMS, Spectra
-from drake_teleop.logs.pose_motion.spectra import WrenchGrid, instants_to_nearest_flag
+from drake_teleop.logs.pose_motion.linear_model import MIN_NOISE_STD_OVER_WRENCH_RMS
+from drake_teleop.logs.pose_motion.spectra import Spectra, WrenchGrid, instants_to_nearest_flag
 from drake_teleop.logs.pose_motion.splines import SIGNALS_ZERO_AT_REST
 
 NOTHING_REJECTED_NOTE = (
@@ -27,11 +27,11 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     `spacing` is that of the splines' knots [s]. The note says that nothing could be rejected.
     """
     # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
-    gain = 0.5 ** ((spectra.bands.frequency * spacing / _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE) ** 2)
-    grid = spectra.grid
-    filtered = (spectrum * gain[:, None] for spectrum in (spectra.signals, spectra.wrench))
+    window, grid = spectra.window, spectra.window.grid
+    gain = 0.5 ** ((window.bands.frequency * spacing / _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE) ** 2)
+    filtered = (x * gain[:, None] for x in (spectra.signals, window.wrench_spectrum))
     x, y = (_spectrum_to_time_signal(spectrum, grid) for spectrum in filtered)
-    inside = spectra.taper > 0.5
+    inside = window.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
     if grid.known_load is None:

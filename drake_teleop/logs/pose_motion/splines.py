@@ -192,13 +192,8 @@ class PoseSplines:
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """Return [1, a, -g, alpha, products of omega] (N, 16) at times t [s], in P, Eq. (T73)."""
         a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
-        zeta = np.empty((len(t), NUM_MOTION_SIGNALS))
-        zeta[:, 0] = 1.0
-        zeta[:, 1:4], zeta[:, 4:7], zeta[:, 7:10] = a, minus_g, alpha
-        zeta[:, 10:13] = omega * omega
-        for column, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)), start=13):
-            zeta[:, column] = omega[:, i] * omega[:, j]
-        return zeta
+        products = np.hstack([omega, omega[:, [0, 0, 1]]]) * np.hstack([omega, omega[:, [1, 2, 2]]])
+        return np.hstack([np.ones((len(t), 1)), a, minus_g, alpha, products])
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
         """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""

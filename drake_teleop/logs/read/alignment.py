@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,13 +96,14 @@ def smooth_derivatives(
         for row in weights
     ]
     tau = dt * np.arange(1, half + 1)
-    derivatives = []
-    for order in range(3):
+
+    def derivative(order: int) -> Array:
         before = _evaluate_polynomial_derivatives([c[0] for c in inner], -tau[::-1], order)
         after = _evaluate_polynomial_derivatives([c[-1] for c in inner], tau, order)
         middle = math.factorial(order) * inner[order]
-        derivatives.append(np.concatenate([before, middle, after]).reshape(x.shape))
-    return derivatives[0], derivatives[1], derivatives[2]
+        return np.concatenate([before, middle, after]).reshape(x.shape)
+
+    return derivative(0), derivative(1), derivative(2)
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
@@ -172,17 +174,14 @@ def remove_delay(log: Log, delay_s: float) -> Log:
             f" ({_MIN_SAMPLES_AFTER_DELAY} are required)"
         )
         raise DrakeTeleopError(what, where=log.source, remedy="give a shorter delay, or `auto`")
-    motion = (resample(at[known], log.t, x) for x in log.motion)
-    gravity, R_WS = (
-        None if x is None else resample(at[known], log.t, x) for x in (log.gravity, log.R_WS)
-    )
-    bridged = None
+    names = ("specific_force", "angular_velocity", "angular_acceleration", "gravity", "R_WS")
+    present = {name: x for name in names if (x := getattr(log, name)) is not None}
+    moved: dict[str, Any] = {k: resample(at[known], log.t, x) for k, x in present.items()}
     if log.bridged is not None:
         # A gap can belong to the wrench or to the motion, so both positions are flagged.
-        moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
-        bridged = log.bridged[known] | moved
-    advanced: dict[str, Any] = {"gravity": gravity, "R_WS": R_WS, "bridged": bridged}
-    return log.select_rows(known).with_motion(*motion, **advanced)
+        bridged = resample(at[known], log.t, log.bridged.astype(float)) > 0
+        moved["bridged"] = log.bridged[known] | bridged
+    return replace(log.select_rows(known), **moved)
 
 
 def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:

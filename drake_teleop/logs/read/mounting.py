@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, position_of_parabola_minimum
+from drake_teleop.common.numeric import Array, search_minimum
 from drake_teleop.common.rotations import right_angled_rotations, rotation_matrices
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
@@ -55,14 +55,7 @@ def lag_of_imu_clock(
         parts = np.split(moved, len(expected), axis=1)
         return sum(_unexplained_share(y, x) for y, x in zip(expected, parts, strict=True))
 
-    step = 0.01
-    shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
-    costs = np.array([unexplained_at_shift(shift) for shift in shifts])
-    best = int(np.argmin(costs))
-    lag = float(shifts[best])
-    if 0 < best < len(shifts) - 1:
-        lag += step * position_of_parabola_minimum(*costs[best - 1 : best + 2])
-    return lag
+    return search_minimum(unexplained_at_shift, 0.01, reach)[0]
 
 
 def mid_record_lag_and_clock_drift(

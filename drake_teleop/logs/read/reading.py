@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -101,20 +102,19 @@ class _LogReader:
             if keep_time_origin:
                 self.notes.append("each row is interpreted as a pose at rest")
             return self._read_static_poses(self.description.static)
-        assert self.description.wrench is not None
-        weight = self.description.wrench.weight
-        causes = {"gravity": self.description.gravity == "auto", "weight": weight == "removed"}
-        free = tuple(name for name, is_free in causes.items() if is_free)
-        if self.description.gravity == "auto":
+        stream = self.description.wrench
+        assert stream is not None
+        weight, gravity = stream.weight, self.description.gravity
+        free = {"gravity": gravity == "auto", "weight": weight == "removed"}
+        if gravity == "auto":
             self._replace_auto_fields(auto_frames.estimate_auto_gravity)
         if self.description.pose is not None and self.description.pose.is_frame_auto:
             self._replace_auto_fields(auto_frames.estimate_auto_pose_frame, differentiate=False)
         if self.description.imu is not None and self.description.imu.is_mounting_auto:
             self._replace_auto_fields(auto_frames.estimate_auto_imu_mounting)
-        table = self._table_of_stream(self.description.wrench)
-        clock = self._read_clock_and_gaps("wrench", self.description.wrench, table)
-        wrench = self._read_wrench("wrench", self.description.wrench, table, clock.num_rows)
-        wrench = clock.select_timed_rows(wrench)
+        table = self._table_of_stream(stream)
+        clock = self._read_clock_and_gaps("wrench", stream, table)
+        wrench = clock.select_timed_rows(self._read_wrench("wrench", stream, table, clock.num_rows))
         pose = imu = None
         if self.description.pose is not None:
             pose = self._read_pose(self.description.pose, differentiate=differentiate)
@@ -122,18 +122,12 @@ class _LogReader:
             imu = self._read_imu(self.description.imu, pose)
         kinematics = [stream for stream in (imu, pose) if stream is not None]
         t = streams.uniform_times_of_streams(clock.t, kinematics, self.source)
-        wrench = resample(t, clock.t, wrench)
-        log = self._make_log(t, wrench, imu, pose)
-        posed, gain_std = None, self.description.wrench.gain_std
-        if pose is not None and pose.recorded_poses is not None:
-            inertial = None if imu is None else imu.imu_data
-            posed = self.description.poses_with_frame(pose.recorded_poses, inertial)
-        log = replace(log, gain_std=gain_std, estimated=free, described=self.description)
-        log = replace(log, posed=posed)
+        log = self._make_log(t, resample(t, clock.t, wrench), imu, pose)
+        log = replace(log, estimated=tuple(name for name, is_free in free.items() if is_free))
         log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
-        without = self.description.wrench.model_copy(update={"weight": None})
+        without = stream.model_copy(update={"weight": None})
         other = self.description.model_copy(update={"wrench": without})
         return restore_removed_weight(log, np.array(weight), self._read_edited_log(other))
 
@@ -156,27 +150,27 @@ class _LogReader:
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
-            self._read_vectors(name, field, quantity, table, rows, stream.sign)
-            for field, quantity in (("force", stream.force), ("torque", stream.torque))
+            self._read_vectors(f"{name}.{field}", table, rows, stream.sign)
+            for field in ("force", "torque")
         ]
         if isinstance(stream.frame, tuple):
             R = np.array(stream.frame)
             both = [vectors @ R.T for vectors in both]
         return np.hstack(both)
 
-    def _read_vectors(
-        self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
-    ) -> Array:
-        where = f"{self.source}:{name}.{field}.columns"
+    def _read_vectors(self, name: str, table: Table, rows: int, sign: float = 1.0) -> Array:
+        """Return the vectors (rows, 3) of a quantity such as `wrench.force` [SI]."""
+        quantity, where = attrgetter(name)(self.description), f"{self.source}:{name}.columns"
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self.description.unit_in_si(quantity.unit) * np.array(quantity.scale)
         of_table = table_files.note_that_table_needs_description(self.source)
         remedy = (
-            f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
+            f"if these are raw counts, set {name}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_magnitude(values, *streams.MAX_PLAUSIBLE_VALUES[field], where, remedy)
+        limit = streams.MAX_PLAUSIBLE_VALUES[name.partition(".")[2]]
+        table.check_magnitude(values, *limit, where, remedy)
         return values
 
     def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -204,8 +198,7 @@ class _LogReader:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            quantity = "pose", "position", stream.position
-            position = self._read_vectors(*quantity, table, clock.num_rows)
+            position = self._read_vectors("pose.position", table, clock.num_rows)
             position = clock.select_timed_rows(position)
         where, form = f"{self.source}:pose.orientation", stream.orientation
         orientations = OrientationColumns(self.description, form, table, clock.num_rows, where)
@@ -231,10 +224,9 @@ class _LogReader:
         dt = alignment.mean_time_step(t)
 
         def imu_vectors(field: str, sign: float = 1.0) -> Array | None:
-            quantity = getattr(stream, field)
-            if quantity is None:
+            if getattr(stream, field) is None:
                 return None
-            values = self._read_vectors("imu", field, quantity, table, clock.num_rows, sign)
+            values = self._read_vectors(f"imu.{field}", table, clock.num_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
             return self._imu_to_S(stream.frame, values, t, pose)
 
@@ -269,10 +261,9 @@ class _LogReader:
         wrench = self._read_wrench("static", stream, table, table.rows)
         R_SW = None
         if stream.gravity is not None:
-            gravity = self._read_vectors("static", "gravity", stream.gravity, table, table.rows)
+            gravity = self._read_vectors("static.gravity", table, table.rows)
         elif stream.specific_force is not None:
-            quantity = stream.specific_force
-            gravity = -self._read_vectors("static", "specific_force", quantity, table, table.rows)
+            gravity = -self._read_vectors("static.specific_force", table, table.rows)
         else:
             assert stream.orientation is not None
             where, form = f"{self.source}:static.orientation", stream.orientation
@@ -351,31 +342,39 @@ class _LogReader:
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
         gravity = R_WS = None
-        described, described_pose = self.description.wrench, self.description.pose
-        in_base = described is not None and described.frame == "base"
+        described, wrench_stream = self.description, self.description.wrench
+        assert wrench_stream is not None
+        in_base = wrench_stream.frame == "base"
         if pose is not None and pose.R_WS is not None:
             R_WS = nearest_rotation(streams.resample_to_clock(t, pose, pose.R_WS))
-            gravity = np.swapaxes(R_WS, 1, 2) @ self.description.gravity_W
+            gravity = np.swapaxes(R_WS, 1, 2) @ described.gravity_W
             if in_base:
                 wrench = streams.rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
             raise self._no_R_WS_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
-        if not accelerometer and described_pose and described_pose.position is None:
+        if not accelerometer and described.pose and described.pose.position is None:
             self.notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
+        posed = None
+        if pose is not None and pose.recorded_poses is not None:
+            inertial = None if imu is None else imu.imu_data
+            posed = described.poses_with_frame(pose.recorded_poses, inertial)
         names = ("specific_force", "angular_velocity", "angular_acceleration")
         s, omega, alpha = map(signal_on_clock, names)
         return Log(
             *(t, wrench, s, omega, alpha),
             gravity=gravity,
             R_WS=R_WS,
-            gravity_W=None if R_WS is None else self.description.gravity_W,
+            gravity_W=None if R_WS is None else described.gravity_W,
             bridged=self._flag_bridged_samples(t),
             notes=tuple(self.notes),
             source=self.source,
+            posed=posed,
+            gain_std=wrench_stream.gain_std,
             one_sided_s=self.one_sided_s,
+            described=described,
         )
 
     def _flag_bridged_samples(self, t: Array) -> NDArray[np.bool_] | None:
