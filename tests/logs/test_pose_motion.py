@@ -36,14 +36,15 @@ from drake_teleop.logs.pose_motion.estimate import (
     estimate_from_poses,
 )
 from drake_teleop.logs.pose_motion.linear_model import (
+    NOTHING_REJECTED_NOTE,
     _costs_at_delays,
     find_best_delay_and_cost,
+    find_disturbances,
     fit_coefficients,
     fit_linear_model,
     fit_noise_levels,
 )
 from drake_teleop.logs.pose_motion.poses import Poses
-from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED_NOTE, find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     RigidParameters,
     UnitsAndAxes,

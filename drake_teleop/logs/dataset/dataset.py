@@ -317,7 +317,7 @@ def _verdict_on_episode(
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
     spread = ln_half_width_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0]
     spread -= np.log(usual)
-    spread -= np.log(found.force_torque_gains).repeat(3)
+    spread -= np.log(found.gains).repeat(3)
     if not faults and spread.mean() > _MAX_LN_SPREAD_OVER_USUAL:
         text = (
             "no single fault explains the wrench: it is in contact most of the time, or the load"

@@ -24,7 +24,6 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
-from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN = "observation.contact_wrench", "observation.in_contact"
@@ -210,7 +209,7 @@ def _add_features_to_metadata(text: str) -> str:
 
 
 def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
-    frame, first = read_csv(path, True)
+    frame, first = table_files.read_csv(path, True)
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
     head = first - 2
