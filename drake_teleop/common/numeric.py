@@ -136,6 +136,14 @@ def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
 
 
+def samples_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
+    """Return the number (N,) of samples to the nearest set flag; inf without any."""
+    at = np.arange(len(flags), dtype=float)
+    before = np.maximum.accumulate(np.where(flags, at, -np.inf))
+    after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
+    return np.minimum(at - before, after - at)
+
+
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
     times = np.asarray(t, float)
     runs = find_runs_of_true(np.asarray(contact, bool))

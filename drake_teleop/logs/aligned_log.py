@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, narrowest_half_width_and_centre, one_blas_thread
+from drake_teleop.common.numeric import (
+    Array,
+    narrowest_half_width_and_centre,
+    one_blas_thread,
+    samples_to_nearest_flag,
+)
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.compensation import contact_wrench
@@ -254,7 +259,9 @@ def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
         stop = start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
-    bridged = None if log.bridged is None else alignment.widen_flags(log.bridged, stride)[::stride]
+    bridged = None
+    if log.bridged is not None:
+        bridged = samples_to_nearest_flag(log.bridged)[::stride] <= stride
     return replace(few, wrench=wrench, bridged=bridged)
 
 

@@ -70,7 +70,7 @@ class Dataset(NamedTuple):
                 return Table(episode.file, table_files.array_columns(arrays, None))
             frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first_row, episode.rows)
-            return Table(episode.file, table_files.numeric_and_nested_columns(part))
+            return Table(episode.file, table_files.columns_of_frame(part))
 
 
 @lru_cache(maxsize=1)
@@ -79,7 +79,9 @@ def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
     import polars as pl
 
     frame = pl.scan_parquet(file)
-    return frame.select(table_files.numeric_or_nested_column_names(frame)).collect().lazy()
+    types, nested = frame.collect_schema(), (pl.List, pl.Array)
+    names = [name for name, x in types.items() if x.is_numeric() or isinstance(x, nested)]
+    return frame.select(names).collect().lazy()
 
 
 def open_dataset(path: Path) -> Dataset:

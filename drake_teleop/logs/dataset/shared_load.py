@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, samples_to_nearest_flag
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.noise_floor import (
@@ -27,7 +27,6 @@ from drake_teleop.logs.dataset.episode_verdict import (
     hypothesis_without_fault,
 )
 from drake_teleop.logs.processing import phi_with_inertia_replaced
-from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
@@ -176,8 +175,8 @@ def _contact_free_samples(
 ) -> DetectorSamples:
     limit = _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL
     far = np.asarray((np.abs(contact) > limit).any(axis=1))
-    near = widen_flags(far, _CONTACT_MARGIN_FRAMES)
-    return samples_for_detector(signals, lag, contact).select_rows(~near)
+    free = samples_to_nearest_flag(far) > _CONTACT_MARGIN_FRAMES
+    return samples_for_detector(signals, lag, contact).select_rows(free)
 
 
 def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:

@@ -155,7 +155,11 @@ def estimate_from_poses(
             return rigid.fit_rigid(Z, Q, levels, start, free, best, gain_std=gain_std)
 
         seen = rigid.estimate_units_and_axes(best)
-        start = _initial_rigid_parameters(p_SoPo_S, R_SP, seen)
+        has_axes = seen.is_usable and not seen.is_mirrored
+        R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
+        R = seen.R_SP.T if R_SP is None and has_axes else R
+        p = np.zeros(3) if p_SoPo_S is None else np.asarray(p_SoPo_S, float)
+        start = RigidParameters(np.zeros(16), 0.0, -R @ p, R)
         fit_free = np.ones(rigid.NUM_RIGID_PARAMETERS, bool)
         fit_free[16] = delay is None
         fit_free[rigid.LEVER_PARAMETERS] = p_SoPo_S is None
@@ -163,7 +167,11 @@ def estimate_from_poses(
         fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
             with_frame = fit_free | (np.arange(rigid.NUM_RIGID_PARAMETERS) > 16)
-            free = fit_rigid_from(_initial_parameters_with_free_frame(fit, start, seen), with_frame)
+            first = fit.parameters
+            if has_axes and np.trace(seen.R_SP @ start.R_PS) < 2.9:
+                origin = seen.R_SP.T @ start.R_PS.T @ start.p_PoSo_P
+                first = RigidParameters(np.zeros(16), first.delay_s, origin, seen.R_SP.T)
+            free = fit_rigid_from(first, with_frame)
         std = float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free))))
         found = replace(found, delay_s=late + fit.parameters.delay_s, delay_std_s=std)
         frame = _pose_frame_of_fit(free, start)
@@ -279,27 +287,6 @@ def _taper_zero_in_gaps(
     for k in np.flatnonzero(np.diff(stamps) > _MIN_EXCLUDED_POSE_GAP_S):
         bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
     return exclude_from_taper(taper, bad, grid.dt, grid.dt)
-
-
-def _initial_rigid_parameters(
-    p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: UnitsAndAxes
-) -> RigidParameters:
-    R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
-    if R_SP is None and seen.is_usable and not seen.is_mirrored:
-        R = seen.R_SP.T
-    p = np.zeros(3) if p_SoPo_S is None else np.asarray(p_SoPo_S, float)
-    return RigidParameters(np.zeros(16), 0.0, -R @ p, R)
-
-
-def _initial_parameters_with_free_frame(
-    fit: RigidFit, start: RigidParameters, seen: UnitsAndAxes
-) -> RigidParameters:
-    turned = seen.is_usable and not seen.is_mirrored and np.trace(seen.R_SP @ start.R_PS) < 2.9
-    if not turned:
-        return fit.parameters
-    R = seen.R_SP.T
-    origin = R @ start.R_PS.T @ start.p_PoSo_P
-    return RigidParameters(np.zeros(16), fit.parameters.delay_s, origin, R)
 
 
 def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:

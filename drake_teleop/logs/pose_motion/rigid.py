@@ -178,7 +178,9 @@ def _solve_rigid_fit(
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_MAX_PARAMETER_FIT_STEP / np.maximum(np.abs(step), 1e-300))))
         state = _add_rigid_step(state, step)
-        used = _degrees_of_freedom_of_fit(B, record.moments, W, inverse)
+        half = np.einsum("cjk,ji->cik", B, inverse)
+        used = np.einsum("cik,bkm,cim->bc", half, record.moments, B, optimize=True)
+        used = np.clip(used * np.diagonal(W, axis1=1, axis2=2), 0.0, None)
         R = _residual_covariances(record, state, _residual_channel_powers(record, state), used)
         if np.max(np.abs(step) / size) < _MAX_CONVERGED_STEP_OVER_STD:
             break
@@ -285,13 +287,6 @@ def _residual_covariances(
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
-
-
-def _degrees_of_freedom_of_fit(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    diagonal = np.diagonal(W, axis1=1, axis2=2)
-    half = np.einsum("cjk,ji->cik", B, inverse)
-    gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
-    return np.asarray(np.clip(gram * diagonal, 0.0, None))
 
 
 def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array:

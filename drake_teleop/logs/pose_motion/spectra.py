@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import next_fast_len
 
-from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_flag
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.normal_equations import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
@@ -119,16 +119,8 @@ def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((instants_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
+    edge = np.clip((samples_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
-
-
-def instants_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
-    """Return the number (M,) of instants to the nearest set flag; inf without any."""
-    at = np.arange(len(flags), dtype=float)
-    before = np.maximum.accumulate(np.where(flags, at, -np.inf))
-    after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
-    return np.minimum(at - before, after - at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,11 +341,8 @@ def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, fl
         left = splines.imu_rows.pose_noise_shares_left_by_imu(bands.frequency)
         position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
-    still, first, second, third = _signal_covariances_by_rotation(spectra.motion_signals, weight)
-    eye = np.zeros((NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
-    eye[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
+    shapes = _signal_covariances_by_pose_noise(spectra.motion_signals, weight)
     powers = position_power * w2**2, rotation_power, rotation_power * w2, rotation_power * w2**2
-    shapes = eye, still, first + second, third
     Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
     signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
     for power, shape in zip(powers, shapes, strict=True):
@@ -362,10 +351,9 @@ def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, fl
     return Q
 
 
-def _signal_covariances_by_rotation(
-    zeta: Array, weight: Array
-) -> tuple[Array, Array, Array, Array]:
-    still, cross, products, alpha = np.zeros((4, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
+def _signal_covariances_by_pose_noise(zeta: Array, weight: Array) -> tuple[Array, ...]:
+    place, still, cross, products, alpha = np.zeros((5, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
+    place[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
     mean = weight @ zeta
     for left in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
         for right in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
@@ -379,4 +367,4 @@ def _signal_covariances_by_rotation(
     for jacobian in omega_product_jacobians(OMEGA_PRODUCT_COLUMNS, NUM_MOTION_SIGNALS):
         products += jacobian.T @ ww @ jacobian
     alpha[_ALPHA_COLUMNS, _ALPHA_COLUMNS] = np.eye(3)
-    return still, cross, products, alpha
+    return place, still, cross + products, alpha

@@ -66,11 +66,9 @@ class ImuSplineRows:
     def pose_noise_shares_left_by_imu(self, frequency: Array) -> tuple[Array, Array]:
         """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
-        powers = zip(self.pose_noise_powers, self.imu_noise_powers, strict=True)
-        without = self.acceleration_W is None, self.quaternion_rate is None
-        position, rotation = (
-            0.0 if x else a / b for (a, b), x in zip(powers, without, strict=True)
-        )
+        data = self.acceleration_W, self.quaternion_rate
+        ratios = zip(self.pose_noise_powers, self.imu_noise_powers, data, strict=True)
+        position, rotation = (0.0 if rows is None else a / b for a, b, rows in ratios)
         return 1.0 / (1.0 + position * w**4), 1.0 / (1.0 + rotation * w**2)
 
 

@@ -52,21 +52,18 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     A row that repeats the time stamp and the values in `columns` of the previous row is removed.
     """
     t, episodes = time_stamps_and_num_episodes(time, table, where)
-    total, rows = len(t), np.flatnonzero(np.isfinite(t))
+    total, rows, notes = len(t), np.flatnonzero(np.isfinite(t)), []
     if time.column is None:
         return Clock(_apply_clock_scale_and_offset(t, time), rows, total)
-    notes = []
-    if len(rows) < len(t):
-        notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
+    if len(rows) < total:
+        notes.append(f"{total - len(rows)} rows without a time stamp are removed")
     _check_stamps_go_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
-        before = len(rows)
-        rows = _remove_repeated_rows(rows, t, table, columns, where)
-        if len(rows) < before:
-            notes.append(
-                f"{before - len(rows)} rows that repeat the previous row and its time stamp"
-                " are removed"
-            )
+        same = _find_repeated_rows(rows, t, table, columns, where)
+        rows = rows[~same]
+        if same.any():
+            text = f"{same.sum()} rows that repeat the previous row and its time stamp are removed"
+            notes.append(text)
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
     if shared:
@@ -215,15 +212,15 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     return line + smooth
 
 
-def _remove_repeated_rows(
+def _find_repeated_rows(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
-) -> NDArray[np.intp]:
+) -> NDArray[np.bool_]:
     values = [table.numbers_with_nan(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0
     for x in values:
         same &= ((x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))).all(axis=1)
-    return rows[np.concatenate([[True], ~same])]
+    return np.concatenate([[False], same])
 
 
 def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:

@@ -282,23 +282,19 @@ class _LogReader:
             what = f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)"
             remedy = "record 12 or more, with different orientations"
             raise DrakeTeleopError(what, where=f"{self.source}:static", remedy=remedy)
-        rest = np.zeros((n, 3))
+        rest, steps = np.zeros((n, 3)), []
+        for name, quantity in (("force", stream.force), ("torque", stream.torque)):
+            values = table.finite_numbers(quantity.columns, 3, f"static.{name}", table.rows)
+            unit = self.description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
+            steps.append(decimal_resolution(values) * unit)
         return Log(
             *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),
             notes=tuple(self.notes),
             source=self.source,
             gain_std=stream.gain_std,
             described=self.description,
-            resolution=self._quantization_steps(stream, table),
+            resolution=(steps[0], steps[1]),
         )
-
-    def _quantization_steps(self, stream: Static, table: Table) -> tuple[float, float]:
-        steps = []
-        for name, quantity in (("force", stream.force), ("torque", stream.torque)):
-            values = table.finite_numbers(quantity.columns, 3, f"static.{name}", table.rows)
-            unit = self.description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
-            steps.append(decimal_resolution(values) * unit)
-        return steps[0], steps[1]
 
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         clock = read_clock(stream.time, table, stream.columns, f"{self.source}:{name}.time")

@@ -13,7 +13,6 @@ import math
 import os
 import re
 import zipfile
-from collections import UserDict
 from collections.abc import Callable, Mapping, MutableMapping
 from contextlib import suppress
 from functools import partial
@@ -28,7 +27,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
-from drake_teleop.logs.read.tables import Table
+from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -195,7 +194,7 @@ def _add_lower_case_names_if_canonical(columns: dict[str, _ColumnType]) -> dict[
     return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
 
 
-def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
+def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
     import polars as pl
 
     kind = path.suffix.lower()
@@ -210,25 +209,12 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
     columns = _column_expressions(frame)
     rows = frame.select(pl.len()).collect().item()
     if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
-        return _LazyColumns(frame, columns)  # each is read on access, to limit memory
+
+        def read(name: str) -> NDArray:
+            return _to_numpy(frame.select(columns[name].alias("x")).collect().to_series())
+
+        return ColumnsOnAccess(columns, read)  # to limit memory
     return _collect_columns(frame, columns)
-
-
-def numeric_and_nested_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
-    """Return columns of numbers, and elements of lists and structures, of a frame by name."""
-    frame = frame.select(numeric_or_nested_column_names(frame)).collect().lazy()
-    return _collect_columns(frame, _column_expressions(frame))
-
-
-def numeric_or_nested_column_names(frame: pl.LazyFrame) -> list[str]:
-    """Return the names of the columns of numbers, lists and arrays."""
-    import polars as pl
-
-    return [
-        name
-        for name, dtype in frame.collect_schema().items()
-        if dtype.is_numeric() or isinstance(dtype, (pl.List, pl.Array))
-    ]
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
@@ -239,6 +225,11 @@ def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
         columns |= _expand_nested_column(name.strip(), pl.col(name), dtype, frame)
     _strip_column_names(list(frame.collect_schema()))
     return _add_lower_case_names_if_canonical(columns)
+
+
+def columns_of_frame(frame: pl.LazyFrame) -> dict[str, NDArray]:
+    """Return the columns of a frame, and the elements of lists and structures, by name."""
+    return _collect_columns(frame, _column_expressions(frame))
 
 
 def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
@@ -271,15 +262,6 @@ def _expand_nested_column(
     length = min(length, _MAX_ELEMENT_COLUMNS)
     elements = {f"{label}[{k}]": column.arr.get(k) for k in range(length)}
     return {**elements, label: column}
-
-
-class _LazyColumns(UserDict[str, Any]):
-    def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
-        super().__init__(columns)
-        self._frame = frame
-
-    def __getitem__(self, key: str) -> NDArray:
-        return _to_numpy(self._frame.select(self.data[key].alias("x")).collect().to_series())
 
 
 def _to_numpy(series: pl.Series) -> NDArray:
