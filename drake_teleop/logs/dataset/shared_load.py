@@ -18,13 +18,11 @@ from drake_teleop.load.contact.noise_floor import (
     limit_covariance_to_scales,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
+from drake_teleop.logs.dataset import episode_verdict
 from drake_teleop.logs.dataset.episode_verdict import (
-    HALF_WIDTH_OF_NORMAL,
     LAG_STEPS_PER_FRAME,
     EpisodeSignals,
-    HypothesisSearch,
     WrenchHypothesis,
-    hypothesis_without_fault,
 )
 from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.canonical import Log
@@ -99,7 +97,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
 def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
     """Return the hypothesis of the load and lag that explain an episode best."""
-    search = HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
+    search = episode_verdict.HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
     return min(found, key=lambda x: x.spread.sum())
@@ -113,10 +111,15 @@ class _Episode(NamedTuple):
 
     def faultless_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
         """Return the hypothesis of load phi (10,), at the best lag near that of the own load."""
-        search = HypothesisSearch(self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH)
+        search = episode_verdict.HypothesisSearch(
+            self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
+        )
         steps = np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1)
         lags = self.own.lag + steps / LAG_STEPS_PER_FRAME
-        found = (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags)
+        found = (
+            search.with_spread_and_cost(episode_verdict.hypothesis_without_fault(float(lag)))
+            for lag in lags
+        )
         best = min(found, key=lambda x: x.spread.sum())
         return best, search.unexplained_reading(best)
 
@@ -136,7 +139,7 @@ def _fit_load(episodes: Sequence[_Episode], phi: Array) -> Identification:
     offsets = []
     for episode in episodes:
         x, r = episode.faultless_hypothesis_and_residual(phi)
-        sigma = np.exp(x.spread) / HALF_WIDTH_OF_NORMAL
+        sigma = np.exp(x.spread) / episode_verdict.HALF_WIDTH_OF_NORMAL
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episode.signals.regressor_at_lag(x.lag)[rows], episode.signals.log.wrench[rows]
         A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)
@@ -173,7 +176,7 @@ def _fit_load(episodes: Sequence[_Episode], phi: Array) -> Identification:
 def _contact_free_samples(
     signals: EpisodeSignals, lag: float, contact: Array, typical: Array
 ) -> DetectorSamples:
-    limit = _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL
+    limit = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.HALF_WIDTH_OF_NORMAL
     far = np.asarray((np.abs(contact) > limit).any(axis=1))
     free = samples_to_nearest_flag(far) > _CONTACT_MARGIN_FRAMES
     return samples_for_detector(signals, lag, contact).select_rows(free)

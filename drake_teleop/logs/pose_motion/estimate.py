@@ -16,13 +16,7 @@ from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import find_disturbances
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rigid import RigidFit, RigidParameters, UnitsAndAxes
-from drake_teleop.logs.pose_motion.spectra import (
-    FitWindow,
-    Spectra,
-    WrenchGrid,
-    end_taper,
-    exclude_from_taper,
-)
+from drake_teleop.logs.pose_motion.spectra import FitWindow, Spectra, WrenchGrid
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
 _SEARCHED_RECORD_PART_S = 120.0
@@ -144,7 +138,7 @@ def estimate_from_poses(
         splines, late = found.splines, found.delay_s
         window = replace(window, taper=_taper_zero_in_gaps(grid, splines.poses, lost, late))
         rejected, note = find_disturbances(window.spectra_at_delay(splines, late), splines.spacing)
-        window = replace(window, taper=exclude_from_taper(window.taper, rejected, grid.dt))
+        window = replace(window, taper=spectra.exclude_from_taper(window.taper, rejected, grid.dt))
         final = window.spectra_at_delay(splines, late)
         Z = final.second_moments_with_rates()
         Q = spectra.noise_moments(splines, final, splines.estimate_pose_noise())
@@ -166,19 +160,17 @@ def estimate_from_poses(
         fit_free[rigid.ROTATION_PARAMETERS] = R_SP is None
         fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
-            with_frame = fit_free | (np.arange(rigid.NUM_RIGID_PARAMETERS) > 16)
             first = fit.parameters
             if has_axes and np.trace(seen.R_SP @ start.R_PS) < 2.9:
                 origin = seen.R_SP.T @ start.R_PS.T @ start.p_PoSo_P
                 first = RigidParameters(np.zeros(16), first.delay_s, origin, seen.R_SP.T)
-            free = fit_rigid_from(first, with_frame)
+            free = fit_rigid_from(first, fit_free | (np.arange(len(fit_free)) > 16))
         std = float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free))))
         found = replace(found, delay_s=late + fit.parameters.delay_s, delay_std_s=std)
-        frame = _pose_frame_of_fit(free, start)
         return PoseEstimate(
             **vars(found),
             fit=fit,
-            frame=frame,
+            frame=_pose_frame_of_fit(free, start),
             free_frame_fit=free,
             units_and_axes=seen,
             t=grid.t,
@@ -220,9 +212,8 @@ def _find_splines_and_delay(
     known, guess = delay is not None, delay or 0.0
     taper = _taper_zero_in_gaps(grid, poses, lost, guess)
     usable = int((taper > 0.5).sum())
-    fewest = _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
-    if grid.known_load is None:
-        fewest = _MIN_SHARED_INSTANTS
+    free_load = grid.known_load is None
+    fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
     if usable < fewest:
         raise DrakeTeleopError(
             f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart ({fewest} required)",
@@ -239,7 +230,7 @@ def _find_splines_and_delay(
     spacing, late = linear_model.guess_knot_spacing_and_delay(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
     disturbed = find_disturbances(first, spacing)[0]
-    part = replace(part, taper=exclude_from_taper(part.taper, disturbed, grid.dt))
+    part = replace(part, taper=spectra.exclude_from_taper(part.taper, disturbed, grid.dt))
     rate = 0.0 if known else linear_model.estimate_clock_rate_error(part, cache, late, spacing)
     if rate:
         near_poses = linear_model.correct_clock_rate(near_poses, rate, part.grid, late)
@@ -265,10 +256,8 @@ def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
     rows, length = len(grid.t), round(_SEARCHED_RECORD_PART_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
-    starts = range(0, rows - length, length // 2)
-    coarse = grid.wrench[:: grid.stride]
-    varied = [np.var(coarse[k : k + length], axis=0)[:3].sum() for k in starts]
-    first = starts[int(np.argmax(varied))]
+    coarse, parts = grid.wrench[:: grid.stride], range(0, rows - length, length // 2)
+    first = max(parts, key=lambda k: float(np.var(coarse[k : k + length], axis=0)[:3].sum()))
     return slice(first, first + length)
 
 
@@ -279,14 +268,14 @@ def _taper_zero_in_gaps(
     start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
         return np.zeros(len(grid.t))
-    taper = end_taper(grid.t, start, stop)
+    taper = spectra.end_taper(grid.t, start, stop)
     bad = np.zeros(len(grid.t), bool)
     if lost is not None:
         rows = len(grid.t) * grid.stride
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
     for k in np.flatnonzero(np.diff(stamps) > _MIN_EXCLUDED_POSE_GAP_S):
         bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
-    return exclude_from_taper(taper, bad, grid.dt, grid.dt)
+    return spectra.exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
 
 def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:

@@ -126,22 +126,6 @@ def _row_numbers_without_other_streams(table: Table) -> NDArray[np.intp]:
     return np.searchsorted(np.flatnonzero(~only_others), kept)
 
 
-def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
-    """Return a note about the episodes of a wrench's clock; raise an error for several files."""
-    if num_files > 1:
-        what = (
-            f"the clock starts {clock.num_episodes} times, which requires all streams in one file"
-        )
-        remedy = "write all streams into one table, or each episode into files of its own"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
-    if not where.endswith("wrench.time"):
-        return []
-    return [
-        f"the clock starts {clock.num_episodes} times: the episodes follow each other, 1 s or more"
-        " apart; samples near their ends are not used"
-    ]
-
-
 def join_episodes(t: Array) -> tuple[Array, int]:
     """Return increasing times (N,) for a clock that starts again, and the number of episodes.
 

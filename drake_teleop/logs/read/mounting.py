@@ -13,14 +13,8 @@ from drake_teleop.common.rotations import right_angled_rotations, rotation_matri
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.read.alignment import (
-    estimate_delay,
-    is_far_from_gaps,
-    low_pass,
-    low_pass_log,
-    remove_delay,
-    resample,
-)
+from drake_teleop.logs.read import alignment
+from drake_teleop.logs.read.alignment import low_pass_log, resample
 from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
@@ -179,7 +173,9 @@ class LeverArm:
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     """Return the accelerometer's position, Eq. (T21); None for a poor fit or few samples."""
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_pass_log(remove_delay(log, estimate_delay(log, None) or 0.0), cutoff)
+    smooth = low_pass_log(
+        alignment.remove_delay(log, alignment.estimate_delay(log, None) or 0.0), cutoff
+    )
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
     if len(t) < NUM_COMPARED_SAMPLES // 10:
@@ -209,7 +205,9 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 def times_outside_gaps(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, NUM_COMPARED_SAMPLES)
-    known = [np.interp(t, x.t, is_far_from_gaps(x, cutoff).astype(float)) > 0.99 for x in logs]
+    known = [
+        np.interp(t, x.t, alignment.is_far_from_gaps(x, cutoff).astype(float)) > 0.99 for x in logs
+    ]
     return t[np.all(known, axis=0)]
 
 
@@ -222,7 +220,9 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) True for axes along which the motion K determines a lever arm."""
     alpha = log.angular_acceleration
-    above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
+    above = alignment.low_pass(alpha, log.dt, 2 * cutoff) - alignment.low_pass(
+        alpha, log.dt, cutoff
+    )
     noise = above.var(axis=0) / 7
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)

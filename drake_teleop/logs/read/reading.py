@@ -22,7 +22,7 @@ from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angula
 from drake_teleop.logs.read.auto_frames import restore_removed_weight
 from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
+from drake_teleop.logs.read.clocks import Clock, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
     Description,
     Imu,
@@ -237,7 +237,13 @@ class _LogReader:
             alpha = alignment.smooth_derivatives(omega, dt, self.bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = streams.specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
+            omega_S, alpha_S = omega, alpha
+            if omega is None:
+                assert pose is not None and pose.angular_velocity is not None
+                omega_S = resample(t, pose.t, pose.angular_velocity)
+                alpha_S = resample(t, pose.t, pose.angular_acceleration)
+            p = np.array(stream.position)  # the specific force moves from Io to So
+            s = s - np.cross(alpha_S, p) - np.cross(omega_S, np.cross(omega_S, p))
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
         outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
@@ -310,8 +316,16 @@ class _LogReader:
             )
         found_gaps = find_gaps_in_times(t, self.bandwidth_hz)
         if clock.num_episodes > 1:
-            files = len({stream.source for stream in self.description.streams.values()})
-            self.notes += episodes_note(clock, files, f"{self.source}:{name}.time")
+            starts = f"the clock starts {clock.num_episodes} times"
+            if len({stream.source for stream in self.description.streams.values()}) > 1:
+                what = f"{starts}, which requires all streams in one file"
+                remedy = "write all streams into one table, or each episode into files of its own"
+                raise DrakeTeleopError(what, where=f"{self.source}:{name}.time", remedy=remedy)
+            if name == "wrench":
+                self.notes.append(
+                    f"{starts}: the episodes follow each other, 1 s or more apart; samples near"
+                    " their ends are not used"
+                )
         elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self.notes.append(
