@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,7 +183,7 @@ class _LogReader:
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, recorded_poses=raw)
         dt = alignment.mean_time_step(t)
-        self._raise_one_sided_length_to_window(dt)
+        self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
         raw_R = rotations.rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -228,12 +227,19 @@ class _LogReader:
                 return None
             values = self._read_vectors(f"imu.{field}", table, clock.num_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
-            return self._imu_to_S(stream.frame, values, t, pose)
+            if stream.frame == "sensor":
+                return values
+            if isinstance(stream.frame, tuple):
+                return values @ np.array(stream.frame).T
+            if pose is None or pose.R_WS is None:
+                raise self._no_R_WS_error("imu")
+            R_WS = nearest_rotation(resample(t, pose.t, pose.R_WS))
+            return streams.rotate_world_to_S(R_WS, values)
 
         s = imu_vectors("specific_force", stream.sign)
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._raise_one_sided_length_to_window(dt)
+            self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
             alpha = alignment.smooth_derivatives(omega, dt, self.bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
@@ -248,15 +254,6 @@ class _LogReader:
         outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
         return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
-
-    def _imu_to_S(self, frame: Any, vectors: Array, t: Array, pose: Stream | None) -> Array:
-        if isinstance(frame, tuple):
-            return vectors @ np.array(frame).T
-        if frame == "sensor":
-            return vectors
-        if pose is None or pose.R_WS is None:
-            raise self._no_R_WS_error("imu")
-        return streams.rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
     def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
@@ -341,9 +338,6 @@ class _LogReader:
         window = SMOOTHER_WINDOW_OVER_PERIOD / self.bandwidth_hz if self.bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _raise_one_sided_length_to_window(self, dt: float) -> None:
-        self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
-
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
@@ -351,7 +345,7 @@ class _LogReader:
                     return streams.resample_to_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
-        gravity = R_WS = None
+        gravity = R_WS = posed = None
         described, wrench_stream = self.description, self.description.wrench
         assert wrench_stream is not None
         in_base = wrench_stream.frame == "base"
@@ -367,7 +361,6 @@ class _LogReader:
             self.notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
-        posed = None
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
             posed = described.poses_with_frame(pose.recorded_poses, inertial)
