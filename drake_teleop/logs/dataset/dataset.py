@@ -50,8 +50,6 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class SharedJudgingData(NamedTuple):
-    """Data that the verdicts of all episodes share."""
-
     dataset: Dataset
     streams: dict[str, Any]
     shared_load: SharedLoad

@@ -104,8 +104,6 @@ def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
 
 
 class _Episode(NamedTuple):
-    """Signals of an episode, and the hypothesis of its own load."""
-
     signals: EpisodeSignals
     own: WrenchHypothesis
 

@@ -61,7 +61,6 @@ class RigidFit:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether the misfit is below four times its degrees of freedom."""
         return self.misfit < _MAX_RIGID_MISFIT_OVER_DOF * self.degrees_of_freedom
 
     @property
@@ -352,7 +351,6 @@ class UnitsAndAxes:
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether the axes of wrench and poses are mirror images."""
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 

@@ -166,7 +166,6 @@ class LeverArm:
 
     @property
     def is_determined_by_axis(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where the standard deviation is below 5 mm."""
         return self.deviations < MAX_LEVER_ARM_DEVIATION_M
 
 
@@ -282,7 +281,6 @@ class Mounting:
 
     @property
     def is_right_angled(self) -> bool:
-        """Whether R_SI maps axes to axes, within 5 deg."""
         return self.angle_to_right_angled_deg < MAX_RIGHT_ANGLE_ERROR_DEG
 
     @property

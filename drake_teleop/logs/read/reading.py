@@ -15,7 +15,7 @@ from drake_teleop.common import rotations
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation
-from drake_teleop.logs.pose_motion.poses import ImuData, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.read import alignment, auto_frames, streams, table_files
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angular_motion, resample
 from drake_teleop.logs.read.auto_frames import restore_removed_weight
@@ -361,9 +361,11 @@ class _LogReader:
             self.notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
-        if pose is not None and pose.recorded_poses is not None:
+        if described.pose and pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
-            posed = described.poses_with_frame(pose.recorded_poses, inertial)
+            R_SP = np.eye(3) if described.pose.R_SP is None else described.pose.R_SP
+            p_SoPo_S = np.array(described.pose.position_in_sensor)
+            posed = PosesOfLog(pose.recorded_poses, described.gravity_W, p_SoPo_S, R_SP, inertial)
         names = ("specific_force", "angular_velocity", "angular_acceleration")
         s, omega, alpha = map(signal_on_clock, names)
         return Log(

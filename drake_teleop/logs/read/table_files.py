@@ -118,7 +118,11 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         skip_lines=before,
         try_parse_dates=True,
     )
-    frame = _parse_with_inferred_types(parse)
+    frame = None
+    with suppress(pl.exceptions.ComputeError):
+        frame = parse(infer_schema_length=_ROWS_FOR_TYPE_INFERENCE)
+    if frame is None or not all(kind.is_numeric() for kind in frame.dtypes):
+        frame = parse(infer_schema_length=None)
     if names is not None:
         frame.columns = names
     return frame, before + (2 if header else 1)
@@ -144,16 +148,6 @@ def _normalize_line_ends_and_decimal_commas(
 def _length_without_blank_end(text: bytes) -> int:
     line = text.find(b"\n", len(text.rstrip(_BLANK_BYTES)))
     return len(text) if line < 0 else line + 1
-
-
-def _parse_with_inferred_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    import polars as pl
-
-    with suppress(pl.exceptions.ComputeError):
-        frame = parse(infer_schema_length=_ROWS_FOR_TYPE_INFERENCE)
-        if all(kind.is_numeric() for kind in frame.dtypes):
-            return frame
-    return parse(infer_schema_length=None)
 
 
 def _find_separator(line: str) -> str:
@@ -221,8 +215,30 @@ def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     import polars as pl
 
     columns: dict[str, pl.Expr] = {}
+
+    def add(label: str, column: pl.Expr, dtype: Any) -> None:
+        length = 0
+        if isinstance(dtype, pl.Struct):
+            for field in dtype.fields:
+                add(f"{label}.{field.name}", column.struct.field(field.name), field.dtype)
+            return
+        if isinstance(dtype, pl.List):
+            lengths = frame.select(column.list.len().drop_nulls().unique()).collect().to_series()
+            if not dtype.inner.is_numeric() or len(lengths) != 1 or not lengths[0]:
+                return
+            column, length = column.list.to_array(lengths[0]), int(lengths[0])
+        elif isinstance(dtype, pl.Array):
+            if not (dtype.inner.is_numeric() or isinstance(dtype.inner, pl.Array)):
+                return
+            length = dtype.shape[0] if len(dtype.shape) == 1 else 0
+        elif isinstance(dtype, (pl.Binary, pl.Object)):
+            return
+        for k in range(min(length, _MAX_ELEMENT_COLUMNS)):
+            columns[f"{label}[{k}]"] = column.arr.get(k)
+        columns[label] = column
+
     for name, dtype in frame.collect_schema().items():
-        columns |= _expand_nested_column(name.strip(), pl.col(name), dtype, frame)
+        add(name.strip(), pl.col(name), dtype)
     _strip_column_names(list(frame.collect_schema()))
     return _add_lower_case_names_if_canonical(columns)
 
@@ -235,33 +251,6 @@ def columns_of_frame(frame: pl.LazyFrame) -> dict[str, NDArray]:
 def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
     whole = frame.select(column.alias(name) for name, column in columns.items()).collect()
     return {series.name: _to_numpy(series) for series in whole.get_columns()}
-
-
-def _expand_nested_column(
-    label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame
-) -> dict[str, pl.Expr]:
-    import polars as pl
-
-    if isinstance(dtype, pl.Struct):
-        parts: dict[str, pl.Expr] = {}
-        for field in dtype.fields:
-            of_field = column.struct.field(field.name)
-            parts |= _expand_nested_column(f"{label}.{field.name}", of_field, field.dtype, frame)
-        return parts
-    if isinstance(dtype, pl.List):
-        lengths = frame.select(column.list.len().drop_nulls().unique()).collect().to_series()
-        if not dtype.inner.is_numeric() or len(lengths) != 1 or not lengths[0]:
-            return {}
-        column, length = column.list.to_array(lengths[0]), int(lengths[0])
-    elif isinstance(dtype, pl.Array):
-        if not (dtype.inner.is_numeric() or isinstance(dtype.inner, pl.Array)):
-            return {}
-        length = dtype.shape[0] if len(dtype.shape) == 1 else 0
-    else:
-        return {} if isinstance(dtype, (pl.Binary, pl.Object)) else {label: column}
-    length = min(length, _MAX_ELEMENT_COLUMNS)
-    elements = {f"{label}[{k}]": column.arr.get(k) for k in range(length)}
-    return {**elements, label: column}
 
 
 def _to_numpy(series: pl.Series) -> NDArray:
