@@ -91,8 +91,8 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
-    gravity = splines.gravity(t, gravity_W)
-    moved = moved.with_motion(*splines.motion(t, gravity_W), gravity=gravity)
+    *motion, gravity = splines.motion(t, gravity_W)
+    moved = moved.with_motion(*motion, gravity=gravity)
     stamps, margin = splines.poses.t, _EDGE_MARGIN_OVER_KNOT_SPACING * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]

@@ -346,12 +346,10 @@ class EpisodeSignals:
         log = self.log
         if self._splines is None or log.posed is None:
             assert log.gravity is not None and log.R_WS is not None
-            signals = (*log.motion, log.gravity, log.R_WS.reshape(-1, 9))
-            s, omega, alpha, gravity, R = (resample(t, log.t, x) for x in signals)
-            return Motion(s, omega, alpha, gravity, R.reshape(-1, 3, 3))
-        g = log.posed.gravity_W
+            signals = (*log.motion, log.gravity, log.R_WS)
+            return Motion(*(resample(t, log.t, x) for x in signals))
         R = rotation_matrices(self._splines.quaternion(t), "quaternion_wxyz")
-        return Motion(*self._splines.motion(t, g), self._splines.gravity(t, g), R)
+        return Motion(*self._splines.motion(t, log.posed.gravity_W), R)
 
     def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) `lag` frames after each frame."""

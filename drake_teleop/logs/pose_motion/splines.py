@@ -193,18 +193,10 @@ class PoseSplines:
         products = np.hstack([omega, omega[:, [0, 0, 1]]]) * np.hstack([omega, omega[:, [1, 2, 2]]])
         return np.hstack([np.ones((len(t), 1)), a, minus_g, alpha, products])
 
-    def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
-        """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""
+    def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
+        """Return specific force of Po, omega, alpha and gravity (N, 3) at times t, in P [SI]."""
         a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
-        return a + minus_g, omega, alpha
-
-    def gravity(self, t: Array, gravity_W: Array) -> Array:
-        """Return gravity (N, 3) at times t, in the axes of P [m/s^2]."""
-        out = np.empty((len(t), 3))
-        for part in _split_rows_into_blocks(len(t)):
-            q, g = self.quaternion(t[part]), np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _rotate_W_to_P(q, np.sum(q * q, axis=1, keepdims=True), g)
-        return out
+        return a + minus_g, omega, alpha, -minus_g
 
     def _acceleration_minus_gravity_omega_alpha(self, t: Array, gravity_W: Array) -> Array:
         out = np.empty((4, len(t), 3))
@@ -226,23 +218,21 @@ class PoseSplines:
         if self.imu_rows is not None:
             stds = np.sqrt(np.array(self.imu_rows.pose_noise_powers) * self.rate)
             return float(stds[0]), float(stds[1])
+        low, high = (share / self.spacing for share in _POSE_NOISE_BAND_OVER_KNOT_RATE)
         sums, count = np.zeros(2), 0
         for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
             measured = self.poses.quaternion[part]
             turn = 2.0 * _vector_part_of_relative_quaternion(fitted[:, 3:], measured)
-            powers = self._powers_in_noise_band(position), self._powers_in_noise_band(turn)
-            sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
+            residual, n = np.hstack([position, turn]), len(position)
+            frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
+            inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
+            powers = np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
+            sums += powers.reshape(2, 3, -1).sum(axis=(1, 2))
+            count += powers.size // 2
         position_std, rotation_std = np.sqrt(sums / count)
         return float(position_std), float(rotation_std)
-
-    def _powers_in_noise_band(self, residual: Array) -> Array:
-        n = len(residual)
-        frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
-        low, high = (share / self.spacing for share in _POSE_NOISE_BAND_OVER_KNOT_RATE)
-        inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
-        return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
 
 class SplineCache:

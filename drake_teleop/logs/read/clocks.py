@@ -42,9 +42,6 @@ class Clock:
     notes: tuple[str, ...] = ()
     num_episodes: int = 1
 
-    def select_timed_rows(self, x: Array) -> Array:
-        return x if len(self.kept_rows) == self.num_rows else x[self.kept_rows]
-
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
     """Return checked and corrected times of a stream's rows.

@@ -113,7 +113,7 @@ class _LogReader:
             self._replace_auto_fields(auto_frames.estimate_auto_imu_mounting)
         table = self._table_of_stream(stream)
         clock = self._read_clock_and_gaps("wrench", stream, table)
-        wrench = clock.select_timed_rows(self._read_wrench("wrench", stream, table, clock.num_rows))
+        wrench = self._read_wrench("wrench", stream, table, clock.num_rows)[clock.kept_rows]
         pose = imu = None
         if self.description.pose is not None:
             pose = self._read_pose(self.description.pose, differentiate=differentiate)
@@ -197,8 +197,7 @@ class _LogReader:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            position = self._read_vectors("pose.position", table, clock.num_rows)
-            position = clock.select_timed_rows(position)
+            position = self._read_vectors("pose.position", table, clock.num_rows)[clock.kept_rows]
         where, form = f"{self.source}:pose.orientation", stream.orientation
         orientations = OrientationColumns(self.description, form, table, clock.num_rows, where)
         quaternion = orientations.allocate_quaternions(len(clock.kept_rows))
@@ -226,7 +225,7 @@ class _LogReader:
             if getattr(stream, field) is None:
                 return None
             values = self._read_vectors(f"imu.{field}", table, clock.num_rows, sign)
-            values = resample(t, raw_t, clock.select_timed_rows(values))
+            values = resample(t, raw_t, values[clock.kept_rows])
             if stream.frame == "sensor":
                 return values
             if isinstance(stream.frame, tuple):
