@@ -76,8 +76,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
             f" {np.abs(even - t).max():.2g} s"
         )
         t = even
-    _check_rate_is_plausible(t, time, where)
-    _check_stamps_are_even(t, rows, table, where)
+    _check_steps(t, rows, time, table, where)
     return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
 
 
@@ -218,11 +217,22 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
         raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
 
 
-def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
+def _check_steps(t: Array, rows: NDArray[np.intp], time: Time, table: Table, where: str) -> None:
     if len(t) < 2:
         return
-    step = float(np.median(np.diff(t)))
+    steps = np.diff(t)
+    step = float(np.median(steps))
     if 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
+        if len(t) > 2 and t[-1] - t[0] > _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * step:
+            longest = int(np.argmax(steps))
+            row = table.line_in_file(rows[longest + 1])
+            raise DrakeTeleopError(
+                f"the time stamps are too uneven: median step {step:.3g} s, mean"
+                f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that),"
+                f" longest {steps[longest]:.3g} s to row {row} of {table.path.name}",
+                where=where,
+                remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",
+            )
         return
     counts = step / SI_VALUE_OF_UNIT[time.unit]
     # Typical sensor rates are 20 Hz to 10 kHz.
@@ -235,18 +245,3 @@ def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
         f" {1 / MIN_RATE_HZ:g} s are plausible), a rate of {1 / step:.3g} Hz"
     )
     raise DrakeTeleopError(what, where=f"{where}.unit", remedy=remedy)
-
-
-def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
-    steps = np.diff(t)
-    if len(t) < 3 or t[-1] - t[0] <= _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * np.median(steps):
-        return
-    longest = int(np.argmax(steps))
-    row = table.line_in_file(rows[longest + 1])
-    raise DrakeTeleopError(
-        f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
-        f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that), longest"
-        f" {steps[longest]:.3g} s to row {row} of {table.path.name}",
-        where=where,
-        remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",
-    )
