@@ -55,9 +55,8 @@ class SharedLoad:
 
 def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """Return the load that most episodes of a dataset share, or the given load."""
-    episodes = [
-        _Episode(signals, fit_own_load_of_episode(signals)) for signals in map(EpisodeSignals, logs)
-    ]
+    signals = map(EpisodeSignals, logs)
+    episodes = [_Episode(x, fit_own_load_of_episode(x)) for x in signals]
     if load is None:
         candidates = [x.own.phi for x in episodes if x.own.phi is not None and x.own.phi[0] > 0.0]
         if not candidates:
@@ -81,10 +80,12 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     steps = float(np.median([x.lag for x, _ in usual])) * LAG_STEPS_PER_FRAME
     lag = round(steps) / LAG_STEPS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
-    free = [
-        _contact_free_samples(episode.signals, x.lag, residual - x.offsets, typical)
-        for episode, (x, residual) in zip(chosen, usual, strict=True)
-    ]
+    limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.HALF_WIDTH_OF_NORMAL, []
+    for episode, (x, residual) in zip(chosen, usual, strict=True):
+        contact = residual - x.offsets
+        frames_from_touch = samples_to_nearest_flag((np.abs(contact) > limit).any(axis=1))
+        samples = samples_for_detector(episode.signals, x.lag, contact)
+        free.append(samples.select_rows(frames_from_touch > _CONTACT_MARGIN_FRAMES))
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
     floor = detection.fit_noise_floor(*pooled, covariance, fade=0.0)
@@ -169,15 +170,6 @@ def _fit_load(episodes: Sequence[_Episode], phi: Array) -> Identification:
         method="least squares of the calm frames of a dataset",
         samples=samples,
     )
-
-
-def _contact_free_samples(
-    signals: EpisodeSignals, lag: float, contact: Array, typical: Array
-) -> DetectorSamples:
-    limit = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.HALF_WIDTH_OF_NORMAL
-    far = np.asarray((np.abs(contact) > limit).any(axis=1))
-    free = samples_to_nearest_flag(far) > _CONTACT_MARGIN_FRAMES
-    return samples_for_detector(signals, lag, contact).select_rows(free)
 
 
 def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:
