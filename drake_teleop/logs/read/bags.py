@@ -35,10 +35,10 @@ _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
 _CUT_REMEDY = "cut it, or write the topics one by one"
-_VECTOR_NAMES = ("force", "torque", "linear_acceleration", "angular_velocity")
-_VECTOR_NAMES += ("orientation", "position")
-_VECTOR_OF_MESSAGE_FIELD = {name: name for name in _VECTOR_NAMES}
-_VECTOR_OF_MESSAGE_FIELD |= {"rotation": "orientation", "translation": "position"}
+_VECTOR_OF_MESSAGE_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
+_VECTOR_OF_MESSAGE_FIELD |= dict.fromkeys(("position", "translation"), "position")
+for _name in ("force", "torque", "linear_acceleration", "angular_velocity"):
+    _VECTOR_OF_MESSAGE_FIELD[_name] = _name
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),

@@ -204,10 +204,10 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
     rows = frame.select(pl.len()).collect().item()
     if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
 
-        def read(name: str) -> NDArray:
+        def read_column(name: str) -> NDArray:
             return _to_numpy(frame.select(columns[name].alias("x")).collect().to_series())
 
-        return ColumnsOnAccess(columns, read)  # to limit memory
+        return ColumnsOnAccess(columns, read_column)  # to limit memory
     return _collect_columns(frame, columns)
 
 
