@@ -81,7 +81,7 @@ def _fit_sensor_model(
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
     used = frequency <= _COMPARED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
-    noise: Array = pose_noise_power * (2.0 * np.pi * frequency[used]) ** (4 - 2 * which)
+    noise: NDArray[np.floating] = pose_noise_power * (2.0 * np.pi * frequency[used]) ** (4 - 2 * which)
     energy = float(np.sum(taper**2)) / dt
 
     def tapered_spectrum(x: Array) -> ComplexArray:
