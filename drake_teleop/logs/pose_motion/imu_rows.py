@@ -81,7 +81,8 @@ def _fit_sensor_model(
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
     used = frequency <= _COMPARED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
-    noise: NDArray[np.floating] = pose_noise_power * (2.0 * np.pi * frequency[used]) ** (4 - 2 * which)
+    omega: NDArray[np.floating] = 2.0 * np.pi * frequency[used]
+    noise = pose_noise_power * omega ** (4 - 2 * which)
     energy = float(np.sum(taper**2)) / dt
 
     def tapered_spectrum(x: Array) -> ComplexArray:

@@ -242,17 +242,17 @@ class _LogReader:
             alpha = alignment.smooth_derivatives(omega, dt, self.bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            omega_S, alpha_S = omega, alpha
+            turning: list[Any] = [omega, alpha]
             if omega is None:
-                assert pose is not None and pose.angular_velocity is not None
-                omega_S = resample(t, pose.t, pose.angular_velocity)
-                alpha_S = resample(t, pose.t, pose.angular_acceleration)
-            p = np.array(stream.position)  # the specific force moves from Io to So
-            s = s - np.cross(alpha_S, p) - np.cross(omega_S, np.cross(omega_S, p))
+                assert pose is not None
+                both = pose.angular_velocity, pose.angular_acceleration
+                turning = [resample(t, pose.t, x) for x in both if x is not None]
+            p, (omega_S, alpha_S) = np.array(stream.position), turning
+            s = s - np.cross(alpha_S, p) - np.cross(omega_S, np.cross(omega_S, p))  # Io to So
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
         outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
-        both = (None if x is None else x[outside_gaps] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
+        signals = (None if x is None else x[outside_gaps] for x in (s, omega))
+        return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *signals))
 
     def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
