@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias, TypeVar
 
@@ -136,6 +136,14 @@ def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
 
 
+def samples_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
+    """Return the number (N,) of samples to the nearest set flag; inf without any."""
+    at = np.arange(len(flags), dtype=float)
+    before = np.maximum.accumulate(np.where(flags, at, -np.inf))
+    after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
+    return np.minimum(at - before, after - at)
+
+
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
     times = np.asarray(t, float)
     runs = find_runs_of_true(np.asarray(contact, bool))
@@ -159,3 +167,17 @@ def position_of_parabola_minimum(left: float, middle: float, right: float) -> fl
     """
     bend = left - 2.0 * middle + right
     return float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
+
+
+def search_minimum(cost: Callable[[float], float], step: float, reach: float) -> tuple[float, bool]:
+    """Return the argument of the least cost, on a grid of +-`reach` refined by a parabola.
+
+    The flag is False if the least cost is at an end of the grid.
+    """
+    at = step * np.arange(-round(reach / step), round(reach / step) + 1)
+    costs = np.array([cost(x) for x in at])
+    best = int(np.argmin(costs))
+    if best in (0, len(at) - 1):
+        return float(at[best]), False
+    share = position_of_parabola_minimum(*costs[best - 1 : best + 2])
+    return float(at[best]) + step * share, True

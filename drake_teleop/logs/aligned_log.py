@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, narrowest_half_width_and_centre, one_blas_thread
+from drake_teleop.common.numeric import (
+    Array,
+    narrowest_half_width_and_centre,
+    one_blas_thread,
+    samples_to_nearest_flag,
+)
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.compensation import contact_wrench
@@ -70,7 +75,8 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
-    moved = moved.with_motion(*splines.motion(t, gravity_W), gravity=splines.gravity(t, gravity_W))
+    *motion, gravity = splines.motion(t, gravity_W)
+    moved = moved.with_motion(*motion, gravity=gravity)
     stamps, margin = splines.poses.t, _EDGE_MARGIN_OVER_KNOT_SPACING * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
@@ -243,7 +249,9 @@ def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
         stop = start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
-    bridged = None if log.bridged is None else alignment.widen_flags(log.bridged, stride)[::stride]
+    bridged = None
+    if log.bridged is not None:
+        bridged = samples_to_nearest_flag(log.bridged)[::stride] <= stride
     return replace(few, wrench=wrench, bridged=bridged)
 
 

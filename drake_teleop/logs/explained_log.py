@@ -225,7 +225,7 @@ def _block_means_of_splines(log: Log, found: PoseEstimate, late: float) -> Block
         q = splines.quaternion(t + late)
         q /= np.linalg.norm(q, axis=1, keepdims=True)
         p = splines.position(t + late) - middle
-        return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
+        return *splines.motion(t + late, gravity)[:3], rotation_matrices(q, "quaternion_wxyz"), p
 
     stamps, margin = splines.poses.t, _SPLINE_END_MARGIN_OVER_KNOT_SPACING * splines.spacing
     at = log.t + late

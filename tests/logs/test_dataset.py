@@ -145,7 +145,7 @@ def test_any_large_rotation_of_the_wrench_is_found(
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x))
     found, _ = find_simplest_hypothesis_and_residual(signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD)
-    assert np.degrees(Rotation.from_matrix(found.force_axes @ R.T).magnitude()) < 3.0
+    assert np.degrees(Rotation.from_matrix(found.axes[0] @ R.T).magnitude()) < 3.0
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

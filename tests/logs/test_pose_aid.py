@@ -16,11 +16,11 @@ from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.imu_rows import _fit_sensor_parameters, correct_imu_data
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.spectra import (
+    FitWindow,
+    Spectra,
     WrenchGrid,
     end_taper,
-    make_frequency_bands,
     noise_moments,
-    signal_spectrum,
 )
 from drake_teleop.logs.pose_motion.splines import (
     SPLINE_DEGREE,
@@ -106,7 +106,8 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
     exact = poses_of(replace(ROUGH, place=0.0, turn=0.0))[2]
     t = np.arange(0.0, SECONDS, 0.01)
     grid, taper = WrenchGrid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
-    bands = make_frequency_bands(grid, taper, 6.0)
+    window = FitWindow(grid, taper, GRAVITY_W, 6.0)
+    bands = window.bands
     clean = PoseSplines(exact, 0.05).signals(t, GRAVITY_W)
     sums, said = np.zeros(2), np.zeros(2)
     for seed in range(6):
@@ -119,10 +120,9 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
         assert aid is not None
         splines = SplineCache(noisy, aid).splines_with_spacing(0.05)
         error = splines.signals(t, GRAVITY_W) - clean
-        power = bands.sums_over_bands(
-            np.abs(signal_spectrum(grid, taper, error, len(bands.frequency))) ** 2
-        )
-        Q = noise_moments(splines, grid, taper, clean, bands, splines.estimate_pose_noise())
+        power = bands.sums_over_bands(np.abs(window.signal_spectrum(error)) ** 2)
+        spectra = Spectra(window, window.signal_spectrum(clean), 0.0, clean)
+        Q = noise_moments(splines, spectra, splines.estimate_pose_noise())
         fast = bands.sums_over_bands(bands.frequency) / bands.half_dof_of_bands > 2.0
         for k, where in enumerate((slice(1, 4), slice(7, 10))):
             sums[k] += power[fast, where].sum()

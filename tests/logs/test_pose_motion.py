@@ -36,13 +36,15 @@ from drake_teleop.logs.pose_motion.estimate import (
     estimate_from_poses,
 )
 from drake_teleop.logs.pose_motion.linear_model import (
-    FitWindow,
+    NOTHING_REJECTED_NOTE,
+    _costs_at_delays,
     find_best_delay_and_cost,
+    find_disturbances,
+    fit_coefficients,
     fit_linear_model,
     fit_noise_levels,
 )
 from drake_teleop.logs.pose_motion.poses import Poses
-from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED_NOTE, find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     RigidParameters,
     UnitsAndAxes,
@@ -57,13 +59,13 @@ from drake_teleop.logs.pose_motion.rigid import (
 )
 from drake_teleop.logs.pose_motion.spectra import (
     SIGNAL_RATE_COLUMNS,
+    FitWindow,
     NoiseLevels,
+    Spectra,
     WrenchGrid,
     end_taper,
-    make_frequency_bands,
     noise_moments,
     second_moments,
-    signal_spectrum,
 )
 from drake_teleop.logs.pose_motion.spectra import exclude_from_taper as exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import (
@@ -179,11 +181,12 @@ def test_noise_moments_predict_the_effect_of_noise():
     t, wrench, clean = record(kind)
     grid = WrenchGrid.from_samples(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    bands = make_frequency_bands(grid, taper, 8.0)
-    splines = PoseSplines(clean.with_continuous_quaternions(), 0.07)
-    zeta = splines.signals(grid.t, GRAVITY_W)
+    window = FitWindow(grid, taper, GRAVITY_W, 8.0)
+    splines, bands = PoseSplines(clean.with_continuous_quaternions(), 0.07), window.bands
+    spectra = window.spectra_at_delay(splines, 0.0)
+    zeta = spectra.motion_signals
     place, turn = 2e-4, 5e-4
-    Q = noise_moments(splines, grid, taper, zeta, bands, (place, turn))
+    Q = noise_moments(splines, spectra, (place, turn))
     sums = np.zeros_like(Q)
     none, rates = np.zeros((len(bands.frequency), 6)), 2j * np.pi * bands.frequency[:, None]
     for seed in range(12):
@@ -194,8 +197,8 @@ def test_noise_moments_predict_the_effect_of_noise():
             clean.t, clean.position + place * noise[:, :3], quaternions(R)
         ).with_continuous_quaternions()
         error = PoseSplines(noisy, 0.07).signals(grid.t, GRAVITY_W) - zeta
-        spectrum = signal_spectrum(grid, taper, error, len(bands.frequency))
-        sums += second_moments(spectrum, none, bands, rates * spectrum) / 12
+        spectrum = window.signal_spectrum(error)
+        sums += second_moments(bands, spectrum, none, rates * spectrum) / 12
     # Below 2 Hz the motion modulates additional noise from higher frequencies.
     whole = NoiseLevels.white_within_groups(bands).sums_over_groups
     well = whole(bands.sums_over_bands(bands.frequency)) / whole(bands.half_dof_of_bands) > 2.0
@@ -292,17 +295,16 @@ def test_noise_of_poses_does_not_bias_the_load():
     )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     spectra = FitWindow(grid, taper, GRAVITY_W, 12.0).spectra_at_delay(splines, LATE)
-    zeta = splines.signals(grid.t + LATE, GRAVITY_W)
-    Q = noise_moments(splines, grid, taper, zeta, spectra.bands, splines.estimate_pose_noise())
+    Q = noise_moments(splines, spectra, splines.estimate_pose_noise())
     free, start = np.arange(23) < 17, RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     inertias = []
     for noise in (Q, np.zeros_like(Q)):
         record_ = _RigidFitData(
-            spectra.second_moments(),
+            spectra.second_moments_with_rates(),
             noise,
-            NoiseLevels.white_within_groups(spectra.bands),
+            NoiseLevels.white_within_groups(spectra.window.bands),
             free,
-            spectra.fit_coefficients().noise_power,
+            fit_coefficients(spectra).noise_power,
         )
         inertias.append(
             _solve_rigid_fit(record_, start).parameters.theta[[10, 13]] / PHI[[4, 7]] - 1.0
@@ -363,10 +365,14 @@ def test_fixed_taper_keeps_its_place_when_the_delay_changes():
     size = np.abs(spectra.signals).max(axis=0)
     np.testing.assert_allclose(moved.signals / size, there.signals / size, atol=1e-3)
     rates = (slight.signals - spectra.signals) / 1e-5
-    expected = second_moments(spectra.signals, spectra.wrench, spectra.bands, rates)
+    expected = second_moments(
+        spectra.window.bands, spectra.signals, spectra.window.wrench_spectrum, rates
+    )
     scale = np.sqrt(np.einsum("bii,bjj->bij", expected, expected))
     scale[:, 22], scale[:, :, 22] = np.inf, np.inf  # the constant has zero derivative
-    np.testing.assert_allclose(spectra.second_moments() / scale, expected / scale, atol=2e-3)
+    np.testing.assert_allclose(
+        spectra.second_moments_with_rates() / scale, expected / scale, atol=2e-3
+    )
 
 
 def test_weights_recover_from_a_poor_start():
@@ -378,16 +384,15 @@ def test_weights_recover_from_a_poor_start():
     )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
-    zeta = splines.signals(grid.t + LATE, GRAVITY_W)
-    Q = noise_moments(splines, grid, taper, zeta, spectra.bands, splines.estimate_pose_noise())
+    Q = noise_moments(splines, spectra, splines.estimate_pose_noise())
     start = RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     fit = fit_rigid(
-        spectra.second_moments(),
+        spectra.second_moments_with_rates(),
         Q,
-        NoiseLevels.white_within_groups(spectra.bands),
+        NoiseLevels.white_within_groups(spectra.window.bands),
         start,
         np.arange(23) < 17,
-        spectra.fit_coefficients(),
+        fit_coefficients(spectra),
     )
     assert fit.is_rigid
     assert np.abs(fit.parameters.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
@@ -405,7 +410,7 @@ def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> UnitsAnd
     )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     return estimate_units_and_axes(
-        FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE).fit_coefficients()
+        fit_coefficients(FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE))
     )
 
 
@@ -434,7 +439,7 @@ def test_planar_gravity_determines_the_unit_but_not_the_axes():
         end_taper(t[::2], 0.3, SECONDS - 0.3),
     )
     seen = estimate_units_and_axes(
-        FitWindow(grid, taper, DOWN, 20.0).spectra_at_delay(splines, LATE).fit_coefficients()
+        fit_coefficients(FitWindow(grid, taper, DOWN, 20.0).spectra_at_delay(splines, LATE))
     )
     assert not seen.is_usable
     assert seen.position_unit_ratio == pytest.approx(1.0, abs=0.02)
@@ -472,12 +477,12 @@ def test_gain_effects_predict_the_change_of_the_estimate():
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
     Z, levels, free = (
-        spectra.second_moments(),
-        NoiseLevels.white_within_groups(spectra.bands),
+        spectra.second_moments_with_rates(),
+        NoiseLevels.white_within_groups(spectra.window.bands),
         np.ones(23, bool),
     )
     none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
-    power = spectra.fit_coefficients().noise_power
+    power = fit_coefficients(spectra).noise_power
     solution = _solve_rigid_fit(_RigidFitData(Z, none, levels, free, power), start)
     effects = _parameter_errors_of_unit_gains(solution, Z).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
@@ -500,12 +505,15 @@ def test_wandering_channels_are_found_and_get_less_weight():
     grid, taper = WrenchGrid.from_samples(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
     splines = PoseSplines(poses.with_continuous_quaternions(), 0.1)
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
-    levels = fit_noise_levels(spectra.second_moments(), spectra.bands)
-    at = spectra.bands.sums_over_bands(spectra.bands.frequency) / spectra.bands.half_dof_of_bands
+    levels = fit_noise_levels(spectra.second_moments_with_rates(), spectra.window.bands)
+    at = (
+        spectra.window.bands.sums_over_bands(spectra.window.bands.frequency)
+        / spectra.window.bands.half_dof_of_bands
+    )
     corner = np.sqrt(levels.relative_power - 1.0)[5] * at[5]
     assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
     np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
-    power = fit_linear_model(spectra.second_moments(), levels).noise_power
+    power = fit_linear_model(spectra.second_moments_with_rates(), levels).noise_power
     assert (power[0, 2:4] > 30.0 * power[-1, 2:4]).all()
     assert (np.diff(power[levels.group_of_band == 0, 2]) < 0.0).all()
 
@@ -564,10 +572,10 @@ def test_costs_of_many_delays_equal_single_costs(chopped):
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(
         PoseSplines(poses.with_continuous_quaternions(), 0.07), -0.02
     )
-    assert spectra.is_taper_fixed is chopped
+    assert spectra.window.is_taper_fixed is chopped
     delays = np.array([-0.05, -0.02, LATE])
-    alone = [spectra.with_delay(delay).fit_coefficients().cost for delay in delays]
-    np.testing.assert_allclose(spectra.costs_at_delays(delays), alone, rtol=1e-9)
+    alone = [fit_coefficients(spectra.with_delay(delay)).cost for delay in delays]
+    np.testing.assert_allclose(_costs_at_delays(spectra, delays), alone, rtol=1e-9)
 
 
 def test_exclude_sets_the_taper_to_zero_with_edges():
@@ -602,13 +610,8 @@ def test_residual_only_where_the_load_moves_rejects_nothing(known, moving, push)
     wrench = signals(t + late) @ C.T + 0.02 * rng.normal(size=(len(t), 6))
     wrench[(t > 5.0) & (t < 6.0)] += push
     grid = WrenchGrid(t, wrench, 1, C if known else None)
-    spectra = SimpleNamespace(
-        bands=SimpleNamespace(frequency=grid.frequency),
-        grid=grid,
-        taper=np.ones(len(t)),
-        signals=np.fft.rfft(signals(t), grid.transform_length, axis=0),
-        wrench=np.fft.rfft(wrench, grid.transform_length, axis=0),
-    )
+    window = FitWindow(grid, np.ones(len(t)), GRAVITY_W, np.inf)
+    spectra = Spectra(window, window.signal_spectrum(signals(t)), 0.0, signals(t))
     rejected, note = find_disturbances(spectra, 0.05)
     assert note == (NOTHING_REJECTED_NOTE if late else "")
     assert rejected[(t > 5.0) & (t < 6.0)].all() == bool(push)

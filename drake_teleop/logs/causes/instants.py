@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from drake_teleop.common.numeric import Array, position_of_parabola_minimum
+from drake_teleop.common.numeric import Array, search_minimum
 
 MAX_NOISE_LAG = 4  # order of the autoregressive noise
 CONSTANT_COLUMN, SPECIFIC_FORCE_SIGNALS, GRAVITY_SIGNALS = 0, slice(1, 4), slice(4, 7)
@@ -231,11 +231,5 @@ def delay_of_free_fit(data: BlockMeans) -> float:
         left = total - ((x.T @ forces) * found).sum(axis=0)
         return float(np.log(np.maximum(left, 1e-12 * total + 1e-30)).sum())
 
-    steps = round(reach / _DELAY_STEP_S)
-    shifts = np.arange(-steps, steps + 1) * _DELAY_STEP_S
-    costs = np.array([log_residual(x) for x in shifts])
-    best = int(np.argmin(costs))
-    if best in (0, len(shifts) - 1):
-        return 0.0
-    share = position_of_parabola_minimum(*costs[best - 1 : best + 2])
-    return float(shifts[best] + _DELAY_STEP_S * share)
+    delay, is_inside = search_minimum(log_residual, _DELAY_STEP_S, reach)
+    return delay if is_inside else 0.0

@@ -20,30 +20,20 @@ from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import replace_file_on_success
 from drake_teleop.common.html import render_page
-from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread, samples_to_nearest_flag
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.texts import read_yaml, to_yaml_text
 from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
-from drake_teleop.logs.dataset import dataset_files, episode_verdict
+from drake_teleop.logs.dataset import dataset_files, episode_verdict, shared_load
 from drake_teleop.logs.dataset.dataset_files import ContactColumns, Dataset, Episode
 from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturation_faults
-from drake_teleop.logs.dataset.episode_verdict import (
-    EpisodeSignals,
-    WrenchHypothesis,
-    find_simplest_hypothesis_and_residual,
-    ln_half_width_and_centre_of_calm_half,
-)
-from drake_teleop.logs.dataset.shared_load import (
-    SharedLoad,
-    find_shared_load,
-    fit_own_load_of_episode,
-    samples_for_detector,
-)
+from drake_teleop.logs.dataset.episode_verdict import EpisodeSignals, WrenchHypothesis
+from drake_teleop.logs.dataset.shared_load import SharedLoad
 from drake_teleop.logs.figures import summarize_load
-from drake_teleop.logs.read.alignment import resample, widen_flags
+from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
@@ -60,8 +50,6 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class SharedJudgingData(NamedTuple):
-    """Data that the verdicts of all episodes share."""
-
     dataset: Dataset
     streams: dict[str, Any]
     shared_load: SharedLoad
@@ -170,7 +158,7 @@ def _choose_quaternion_order_and_wrench_sign(
         for episode in episodes:
             with suppress(DrakeTeleopError):
                 log, _ = _read_log_and_row_times(dataset, tried, episode)
-                loads.append(fit_own_load_of_episode(EpisodeSignals(log)))
+                loads.append(shared_load.fit_own_load_of_episode(EpisodeSignals(log)))
         if loads:
             spread = float(np.median([x.spread.sum() for x in loads]))
             mass = float(np.median([x.phi[0] for x in loads if x.phi is not None]))
@@ -263,7 +251,7 @@ def _estimate_shared_load(
         progress(0.5 * (k + 1) * step / len(dataset.episodes))
     if not logs:
         raise errors[0]
-    shared = find_shared_load(logs, known)
+    shared = shared_load.find_shared_load(logs, known)
     progress(1.0)
     return shared
 
@@ -304,7 +292,9 @@ def _verdict_on_episode(
     usual_lag = shared.lag_frames
     log, at = _read_log_and_row_times(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
-    found, residual = find_simplest_hypothesis_and_residual(signals, shared.phi, usual_lag, usual)
+    found, residual = episode_verdict.find_simplest_hypothesis_and_residual(
+        signals, shared.phi, usual_lag, usual
+    )
     faults = saturation_faults(log.wrench)
     faults += name_faults(found, usual_lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
@@ -315,9 +305,10 @@ def _verdict_on_episode(
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
-    spread = ln_half_width_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0]
+    calm = residual - offsets
+    spread, _ = episode_verdict.ln_half_width_and_centre_of_calm_half(calm, 0.1 * usual)
     spread -= np.log(usual)
-    spread -= np.log(found.force_torque_gains).repeat(3)
+    spread -= np.log(found.gains).repeat(3)
     if not faults and spread.mean() > _MAX_LN_SPREAD_OVER_USUAL:
         text = (
             "no single fault explains the wrench: it is in contact most of the time, or the load"
@@ -349,8 +340,8 @@ def _contact_wrench_and_flags(
     for _ in range(3):
         contact = found.wrench_of_reading(residual)
         detector = ContactDetector(shared.noise_floor, shared.threshold, statistic="level", hold=1)
-        touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
-        free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
+        touched = detector.detect(*shared_load.samples_for_detector(signals, found.lag, contact))
+        free = samples_to_nearest_flag(touched) > _CONTACT_MARGIN_FRAMES
         if free.sum() < _MIN_FREE_FRAMES_FOR_OFFSETS:
             break
         residual = residual - residual[free].mean(axis=0)

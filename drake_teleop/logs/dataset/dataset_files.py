@@ -24,7 +24,6 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
-from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN = "observation.contact_wrench", "observation.in_contact"
@@ -71,7 +70,7 @@ class Dataset(NamedTuple):
                 return Table(episode.file, table_files.array_columns(arrays, None))
             frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first_row, episode.rows)
-            return Table(episode.file, table_files.numeric_and_nested_columns(part))
+            return Table(episode.file, table_files.columns_of_frame(part))
 
 
 @lru_cache(maxsize=1)
@@ -80,7 +79,9 @@ def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
     import polars as pl
 
     frame = pl.scan_parquet(file)
-    return frame.select(table_files.numeric_or_nested_column_names(frame)).collect().lazy()
+    types, nested = frame.collect_schema(), (pl.List, pl.Array)
+    names = [name for name, x in types.items() if x.is_numeric() or isinstance(x, nested)]
+    return frame.select(names).collect().lazy()
 
 
 def open_dataset(path: Path) -> Dataset:
@@ -210,7 +211,7 @@ def _add_features_to_metadata(text: str) -> str:
 
 
 def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
-    frame, first = read_csv(path, True)
+    frame, first = table_files.read_csv(path, True)
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
     head = first - 2

@@ -20,8 +20,6 @@ _MIN_WRENCH_ROTATION_DEG, _MIN_UNUSUAL_LAG_FRAMES, _MIN_SATURATED_FRAMES = 4.0, 
 
 
 class EpisodeFault(NamedTuple):
-    """Named fault with its description and figures."""
-
     name: str
     message: str
     value: Any
@@ -44,11 +42,10 @@ def name_faults(
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(EpisodeFault("weight removed", text, None))
-    same = np.allclose(x.force_axes, x.torque_axes)
-    found += _rotation_faults(x.force_axes, "the wrench" if same else "the force")
-    if not same:
-        found += _rotation_faults(x.torque_axes, "the torque")
-    found += _unit_faults(x.force_torque_gains)
+    same = np.allclose(*x.axes)
+    found += _rotation_faults(x.axes[0], "the wrench" if same else "the force")
+    found += [] if same else _rotation_faults(x.axes[1], "the torque")
+    found += _unit_faults(x.gains)
     late = x.lag - usual_lag
     if abs(late) >= _MIN_UNUSUAL_LAG_FRAMES:
         side = "behind" if late > 0 else "ahead of"

@@ -8,7 +8,7 @@ the frames, so that contact has no influence.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -48,8 +48,8 @@ class WrenchHypothesis:
     Attributes:
         kind: one of `HYPOTHESIS_KINDS`.
         lag: delay of the motion behind the wrench [frames].
-        force_axes, torque_axes: (3, 3) rotation or mirroring of the load's force and torque.
-        force_torque_gains: (2,) factors of force and torque.
+        axes: rotations or mirrorings (3, 3) of the load's force and torque.
+        gains: (2,) factors of force and torque.
         phi: (10,) of another load; None for the known one.
         spread: (6,) logarithms of the half widths of the residual.
         offsets: (6,) sensor offsets [N, N m].
@@ -58,9 +58,8 @@ class WrenchHypothesis:
 
     kind: str
     lag: float
-    force_axes: Array
-    torque_axes: Array
-    force_torque_gains: Array
+    axes: tuple[Array, Array]
+    gains: Array
     phi: Array | None = None
     spread: Array = field(default_factory=lambda: np.zeros(6))
     offsets: Array = field(default_factory=lambda: np.zeros(6))
@@ -68,18 +67,17 @@ class WrenchHypothesis:
 
     def reading_of_load(self, load_wrench: Array) -> Array:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
-        f, tau = load_wrench[:, :3], load_wrench[:, 3:]
-        f_gain, tau_gain = self.force_torque_gains
-        return np.hstack([f_gain * f @ self.force_axes.T, tau_gain * tau @ self.torque_axes.T])
+        parts = zip(_FORCE_AND_TORQUE_CHANNELS, self.axes, self.gains, strict=True)
+        return np.hstack([gain * load_wrench[:, c] @ M.T for c, M, gain in parts])
 
     def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
-        f, tau = wrench[:, :3] @ self.force_axes, wrench[:, 3:] @ self.torque_axes
-        return np.hstack([f / self.force_torque_gains[0], tau / self.force_torque_gains[1]])
+        parts = zip(_FORCE_AND_TORQUE_CHANNELS, self.axes, self.gains, strict=True)
+        return np.hstack([wrench[:, c] @ M / gain for c, M, gain in parts])
 
 
 def hypothesis_without_fault(lag: float) -> WrenchHypothesis:
-    return WrenchHypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
+    return WrenchHypothesis("sensor", lag, (np.eye(3), np.eye(3)), np.ones(2))
 
 
 def ln_half_width_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
@@ -142,20 +140,16 @@ class HypothesisSearch:
     def hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
         both, one, eye = self.predict(kind, lag), np.ones(2), np.eye(3)
         force, torque = (self.best_permutation(*both, c) for c in _FORCE_AND_TORQUE_CHANNELS)
-        plain = WrenchHypothesis(kind, lag, eye, eye, one)
-        yield self.with_spread_and_cost(plain)
-        yield self.with_spread_and_cost(replace(plain, force_axes=-eye, torque_axes=-eye))
-        for M, T in ((force, force), (torque, torque), (force, torque)):
-            yield self.with_spread_and_cost(replace(plain, force_axes=M, torque_axes=T))
+        plain = replace(hypothesis_without_fault(lag), kind=kind)
+        axes = ((eye, eye), (-eye, -eye), (force, force), (torque, torque), (force, torque))
+        yield from (self.with_spread_and_cost(replace(plain, axes=x)) for x in axes)
         for det in (1.0, -1.0):
             start = self.refit_best_rows(plain, det=det, scale=True)
             yield start
-            yield self.refit_best_rows(replace(start, force_torque_gains=one), det=det, scale=False)
-            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force_axes).sum()))
+            yield self.refit_best_rows(replace(start, gains=one), det=det, scale=False)
+            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.axes[0]).sum()))
             for M in (eye, -eye, nearest):
-                yield self.refit_best_rows(
-                    replace(start, force_axes=M, torque_axes=M), det=0.0, scale=True
-                )
+                yield self.refit_best_rows(replace(start, axes=(M, M)), det=0.0, scale=True)
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
         """Return the signed permutation (3, 3) with which p fits three channels of w best."""
@@ -170,90 +164,83 @@ class HypothesisSearch:
         ]
         return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
 
-    def row_flags_for_first_fits(self) -> Iterator[NDArray[np.bool_]]:
-        """Yield flags (N,) of frames for a first fit: all, then each quarter of the episode."""
+    def _best_fit(self, fit: Callable[[NDArray[np.bool_]], WrenchHypothesis]) -> WrenchHypothesis:
+        """Return the best fit that starts from all frames or one quarter, given by flags (N,)."""
         at = np.arange(self.frames) * _NUM_START_FIT_PARTS // self.frames
-        yield at >= 0
-        for part in range(_NUM_START_FIT_PARTS):
-            yield at == part
+        quarters = (at == part for part in range(_NUM_START_FIT_PARTS))
+        return min(map(fit, [at >= 0, *quarters]), key=lambda x: x.cost)
 
     def refit_best_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
         """Return the hypothesis with rotation and factors fitted to the frames that fit best.
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
         """
-        found = [self._fit_to_rows(x, rows, det, scale) for rows in self.row_flags_for_first_fits()]
-        return min(found, key=lambda x: x.cost)
-
-    def _fit_to_rows(
-        self, x: WrenchHypothesis, rows: NDArray[np.bool_], det: float, scale: bool
-    ) -> WrenchHypothesis:
         both = self.predict(x.kind, x.lag)
-        for _ in range(_NUM_REFITS):
-            w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
-            if scale:
-                ratio = [
-                    np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
-                    for c in _FORCE_AND_TORQUE_CHANNELS
-                ]
-                x = replace(x, force_torque_gains=np.maximum(ratio, 1e-9))
-            if det:
-                M = _fit_rotation(w, q, x.force_torque_gains, det)
-                x = replace(x, force_axes=M, torque_axes=M)
-            if scale:
-                x = replace(x, force_torque_gains=_fit_gains(w, q, x))
-            x = self.with_spread_and_cost(x)
-            rows = self._best_rows_of(x)
-        return x
+
+        def fit(rows: NDArray[np.bool_]) -> WrenchHypothesis:
+            found = x
+            for _ in range(_NUM_REFITS):
+                w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
+                if scale:
+                    ratio = [
+                        np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
+                        for c in _FORCE_AND_TORQUE_CHANNELS
+                    ]
+                    found = replace(found, gains=np.maximum(ratio, 1e-9))
+                if det:
+                    M = _fit_rotation(w, q, found.gains, det)
+                    found = replace(found, axes=(M, M))
+                if scale:
+                    found = replace(found, gains=_fit_gains(w, q, found))
+                found = self.with_spread_and_cost(found)
+                rows = self._best_rows_of(found)
+            return found
+
+        return self._best_fit(fit)
 
     def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        first_fits = self.row_flags_for_first_fits()
-        found = (self._fit_other_load(wrench, V, lag, rows) for rows in first_fits)
-        return min(found, key=lambda x: x.cost)
+        first_weights = np.exp(-ln_half_width_and_centre_of_calm_half(wrench, self.floor)[0])
 
-    def _fit_other_load(
-        self, wrench: Array, V: Array, lag: float, rows: NDArray[np.bool_]
-    ) -> WrenchHypothesis:
-        x = hypothesis_without_fault(lag)
-        weights = np.exp(-ln_half_width_and_centre_of_calm_half(wrench, self.floor)[0])
-        for _ in range(_NUM_REFITS):
-            w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
-            A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
-            size = np.linalg.norm(A, axis=0) + 1e-12
-            phi = np.linalg.lstsq(A / size, w, rcond=1e-3)[0] / size
-            x = self.with_spread_and_cost(replace(x, phi=phi))
-            rows, weights = self._best_rows_of(x), np.exp(-x.spread)
-        return x
+        def fit(rows: NDArray[np.bool_]) -> WrenchHypothesis:
+            x, weights = hypothesis_without_fault(lag), first_weights
+            for _ in range(_NUM_REFITS):
+                w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
+                A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
+                size = np.linalg.norm(A, axis=0) + 1e-12
+                phi = np.linalg.lstsq(A / size, w, rcond=1e-3)[0] / size
+                x = self.with_spread_and_cost(replace(x, phi=phi))
+                rows, weights = self._best_rows_of(x), np.exp(-x.spread)
+            return x
+
+        return self._best_fit(fit)
 
     def best_lag(self, x: WrenchHypothesis) -> float:
         """Return the lag [frames] with the least spread of a hypothesis."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
-            costs = [self.with_spread_and_cost(replace(x, lag=float(y))).spread.sum() for y in lags]
-            lag, reach = float(lags[int(np.argmin(costs))]), 0.5
+            found = (self.with_spread_and_cost(replace(x, lag=float(y))) for y in lags)
+            lag, reach = min(found, key=lambda x: x.spread.sum()).lag, 0.5
         return lag
 
     def lag_of_linear_fit(self, kind: str) -> float:
         """Return the lag [frames] with which a linear map of the load's wrench fits best."""
-        lags = self.usual_lag + np.arange(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 0.1, 0.25)
-        lag, rows = self.usual_lag, np.ones(self.frames, bool)
-        for _ in range(2):
-            costs = [self._residual_of_linear_fit(kind, float(x), rows)[1] for x in lags]
-            lag = float(lags[int(np.argmin(costs))])
-            rows = _rows_of_smallest_residual(self._residual_of_linear_fit(kind, lag, rows)[0])
-        return lag
 
-    def _residual_of_linear_fit(
-        self, kind: str, lag: float, rows: NDArray[np.bool_]
-    ) -> tuple[Array, float]:
-        w, p = self.predict(kind, lag)
-        p = np.column_stack([p / (np.linalg.norm(p[rows], axis=0) + 1e-9), np.ones(len(p))])
-        P, W = p[rows], w[rows]
-        gram = P.T @ P + 1e-9 * np.eye(7)
-        residual = w - p @ np.linalg.solve(gram, P.T @ W)
-        return residual, float(np.log(residual[rows].var(axis=0) + self.floor**2).sum())
+        def residual_and_cost(lag: float) -> tuple[Array, float]:
+            w, p = self.predict(kind, lag)
+            p = np.column_stack([p / (np.linalg.norm(p[rows], axis=0) + 1e-9), np.ones(len(p))])
+            P, W = p[rows], w[rows]
+            gram = P.T @ P + 1e-9 * np.eye(7)
+            residual = w - p @ np.linalg.solve(gram, P.T @ W)
+            return residual, float(np.log(residual[rows].var(axis=0) + self.floor**2).sum())
+
+        lags = self.usual_lag + np.arange(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 0.1, 0.25)
+        rows = np.ones(self.frames, bool)
+        for _ in range(2):
+            lag = float(min(lags, key=lambda x: residual_and_cost(float(x))[1]))
+            rows = _rows_of_smallest_residual(residual_and_cost(lag)[0])
+        return lag
 
 
 def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
@@ -273,7 +260,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: WrenchHypothesis) -> Array:
     gains = []
-    for channels, M in zip(_FORCE_AND_TORQUE_CHANNELS, (x.force_axes, x.torque_axes), strict=True):
+    for channels, M in zip(_FORCE_AND_TORQUE_CHANNELS, x.axes, strict=True):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
@@ -283,9 +270,8 @@ def _weighted_number_of_faults(x: WrenchHypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _rotation_cost(x.force_axes) + float(not np.allclose(x.force_axes, x.torque_axes))
-    scaled = x.force_torque_gains != 1.0
-    return count + float(scaled[0]) + float(scaled[1])
+    count += _rotation_cost(x.axes[0]) + float(not np.allclose(*x.axes))
+    return count + float((x.gains != 1.0).sum())
 
 
 def _rotation_cost(M: Array) -> float:
@@ -360,12 +346,10 @@ class EpisodeSignals:
         log = self.log
         if self._splines is None or log.posed is None:
             assert log.gravity is not None and log.R_WS is not None
-            signals = (*log.motion, log.gravity, log.R_WS.reshape(-1, 9))
-            s, omega, alpha, gravity, R = (resample(t, log.t, x) for x in signals)
-            return Motion(s, omega, alpha, gravity, R.reshape(-1, 3, 3))
-        g = log.posed.gravity_W
+            signals = (*log.motion, log.gravity, log.R_WS)
+            return Motion(*(resample(t, log.t, x) for x in signals))
         R = rotation_matrices(self._splines.quaternion(t), "quaternion_wxyz")
-        return Motion(*self._splines.motion(t, g), self._splines.gravity(t, g), R)
+        return Motion(*self._splines.motion(t, log.posed.gravity_W), R)
 
     def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) `lag` frames after each frame."""

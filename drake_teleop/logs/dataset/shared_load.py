@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, samples_to_nearest_flag
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.noise_floor import (
@@ -18,20 +18,16 @@ from drake_teleop.load.contact.noise_floor import (
     limit_covariance_to_scales,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
+from drake_teleop.logs.dataset import episode_verdict
 from drake_teleop.logs.dataset.episode_verdict import (
-    HALF_WIDTH_OF_NORMAL,
     LAG_STEPS_PER_FRAME,
     EpisodeSignals,
-    HypothesisSearch,
     WrenchHypothesis,
-    hypothesis_without_fault,
 )
 from drake_teleop.logs.processing import phi_with_inertia_replaced
-from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
-# Log spread beyond that of an episode's own load.
 _MAX_COUNTED_EXCESS_SPREAD, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
 _LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0
 _MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
@@ -59,39 +55,37 @@ class SharedLoad:
 
 def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """Return the load that most episodes of a dataset share, or the given load."""
-    episodes = [EpisodeSignals(log) for log in logs]
-    own = [fit_own_load_of_episode(signals) for signals in episodes]
+    signals = map(EpisodeSignals, logs)
+    episodes = [_Episode(x, fit_own_load_of_episode(x)) for x in signals]
     if load is None:
-        candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
+        candidates = [x.own.phi for x in episodes if x.own.phi is not None and x.own.phi[0] > 0.0]
         if not candidates:
             what = "the fitted mass is negative in all episodes"
             remedy = "set wrench.sign: -1 in a --description, or remove it there"
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
         def counted_excess(phi: Array) -> float:
-            excess = _excess_spread_over_own_loads(episodes, own, phi)
-            return float(excess.clip(max=_MAX_COUNTED_EXCESS_SPREAD).sum())
+            return sum(min(x.excess_spread(phi), _MAX_COUNTED_EXCESS_SPREAD) for x in episodes)
 
         phi = min(candidates, key=counted_excess)
         for _ in range(2):
-            members = _excess_spread_over_own_loads(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
-            members = members if members.any() else np.ones(len(own), bool)
-            load = _fit_load_to_members(episodes, own, members, phi)
+            load = _fit_load(_episodes_with_load(episodes, phi), phi)
             phi = load.phi
     assert load is not None
     # Uncertain inertias are nearer to the truth than those of a point mass.
     determined = np.isfinite(load.standard_deviations).all()
     phi = load.phi if determined else phi_with_inertia_replaced(load)[0]
-    members = _excess_spread_over_own_loads(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
-    chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
-    usual = [_faultless_hypothesis_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
+    chosen = _episodes_with_load(episodes, phi)
+    usual = [x.faultless_hypothesis_and_residual(phi) for x in chosen]
     steps = float(np.median([x.lag for x, _ in usual])) * LAG_STEPS_PER_FRAME
     lag = round(steps) / LAG_STEPS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
-    free = [
-        _contact_free_samples(episodes[k], x.lag, residual - x.offsets, typical)
-        for k, (x, residual) in zip(chosen, usual, strict=True)
-    ]
+    limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.HALF_WIDTH_OF_NORMAL, []
+    for episode, (x, residual) in zip(chosen, usual, strict=True):
+        contact = residual - x.offsets
+        frames_from_touch = samples_to_nearest_flag((np.abs(contact) > limit).any(axis=1))
+        samples = samples_for_detector(episode.signals, x.lag, contact)
+        free.append(samples.select_rows(frames_from_touch > _CONTACT_MARGIN_FRAMES))
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
     floor = detection.fit_noise_floor(*pooled, covariance, fade=0.0)
@@ -104,43 +98,49 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
 def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
     """Return the hypothesis of the load and lag that explain an episode best."""
-    search = HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
+    search = episode_verdict.HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
     return min(found, key=lambda x: x.spread.sum())
 
 
-def _excess_spread_over_own_loads(
-    episodes: Sequence[EpisodeSignals], own: Sequence[WrenchHypothesis], phi: Array
-) -> Array:
-    pairs = zip(episodes, own, strict=True)
-    usual = [_faultless_hypothesis_at_best_lag(s, phi, x.lag)[0].spread.sum() for s, x in pairs]
-    return np.array(usual) - [x.spread.sum() for x in own]
+class _Episode(NamedTuple):
+    signals: EpisodeSignals
+    own: WrenchHypothesis
+
+    def faultless_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
+        """Return the hypothesis of load phi (10,), at the best lag near that of the own load."""
+        search = episode_verdict.HypothesisSearch(
+            self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
+        )
+        steps = np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1)
+        lags = self.own.lag + steps / LAG_STEPS_PER_FRAME
+        found = (
+            search.with_spread_and_cost(episode_verdict.hypothesis_without_fault(float(lag)))
+            for lag in lags
+        )
+        best = min(found, key=lambda x: x.spread.sum())
+        return best, search.unexplained_reading(best)
+
+    def excess_spread(self, phi: Array) -> float:
+        """Return the log spread with load phi (10,) beyond that with the own load."""
+        usual = self.faultless_hypothesis_and_residual(phi)[0]
+        return float(usual.spread.sum() - self.own.spread.sum())
 
 
-def _faultless_hypothesis_at_best_lag(
-    signals: EpisodeSignals, phi: Array, near_lag: float
-) -> tuple[WrenchHypothesis, Array]:
-    search = HypothesisSearch(signals, phi, near_lag, _MIN_RESIDUAL_HALF_WIDTH)
-    lags = near_lag + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
-    found = (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags)
-    best = min(found, key=lambda x: x.spread.sum())
-    return best, search.unexplained_reading(best)
+def _episodes_with_load(episodes: list[_Episode], phi: Array) -> list[_Episode]:
+    found = [x for x in episodes if x.excess_spread(phi) < _MAX_MEMBER_EXCESS_SPREAD]
+    return found or episodes
 
 
-def _fit_load_to_members(
-    episodes: Sequence[EpisodeSignals],
-    own: Sequence[WrenchHypothesis],
-    members: NDArray[np.bool_],
-    phi: Array,
-) -> Identification:
+def _fit_load(episodes: Sequence[_Episode], phi: Array) -> Identification:
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
-    for k in (int(row) for row in np.flatnonzero(members)):
-        x, r = _faultless_hypothesis_at_best_lag(episodes[k], phi, own[k].lag)
-        sigma = np.exp(x.spread) / HALF_WIDTH_OF_NORMAL
+    for episode in episodes:
+        x, r = episode.faultless_hypothesis_and_residual(phi)
+        sigma = np.exp(x.spread) / episode_verdict.HALF_WIDTH_OF_NORMAL
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
-        V, w = episodes[k].regressor_at_lag(x.lag)[rows], episodes[k].log.wrench[rows]
+        V, w = episode.signals.regressor_at_lag(x.lag)[rows], episode.signals.log.wrench[rows]
         A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)
         b = ((w - w.mean(axis=0)) / sigma).ravel()
         gram, right = gram + A.T @ A, right + A.T @ b
@@ -170,15 +170,6 @@ def _fit_load_to_members(
         method="least squares of the calm frames of a dataset",
         samples=samples,
     )
-
-
-def _contact_free_samples(
-    signals: EpisodeSignals, lag: float, contact: Array, typical: Array
-) -> DetectorSamples:
-    limit = _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL
-    far = np.asarray((np.abs(contact) > limit).any(axis=1))
-    near = widen_flags(far, _CONTACT_MARGIN_FRAMES)
-    return samples_for_detector(signals, lag, contact).select_rows(~near)
 
 
 def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:

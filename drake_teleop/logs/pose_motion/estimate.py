@@ -11,30 +11,12 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion import linear_model, rigid
+from drake_teleop.logs.pose_motion import linear_model, rigid, spectra
 from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
-from drake_teleop.logs.pose_motion.linear_model import (
-    FitWindow,
-    Spectra,
-    choose_knot_spacing_and_delay,
-)
+from drake_teleop.logs.pose_motion.linear_model import find_disturbances
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
-from drake_teleop.logs.pose_motion.rejection import find_disturbances
-from drake_teleop.logs.pose_motion.rigid import (
-    LEVER_PARAMETERS,
-    OFFSET_AND_LOAD_PARAMETERS,
-    ROTATION_PARAMETERS,
-    RigidFit,
-    RigidParameters,
-    UnitsAndAxes,
-)
-from drake_teleop.logs.pose_motion.spectra import (
-    MAX_FREQUENCY_HZ,
-    WrenchGrid,
-    end_taper,
-    exclude_from_taper,
-    noise_moments,
-)
+from drake_teleop.logs.pose_motion.rigid import RigidFit, RigidParameters, UnitsAndAxes
+from drake_teleop.logs.pose_motion.spectra import FitWindow, Spectra, WrenchGrid
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
 _SEARCHED_RECORD_PART_S = 120.0
@@ -127,7 +109,7 @@ class PoseEstimate(PoseMotion):
 
     @property
     def covariance(self) -> Array:
-        return self.fit.covariance[OFFSET_AND_LOAD_PARAMETERS, OFFSET_AND_LOAD_PARAMETERS]
+        return self.fit.covariance[:16, :16]
 
 
 def estimate_from_poses(
@@ -151,38 +133,42 @@ def estimate_from_poses(
     are excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
-        inputs = t, wrench, poses, gravity_W, delay, lost, imu
-        found, _, window = _find_splines_and_delay(*inputs, fewest=_MIN_SHARED_INSTANTS)
-        splines, late, grid = found.splines, found.delay_s, window.grid
+        grid = WrenchGrid.from_samples(t, wrench)
+        found, _, window = _find_splines_and_delay(grid, poses, gravity_W, delay, lost, imu)
+        splines, late = found.splines, found.delay_s
         window = replace(window, taper=_taper_zero_in_gaps(grid, splines.poses, lost, late))
-        spectra = window.spectra_at_delay(splines, late)
-        rejected, note = find_disturbances(spectra, splines.spacing)
-        window = replace(window, taper=exclude_from_taper(window.taper, rejected, grid.dt))
-        spectra = window.spectra_at_delay(splines, late)
-        Z = spectra.second_moments()
-        signals = spectra.taper, spectra.motion_signals, spectra.bands
-        Q = noise_moments(splines, grid, *signals, splines.estimate_pose_noise())
-        levels = linear_model.fit_noise_levels(Z, spectra.bands)
+        rejected, note = find_disturbances(window.spectra_at_delay(splines, late), splines.spacing)
+        window = replace(window, taper=spectra.exclude_from_taper(window.taper, rejected, grid.dt))
+        final = window.spectra_at_delay(splines, late)
+        Z = final.second_moments_with_rates()
+        Q = spectra.noise_moments(splines, final, splines.estimate_pose_noise())
+        levels = linear_model.fit_noise_levels(Z, window.bands)
         best = linear_model.fit_linear_model(Z, levels)
 
         def fit_rigid_from(start: RigidParameters, free: NDArray[np.bool_]) -> RigidFit:
             return rigid.fit_rigid(Z, Q, levels, start, free, best, gain_std=gain_std)
 
         seen = rigid.estimate_units_and_axes(best)
-        start = _initial_rigid_parameters(p_SoPo_S, R_SP, seen)
+        has_axes = seen.is_usable and not seen.is_mirrored
+        R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
+        R = seen.R_SP.T if R_SP is None and has_axes else R
+        p = np.zeros(3) if p_SoPo_S is None else np.asarray(p_SoPo_S, float)
+        start = RigidParameters(np.zeros(16), 0.0, -R @ p, R)
         fit_free = np.ones(rigid.NUM_RIGID_PARAMETERS, bool)
         fit_free[16] = delay is None
-        fit_free[LEVER_PARAMETERS], fit_free[ROTATION_PARAMETERS] = p_SoPo_S is None, R_SP is None
+        fit_free[rigid.LEVER_PARAMETERS] = p_SoPo_S is None
+        fit_free[rigid.ROTATION_PARAMETERS] = R_SP is None
         fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
-            with_frame = fit_free | (np.arange(rigid.NUM_RIGID_PARAMETERS) > 16)
-            free = fit_rigid_from(_initial_parameters_with_free_frame(fit, start, seen), with_frame)
+            first = fit.parameters
+            if has_axes and np.trace(seen.R_SP @ start.R_PS) < 2.9:
+                origin = seen.R_SP.T @ start.R_PS.T @ start.p_PoSo_P
+                first = RigidParameters(np.zeros(16), first.delay_s, origin, seen.R_SP.T)
+            free = fit_rigid_from(first, fit_free | (np.arange(len(fit_free)) > 16))
+        std = float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free))))
+        found = replace(found, delay_s=late + fit.parameters.delay_s, delay_std_s=std)
         return PoseEstimate(
-            splines=splines,
-            delay_s=spectra.delay + fit.parameters.delay_s,
-            delay_std_s=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
-            clock_rate_error=found.clock_rate_error,
-            is_imu_consistent_with_poses=found.is_imu_consistent_with_poses,
+            **vars(found),
             fit=fit,
             frame=_pose_frame_of_fit(free, start),
             free_frame_fit=free,
@@ -209,50 +195,42 @@ def fit_motion_to_load(
     `coefficients` (6, 16) are the load's, Eq. (T73). Other arguments as for `estimate_from_poses`.
     """
     with one_blas_thread():
-        motion, last, _ = _find_splines_and_delay(
-            *(t, wrench, poses, gravity_W, delay, lost, imu),
-            fewest=_MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD,
-            load=coefficients,
-        )
+        grid = WrenchGrid.from_samples(t, wrench, coefficients)
+        motion, last, _ = _find_splines_and_delay(grid, poses, gravity_W, delay, lost, imu)
         return replace(motion, delay_std_s=linear_model.delay_std(last) if delay is None else 0.0)
 
 
 def _find_splines_and_delay(
-    t: ArrayLike,
-    wrench: ArrayLike,
+    grid: WrenchGrid,
     poses: Poses,
     gravity_W: ArrayLike,
     delay: float | None,
     lost: NDArray[np.bool_] | None,
     imu: ImuData | None,
-    *,
-    fewest: int,
-    load: Array | None = None,
 ) -> tuple[PoseMotion, Spectra, FitWindow]:
-    t, gravity = finite_array("t", t, np.size(t)), finite_array("gravity_W", gravity_W, 3)
-    wrench = finite_array("wrench", wrench, len(t), 6)
-    grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
+    gravity, poses = finite_array("gravity_W", gravity_W, 3), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
     taper = _taper_zero_in_gaps(grid, poses, lost, guess)
     usable = int((taper > 0.5).sum())
+    free_load = grid.known_load is None
+    fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
     if usable < fewest:
         raise DrakeTeleopError(
             f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart ({fewest} required)",
             remedy="record both at the same time, longer, without interruptions",
         )
     slower = min(poses.rate, grid.stride / grid.dt)
-    top = min(MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
+    top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)
-    rows = _part_with_most_varied_force(grid)
-    part = whole.select_rows(rows)
-    margin = 2 * linear_model.DELAY_SEARCH_HALF_RANGE_S
+    part = whole.select_rows(_part_with_most_varied_force(grid))
+    margin = 2 * spectra.DELAY_SEARCH_HALF_RANGE_S
     near = (poses.t >= part.grid.t[0] - margin) & (poses.t <= part.grid.t[-1] + margin)
     near_poses = Poses(poses.t[near], poses.position[near], poses.quaternion[near])
     cache = linear_model.spline_cache_of_averaged_poses(near_poses)
     spacing, late = linear_model.guess_knot_spacing_and_delay(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
     disturbed = find_disturbances(first, spacing)[0]
-    part = replace(part, taper=exclude_from_taper(part.taper, disturbed, grid.dt))
+    part = replace(part, taper=spectra.exclude_from_taper(part.taper, disturbed, grid.dt))
     rate = 0.0 if known else linear_model.estimate_clock_rate_error(part, cache, late, spacing)
     if rate:
         near_poses = linear_model.correct_clock_rate(near_poses, rate, part.grid, late)
@@ -263,7 +241,9 @@ def _find_splines_and_delay(
         imu_rows = correct_imu_data(PoseSplines(near_poses, imu_spacing), imu, gravity)
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
     agrees = imu is None or imu_rows is not None
-    chosen, spacing, late = choose_knot_spacing_and_delay(part, choices, late, known=known)
+    chosen, spacing, late = linear_model.choose_knot_spacing_and_delay(
+        part, choices, late, known=known
+    )
     imu_rows = chosen.imu_rows
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
         imu_rows = correct_imu_data(PoseSplines(poses, imu_spacing), imu, gravity)
@@ -276,10 +256,8 @@ def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
     rows, length = len(grid.t), round(_SEARCHED_RECORD_PART_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
-    starts = range(0, rows - length, length // 2)
-    coarse = grid.wrench[:: grid.stride]
-    varied = [np.var(coarse[k : k + length], axis=0)[:3].sum() for k in starts]
-    first = starts[int(np.argmax(varied))]
+    coarse, parts = grid.wrench[:: grid.stride], range(0, rows - length, length // 2)
+    first = max(parts, key=lambda k: float(np.var(coarse[k : k + length], axis=0)[:3].sum()))
     return slice(first, first + length)
 
 
@@ -290,35 +268,14 @@ def _taper_zero_in_gaps(
     start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
         return np.zeros(len(grid.t))
-    taper = end_taper(grid.t, start, stop)
+    taper = spectra.end_taper(grid.t, start, stop)
     bad = np.zeros(len(grid.t), bool)
     if lost is not None:
         rows = len(grid.t) * grid.stride
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
     for k in np.flatnonzero(np.diff(stamps) > _MIN_EXCLUDED_POSE_GAP_S):
         bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
-    return exclude_from_taper(taper, bad, grid.dt, grid.dt)
-
-
-def _initial_rigid_parameters(
-    p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: UnitsAndAxes
-) -> RigidParameters:
-    R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
-    if R_SP is None and seen.is_usable and not seen.is_mirrored:
-        R = seen.R_SP.T
-    p = np.zeros(3) if p_SoPo_S is None else np.asarray(p_SoPo_S, float)
-    return RigidParameters(np.zeros(16), 0.0, -R @ p, R)
-
-
-def _initial_parameters_with_free_frame(
-    fit: RigidFit, start: RigidParameters, seen: UnitsAndAxes
-) -> RigidParameters:
-    turned = seen.is_usable and not seen.is_mirrored and np.trace(seen.R_SP @ start.R_PS) < 2.9
-    if not turned:
-        return fit.parameters
-    R = seen.R_SP.T
-    origin = R @ start.R_PS.T @ start.p_PoSo_P
-    return RigidParameters(np.zeros(16), fit.parameters.delay_s, origin, R)
+    return spectra.exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
 
 def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:

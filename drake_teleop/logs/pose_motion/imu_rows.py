@@ -29,36 +29,33 @@ class _ImuSensorModel:
     time_shift_s: float
     noise_power: float
 
+    def motion_of_data(self, y: Array) -> Array:
+        return np.linalg.solve(np.eye(3) + self.gain_errors, (y - self.bias).T).T
+
 
 def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
-    """Return IMU data corrected to fit splines of poses, or None if the two do not agree."""
-    powers = tuple(std**2 / splines.rate for std in splines.estimate_pose_noise())
-    averaged, sensors = imu.average_to_rate(_COMPARED_IMU_RATE_HZ), []
-    for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):
-        sensor = None
-        if y is not None:
-            pose_noise = powers[which], 4 - 2 * which
-            sensor = _fit_sensor_model(splines, averaged.t, y, gravity_W, which, pose_noise)
-            if sensor is None:
-                return None
-        sensors.append(sensor)
-    fitted = [sensor for sensor in sensors if sensor is not None]
-    if not fitted:
+    """Return IMU data corrected to fit splines of poses alone; None if the two do not agree."""
+    position_std, rotation_std = splines.estimate_pose_noise()
+    powers = position_std**2 / splines.rate, rotation_std**2 / splines.rate
+    averaged = imu.average_to_rate(_COMPARED_IMU_RATE_HZ)
+    sensors = {
+        which: _fit_sensor_model(splines, averaged.t, y, gravity_W, which, powers[which])
+        for which, y in enumerate((averaged.specific_force, averaged.angular_velocity))
+        if y is not None
+    }
+    found = {which: sensor for which, sensor in sensors.items() if sensor is not None}
+    if not found or len(found) < len(sensors):
         return None
     rows = imu.average_to_rate(_ADDED_IMU_ROWS_RATE_HZ)
-    t = rows.t + fitted[-1].time_shift_s  # the gyroscope determines the clock best
+    t = rows.t + found[max(found)].time_shift_s  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
-        None
-        if sensor is None or y is None
-        else np.linalg.solve(np.eye(3) + sensor.gain_errors, (y[inside] - sensor.bias).T).T
-        for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
+        found[which].motion_of_data(y[inside]) if which in found and y is not None else None
+        for which, y in enumerate((rows.specific_force, rows.angular_velocity))
     )
-    own = [0.0 if sensor is None else sensor.noise_power for sensor in sensors]
-    imu_rows = ImuSplineRows(t[inside], rows.rate, (powers[0], powers[1]), (own[0], own[1]))
-    imu_rows = imu_rows.with_data_in_sensor_axes(
-        PoseSplines(splines.poses, splines.spacing), gravity_W, s, omega
-    )  # then by poses and IMU together
+    own = tuple(found[which].noise_power if which in found else 0.0 for which in range(2))
+    imu_rows = ImuSplineRows(t[inside], rows.rate, powers, (own[0], own[1]))
+    imu_rows = imu_rows.with_data_in_sensor_axes(splines, gravity_W, s, omega)
     both = PoseSplines(splines.poses, splines.spacing, imu_rows)
     return imu_rows.with_data_in_sensor_axes(both, gravity_W, s, omega)
 
@@ -69,7 +66,7 @@ def _fit_sensor_model(
     y: Array,
     gravity_W: Array,
     which: int,
-    pose_noise: tuple[float, int],
+    pose_noise_power: float,
 ) -> _ImuSensorModel | None:
     """Fit accelerometer (0) or gyroscope (1) data y (K, 3) to splines; None if unexplained."""
     dt = float(np.median(np.diff(t)))
@@ -84,7 +81,8 @@ def _fit_sensor_model(
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
     used = frequency <= _COMPARED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
-    noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
+    omega: NDArray[np.floating] = 2.0 * np.pi * frequency[used]
+    noise = pose_noise_power * omega ** (4 - 2 * which)
     energy = float(np.sum(taper**2)) / dt
 
     def tapered_spectrum(x: Array) -> ComplexArray:
@@ -94,8 +92,7 @@ def _fit_sensor_model(
     least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
     Y = tapered_spectrum(values)
     one = tapered_spectrum(np.ones((len(even), 1)))
-    tau = 0.0
-    power = least
+    tau, power = 0.0, least
     for step in range(_SENSOR_FIT_STEPS):
         x = splines.motion(even + tau, gravity_W)[which]
         X, change = tapered_spectrum(x), tapered_spectrum(np.gradient(x, dt, axis=0))

@@ -27,6 +27,7 @@ _MAX_RIGID_MISFIT_OVER_DOF, _MAX_GAIN_MISFIT_OVER_EXPECTED, _NOISE_MISFIT_OVER_D
 _MAX_PARAMETER_FIT_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
 _MIN_WRENCH_NOISE_OVER_RESIDUAL, _ROTATION_DIFFERENCE_STEP_RAD = 0.1, 1e-4
 _MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
+_OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,6 @@ class RigidFit:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether the misfit is below four times its degrees of freedom."""
         return self.misfit < _MAX_RIGID_MISFIT_OVER_DOF * self.degrees_of_freedom
 
     @property
@@ -86,34 +86,25 @@ def motion_transformation_matrix(R: Array, r: Array) -> Array:
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
     M[7:10, 10:16] = R.T @ centripetal_matrix(r)
     M[10:13, 7:10] = R.T
-    M[13:19, 10:16] = _rotation_of_omega_products(R)
+    i, j = np.transpose(_OMEGA_PRODUCT_PAIRS)[:, :, None]
+    k, m = np.transpose(_OMEGA_PRODUCT_PAIRS)[:, None]
+    M[13:19, 10:16] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
     return M
-
-
-_OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without a weight [m, m c] (4,)."""
-    C = _coefficients_without_removed_weight(phi)
+    M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
+
+    def coefficients_of(phi: Array) -> Array:
+        theta = np.concatenate([np.zeros(6), phi])
+        return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
+
+    C = coefficients_of(phi)
     if removed_weight is not None:
-        weight = _coefficients_without_removed_weight(np.concatenate([removed_weight, np.zeros(6)]))
+        weight = coefficients_of(np.concatenate([removed_weight, np.zeros(6)]))
         C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
-
-
-def _coefficients_without_removed_weight(phi: Array) -> Array:
-    theta = np.concatenate([np.zeros(6), phi])
-    M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
-    return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
-
-
-def _rotation_of_omega_products(R: Array) -> Array:
-    out = np.empty((6, 6))
-    for row, (i, j) in enumerate(_OMEGA_PRODUCT_PAIRS):
-        for column, (k, m) in enumerate(_OMEGA_PRODUCT_PAIRS):
-            out[row, column] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
-    return out
 
 
 def fit_rigid(
@@ -136,7 +127,7 @@ def fit_rigid(
     # The linear model is not compensated for noise, so the compared fit must not be either.
     plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.parameters)
     power = levels.noise_power(_residual_channel_powers(record, plain.parameters))
-    power = np.maximum(power, min_noise_power(record.moments, levels.half_dof_of_bands))
+    power = np.maximum(power, min_noise_power(record.moments, levels))
     fit = RigidFit(
         solution.parameters,
         covariance=np.zeros((0, 0)),
@@ -186,7 +177,9 @@ def _solve_rigid_fit(
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_MAX_PARAMETER_FIT_STEP / np.maximum(np.abs(step), 1e-300))))
         state = _add_rigid_step(state, step)
-        used = _degrees_of_freedom_of_fit(B, record.moments, W, inverse)
+        half = np.einsum("cjk,ji->cik", B, inverse)
+        used = np.einsum("cik,bkm,cim->bc", half, record.moments, B, optimize=True)
+        used = np.clip(used * np.diagonal(W, axis1=1, axis2=2), 0.0, None)
         R = _residual_covariances(record, state, _residual_channel_powers(record, state), used)
         if np.max(np.abs(step) / size) < _MAX_CONVERGED_STEP_OVER_STD:
             break
@@ -289,17 +282,10 @@ def _residual_covariances(
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
         _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(sums, used),
-        min_noise_power(record.moments, levels.half_dof_of_bands),
+        min_noise_power(record.moments, levels),
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
-
-
-def _degrees_of_freedom_of_fit(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    diagonal = np.diagonal(W, axis1=1, axis2=2)
-    half = np.einsum("cjk,ji->cik", B, inverse)
-    gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
-    return np.asarray(np.clip(gram * diagonal, 0.0, None))
 
 
 def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array:
@@ -365,32 +351,29 @@ class UnitsAndAxes:
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether the axes of wrench and poses are mirror images."""
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
 def estimate_units_and_axes(fit: LinearFit) -> UnitsAndAxes:
-    C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
-    M_a, M_g = C[:3, 1:4], C[:3, 4:7]
-    kappa, deviation = _position_unit_ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
-    determined = bool((variances[:3, 4:7] > 0.0).all())
+    variances = np.diagonal(fit.covariance, axis1=1, axis2=2)[:3]
+    M_a, M_g, v_a, v_g = (
+        x[:, k] for x in (fit.coefficients[:3], variances) for k in (slice(1, 4), GRAVITY_COLUMNS)
+    )
     U, masses, Vt = np.linalg.svd(M_g)
-    largest = float(np.sqrt(variances[:3, 4:7].max())) if determined else np.inf
+    largest = float(np.sqrt(v_g.max())) if (v_g > 0.0).all() else np.inf
+    kappa, deviation = _position_unit_ratio(M_a, M_g, v_a, v_g)
     return UnitsAndAxes(kappa, deviation, largest, U @ Vt, masses)
 
 
-def _position_unit_ratio(
-    a: Array, g: Array, variances_a: Array, variances_g: Array
-) -> tuple[float, float]:
-    known = (variances_a > 0.0) & (variances_g > 0.0)
-    if not known.any():
-        return np.nan, np.inf
-    a, g, v_a, v_g = (x[known] for x in (a, g, variances_a, variances_g))
+def _position_unit_ratio(a: Array, g: Array, v_a: Array, v_g: Array) -> tuple[float, float]:
+    known = (v_a > 0.0) & (v_g > 0.0)
+    a, g, v_a, v_g = (x[known] for x in (a, g, v_a, v_g))
+    kappa = 0.0
     kappa = 0.0
     for _ in range(_UNIT_RATIO_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
         information = float(weight @ np.maximum(g * g - v_g, 0.0))
-        if not information > 0.0:  # gravity is not observable
+        if not information > 0.0:  # gravity is not observable, or nothing is known
             return np.nan, np.inf
         kappa = float(weight @ (a * g)) / information
     return kappa, information**-0.5

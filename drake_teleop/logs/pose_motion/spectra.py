@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.fft import next_fast_len
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_flag
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.normal_equations import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
@@ -25,6 +26,8 @@ MAX_FREQUENCY_HZ = 25.0
 # Length of the taper's ramps at the ends of the record, and beside excluded samples [s].
 _TAPER_RAMP_S, _EXCLUSION_RAMP_S = 1.0, 0.2
 _GRID_RATE_HZ = 100.0
+DELAY_SEARCH_HALF_RANGE_S = 0.25
+"""Largest change of the delay in the search, or a tenth of the record [s]."""
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
 _MIN_NOISE_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
@@ -48,7 +51,9 @@ class WrenchGrid:
     known_load: Array | None = None
 
     @classmethod
-    def from_samples(cls, t: Array, wrench: Array, load: Array | None = None) -> WrenchGrid:
+    def from_samples(cls, t: ArrayLike, wrench: ArrayLike, load: Array | None = None) -> WrenchGrid:
+        t = finite_array("t", t, np.size(t))
+        wrench = finite_array("wrench", wrench, len(t), 6)
         dt = (t[-1] - t[0]) / (len(t) - 1)
         stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
@@ -91,30 +96,16 @@ class FrequencyBands:
         """Half the number of independent values (num_bands,) in each band."""
         return np.asarray(np.bincount(self.band_of_frequency, self.frequency_weight), np.float64)
 
+    @cached_property
+    def slices(self) -> list[slice]:
+        """Frequencies of each band."""
+        starts = np.searchsorted(self.band_of_frequency, np.arange(self.num_bands + 1))
+        return [slice(*ends) for ends in itertools.pairwise(starts)]
+
     def sums_over_bands(self, values: Array) -> Array:
         flat = values.reshape(len(values), -1) * self.frequency_weight[:, None]
-        starts = np.searchsorted(self.band_of_frequency, np.arange(self.num_bands))
+        starts = [part.start for part in self.slices]
         return np.add.reduceat(flat, starts, axis=0).reshape(self.num_bands, *values.shape[1:])
-
-
-def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
-    """Return frequency bands up to `top` [Hz]; groups with few values are joined to the next."""
-    frequency = grid.frequency[grid.frequency <= top]
-    worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.transform_length)
-    weight = np.full(len(frequency), worth)
-    weight[0] *= 0.5
-    group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
-    for k in range(len(_GROUP_EDGES_HZ)):
-        if 0.0 < weight[group == k].sum() < _MIN_NOISE_GROUP_SIZE:
-            group[group == k] = k + 1
-    last = group == group[-1]
-    if weight[last].sum() < _MIN_NOISE_GROUP_SIZE and not last.all():
-        group[last] = group[~last][-1]
-    low = np.clip(frequency, frequency[1], _NARROW_BANDS_TO_HZ) / frequency[1]
-    narrow = np.log(low) // np.log(_MAX_NARROW_BAND_EDGE_RATIO)
-    first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
-    group = np.unique(group[first], return_inverse=True)[1]
-    return FrequencyBands(frequency, np.cumsum(first) - 1, weight, group)
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
@@ -128,64 +119,158 @@ def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((instants_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
+    edge = np.clip((samples_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
-def instants_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
-    """Return the number (M,) of instants to the nearest set flag; inf without any."""
-    at = np.arange(len(flags), dtype=float)
-    before = np.maximum.accumulate(np.where(flags, at, -np.inf))
-    after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
-    return np.minimum(at - before, after - at)
+@dataclass(frozen=True, eq=False)
+class FitWindow:
+    """Data of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
+
+    grid: WrenchGrid
+    taper: Array
+    gravity_W: Array
+    max_frequency_hz: float
+
+    @cached_property
+    def bands(self) -> FrequencyBands:
+        """Bands up to the highest frequency; groups with few values are joined to the next."""
+        taper, frequency = self.taper, self.grid.frequency
+        frequency = frequency[frequency <= self.max_frequency_hz]
+        worth = (taper**2).sum() ** 2 / ((taper**4).sum() * self.grid.transform_length)
+        weight = np.full(len(frequency), worth)
+        weight[0] *= 0.5
+        group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
+        for k in range(len(_GROUP_EDGES_HZ)):
+            if 0.0 < weight[group == k].sum() < _MIN_NOISE_GROUP_SIZE:
+                group[group == k] = k + 1
+        last = group == group[-1]
+        if weight[last].sum() < _MIN_NOISE_GROUP_SIZE and not last.all():
+            group[last] = group[~last][-1]
+        low = np.clip(frequency, frequency[1], _NARROW_BANDS_TO_HZ) / frequency[1]
+        narrow = np.log(low) // np.log(_MAX_NARROW_BAND_EDGE_RATIO)
+        first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
+        group = np.unique(group[first], return_inverse=True)[1]
+        return FrequencyBands(frequency, np.cumsum(first) - 1, weight, group)
+
+    @cached_property
+    def wrench_spectrum(self) -> ComplexArray:
+        """Spectrum (K, 6) of the tapered wrench, scaled as by `signal_spectrum`."""
+        stride, n = self.grid.stride, len(self.grid.wrench)
+        fine = np.zeros(self.grid.transform_length * stride)
+        full = np.interp(np.arange(n) / stride, np.arange(len(self.taper)), self.taper)
+        out = np.empty((len(self.bands.frequency), 6), np.complex128)
+        for c in range(6):
+            fine[:n] = self.grid.wrench[:, c] * full
+            out[:, c] = np.fft.rfft(fine)[: len(out)] / stride
+        return out
+
+    @property
+    def delay_search_half_range_s(self) -> float:
+        return min(DELAY_SEARCH_HALF_RANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
+
+    @cached_property
+    def is_taper_fixed(self) -> bool:
+        """Whether the weights of samples stay in place when the delay changes."""
+        inside = np.flatnonzero(self.taper > 0.5)
+        edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
+        return bool(edged or self.grid.known_load is not None)
+
+    def signal_spectrum(self, x: Array, taper: Array | None = None) -> ComplexArray:
+        """Return the spectrum (K, k) of tapered signals x (M, k)."""
+        out = np.empty((len(self.bands.frequency), x.shape[1]), np.complex128)
+        weight = self.taper if taper is None else taper
+        for c, column in enumerate(x.T):
+            out[:, c] = np.fft.rfft(column * weight, self.grid.transform_length)[: len(out)]
+        return out
+
+    def filtered_taper(self, response: NDArray[np.complexfloating]) -> Array:
+        """Return the taper (M,), periodic after padding, filtered by a response at all K."""
+        n = self.grid.transform_length
+        return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
+
+    def select_rows(self, rows: slice) -> FitWindow:
+        grid = self.grid
+        wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
+        grid = replace(grid, t=grid.t[rows], wrench=wrench)
+        taper = self.taper[rows] * end_taper(grid.t, grid.t[0], grid.t[-1])
+        return replace(self, grid=grid, taper=taper)
+
+    def spectra_at_delay(self, splines: PoseSplines, delay: float) -> Spectra:
+        """Return spectra of the wrench, and of the motion `delay` [s] later."""
+        zeta = splines.signals(self.grid.t + delay, self.gravity_W)
+        return Spectra(self, self.signal_spectrum(zeta), delay, zeta)
 
 
-def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> ComplexArray:
-    """Return the spectrum (count, 6) of the tapered wrench, scaled as by `signal_spectrum`."""
-    fine = np.zeros(grid.transform_length * grid.stride)
-    n = len(grid.wrench)
-    full = np.interp(np.arange(n) / grid.stride, np.arange(len(taper)), taper)
-    out = np.empty((count, 6), np.complex128)
-    for c in range(6):
-        fine[:n] = grid.wrench[:, c] * full
-        out[:, c] = np.fft.rfft(fine)[:count] / grid.stride
-    return out
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Spectra of wrench (K, 6) and 16 motion signals (K, 16) at K frequencies of a window.
 
-
-def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> ComplexArray:
-    """Return the spectrum (count, 16) of tapered motion signals zeta (M, 16), Eq. (T73)."""
-    out = np.empty((count, zeta.shape[1]), np.complex128)
-    for c, column in enumerate(zeta.T):
-        out[:, c] = np.fft.rfft(column * taper, grid.transform_length)[:count]
-    return out
-
-
-def filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complexfloating]) -> Array:
-    """Return x (M,), periodic after padding, filtered by a response at `grid.frequency`."""
-    n = grid.transform_length
-    return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * response, n)[: len(x)])
-
-
-def second_moments(
-    zeta: ComplexArray,
-    wrench: ComplexArray,
-    bands: FrequencyBands,
-    rates: ComplexArray | None = None,
-) -> Array:
-    """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
-
-    They are sums of Re y* y^T; (bands, 22, 22) without `rates`, the spectra of d zeta/dt.
+    Attributes:
+        delay: delay of the signals behind the wrench [s].
+        motion_signals: (M, 16) signals over time, see `PoseSplines.signals`.
     """
-    parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
-    y = np.hstack(parts) * np.sqrt(bands.frequency_weight)[:, None]
-    starts = np.searchsorted(bands.band_of_frequency, np.arange(bands.num_bands + 1))
-    out = np.empty((bands.num_bands, y.shape[1], y.shape[1]))
-    for k in range(bands.num_bands):
-        # Real and imaginary parts as rows need only one real product per band.
-        part = y[starts[k] : starts[k + 1]].view(np.float64).reshape(-1, y.shape[1], 2)
-        part = part.transpose(0, 2, 1).reshape(-1, y.shape[1])
-        out[k] = part.T @ part
-    return out
+
+    window: FitWindow
+    signals: ComplexArray
+    delay: float
+    motion_signals: Array
+
+    def with_delay(self, delay: float) -> Spectra:
+        """Return the spectra with signals shifted to a delay [s]; only `signals` changes."""
+        window, shift, signals = self.window, delay - self.delay, self.signals
+        if window.is_taper_fixed:
+            before = window.filtered_taper(np.exp(-2j * np.pi * window.grid.frequency * shift))
+            signals = window.signal_spectrum(self.motion_signals, before)
+        late = signals * np.exp(2j * np.pi * window.bands.frequency * shift)[:, None]
+        late[:, 0] = self.signals[:, 0]
+        return replace(self, signals=late)
+
+    def second_moments(self) -> Array:
+        """Return second moments (bands, 22, 22) of signals and wrench."""
+        return second_moments(self.window.bands, self.signals, self.window.wrench_spectrum)
+
+    def second_moments_with_rates(self) -> Array:
+        """Return second moments (bands, 38, 38) of signals, wrench, and derivatives of signals."""
+        window = self.window
+        rates = 2j * np.pi * window.bands.frequency[:, None] * self.signals
+        edges = window.filtered_taper(2j * np.pi * window.grid.frequency)
+        rates -= window.signal_spectrum(self.motion_signals, edges)
+        rates[:, 0] = 0.0
+        return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
+
+    def second_moments_at_delays(self, delays: Array) -> Array:
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s]."""
+        bands, wrench = self.window.bands, self.window.wrench_spectrum
+        if self.window.is_taper_fixed:
+            return np.array([self.with_delay(delay).second_moments() for delay in delays])
+        fixed = np.column_stack([wrench, self.signals[:, 0]]) * bands.frequency_weight[:, None]
+        products = np.conj(self.signals)[:, :, None] * fixed[:, None]
+        flat = products.reshape(len(products), -1)
+        angle = 2.0 * np.pi * np.outer(delays - self.delay, bands.frequency)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        sums = np.empty((len(delays), bands.num_bands, flat.shape[1]))
+        for k, part in enumerate(bands.slices):
+            sums[:, k] = cosine[:, part] @ flat[part].real + sine[:, part] @ flat[part].imag
+        moving = sums.reshape(len(delays), bands.num_bands, NUM_MOTION_SIGNALS, 7)[:, :, 1:]
+        Z = np.repeat(self.second_moments()[None], len(delays), axis=0)
+        Z[..., 1:NUM_MOTION_SIGNALS, WRENCH_COLUMNS] = moving[..., :6]
+        Z[..., 1:NUM_MOTION_SIGNALS, 0] = Z[..., 0, 1:NUM_MOTION_SIGNALS] = moving[..., 6]
+        return Z
+
+
+def real_and_imaginary_rows(y: ComplexArray) -> Array:
+    """Return the real and the imaginary part (2 K, k) of each row of y (K, k)."""
+    parts = y.view(np.float64).reshape(*y.shape, 2)
+    return parts.transpose(0, 2, 1).reshape(-1, y.shape[1])
+
+
+def second_moments(bands: FrequencyBands, *spectra: ComplexArray) -> Array:
+    """Return the sums of Re y* y^T (bands, n, n) in each band, for spectra y of n columns."""
+    y = np.hstack(spectra) * np.sqrt(bands.frequency_weight)[:, None]
+    # Real and imaginary parts as rows need only one real product per band.
+    parts = (real_and_imaginary_rows(y[part]) for part in bands.slices)
+    return np.array([part.T @ part for part in parts])
 
 
 _MIN_REMAINING_DOF_SHARE = 0.25
@@ -242,31 +327,22 @@ OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
 _ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 7), slice(7, 10)
 
 
-def noise_moments(
-    splines: PoseSplines,
-    grid: WrenchGrid,
-    taper: Array,
-    zeta: Array,
-    bands: FrequencyBands,
-    noise: tuple[float, float],
-) -> Array:
-    """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `second_moments`.
+def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
+    """Return what noise of the poses adds to `Spectra.second_moments_with_rates`.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """
+    taper, bands = spectra.window.taper, spectra.window.bands
     w2 = (2.0 * np.pi * bands.frequency) ** 2
-    per_number = np.sum(taper**2) / (grid.dt * splines.rate)
+    per_number = np.sum(taper**2) / (spectra.window.grid.dt * splines.rate)
     share = per_number * noise_share_passed_by_splines(bands.frequency, splines.spacing)
     position_power, rotation_power = (std**2 * share for std in noise)
     if splines.imu_rows is not None:
         left = splines.imu_rows.pose_noise_shares_left_by_imu(bands.frequency)
         position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
-    still, first, second, third = _signal_covariances_by_rotation(zeta, weight)
-    eye = np.zeros((NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
-    eye[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
+    shapes = _signal_covariances_by_pose_noise(spectra.motion_signals, weight)
     powers = position_power * w2**2, rotation_power, rotation_power * w2, rotation_power * w2**2
-    shapes = eye, still, first + second, third
     Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
     signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
     for power, shape in zip(powers, shapes, strict=True):
@@ -275,10 +351,9 @@ def noise_moments(
     return Q
 
 
-def _signal_covariances_by_rotation(
-    zeta: Array, weight: Array
-) -> tuple[Array, Array, Array, Array]:
-    still, cross, products, alpha = np.zeros((4, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
+def _signal_covariances_by_pose_noise(zeta: Array, weight: Array) -> tuple[Array, ...]:
+    place, still, cross, products, alpha = np.zeros((5, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
+    place[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
     mean = weight @ zeta
     for left in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
         for right in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
@@ -292,4 +367,4 @@ def _signal_covariances_by_rotation(
     for jacobian in omega_product_jacobians(OMEGA_PRODUCT_COLUMNS, NUM_MOTION_SIGNALS):
         products += jacobian.T @ ww @ jacobian
     alpha[_ALPHA_COLUMNS, _ALPHA_COLUMNS] = np.eye(3)
-    return still, cross, products, alpha
+    return place, still, cross + products, alpha

@@ -66,11 +66,9 @@ class ImuSplineRows:
     def pose_noise_shares_left_by_imu(self, frequency: Array) -> tuple[Array, Array]:
         """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
-        powers = zip(self.pose_noise_powers, self.imu_noise_powers, strict=True)
-        without = self.acceleration_W is None, self.quaternion_rate is None
-        position, rotation = (
-            0.0 if x else a / b for (a, b), x in zip(powers, without, strict=True)
-        )
+        data = self.acceleration_W, self.quaternion_rate
+        ratios = zip(self.pose_noise_powers, self.imu_noise_powers, data, strict=True)
+        position, rotation = (0.0 if rows is None else a / b for a, b, rows in ratios)
         return 1.0 / (1.0 + position * w**4), 1.0 / (1.0 + rotation * w**2)
 
 
@@ -192,26 +190,13 @@ class PoseSplines:
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """Return [1, a, -g, alpha, products of omega] (N, 16) at times t [s], in P, Eq. (T73)."""
         a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
-        zeta = np.empty((len(t), NUM_MOTION_SIGNALS))
-        zeta[:, 0] = 1.0
-        zeta[:, 1:4], zeta[:, 4:7], zeta[:, 7:10] = a, minus_g, alpha
-        zeta[:, 10:13] = omega * omega
-        for column, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)), start=13):
-            zeta[:, column] = omega[:, i] * omega[:, j]
-        return zeta
+        products = np.hstack([omega, omega[:, [0, 0, 1]]]) * np.hstack([omega, omega[:, [1, 2, 2]]])
+        return np.hstack([np.ones((len(t), 1)), a, minus_g, alpha, products])
 
-    def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
-        """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""
+    def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
+        """Return specific force of Po, omega, alpha and gravity (N, 3) at times t, in P [SI]."""
         a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
-        return a + minus_g, omega, alpha
-
-    def gravity(self, t: Array, gravity_W: Array) -> Array:
-        """Return gravity (N, 3) at times t, in the axes of P [m/s^2]."""
-        out = np.empty((len(t), 3))
-        for part in _split_rows_into_blocks(len(t)):
-            q, g = self.quaternion(t[part]), np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _rotate_W_to_P(q, np.sum(q * q, axis=1, keepdims=True), g)
-        return out
+        return a + minus_g, omega, alpha, -minus_g
 
     def _acceleration_minus_gravity_omega_alpha(self, t: Array, gravity_W: Array) -> Array:
         out = np.empty((4, len(t), 3))
@@ -233,23 +218,21 @@ class PoseSplines:
         if self.imu_rows is not None:
             stds = np.sqrt(np.array(self.imu_rows.pose_noise_powers) * self.rate)
             return float(stds[0]), float(stds[1])
+        low, high = (share / self.spacing for share in _POSE_NOISE_BAND_OVER_KNOT_RATE)
         sums, count = np.zeros(2), 0
         for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
             measured = self.poses.quaternion[part]
             turn = 2.0 * _vector_part_of_relative_quaternion(fitted[:, 3:], measured)
-            powers = self._powers_in_noise_band(position), self._powers_in_noise_band(turn)
-            sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
+            residual, n = np.hstack([position, turn]), len(position)
+            frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
+            inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
+            powers = np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
+            sums += powers.reshape(2, 3, -1).sum(axis=(1, 2))
+            count += powers.size // 2
         position_std, rotation_std = np.sqrt(sums / count)
         return float(position_std), float(rotation_std)
-
-    def _powers_in_noise_band(self, residual: Array) -> Array:
-        n = len(residual)
-        frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
-        low, high = (share / self.spacing for share in _POSE_NOISE_BAND_OVER_KNOT_RATE)
-        inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
-        return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
 
 class SplineCache:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, finite_array, to_float
+from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_flag, to_float
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
@@ -41,20 +42,16 @@ def resample(t_new: Array, t: Array, x: Array) -> Array:
     if np.array_equal(t_new, t[first : first + len(t_new)]):
         return x[first : first + len(t_new)]
     out = np.empty((len(t_new), *x.shape[1:]))
-    for start in range(0, len(t_new), _INTERPOLATED_CHUNK_ROWS):  # limits the memory of temporaries
-        part = slice(start, start + _INTERPOLATED_CHUNK_ROWS)
-        out[part] = _interpolate_linearly(t_new[part], t, x)
+    for row in range(0, len(t_new), _INTERPOLATED_CHUNK_ROWS):  # limits the memory of temporaries
+        part = slice(row, row + _INTERPOLATED_CHUNK_ROWS)
+        # A single search for all columns is faster than np.interp for each.
+        before = np.searchsorted(t[1:-1], t_new[part], side="right")
+        start, end = t[before], t[before + 1]
+        share = np.minimum(np.maximum((t_new[part] - start) / (end - start), 0.0), 1.0)
+        share = share.reshape(-1, *[1] * (x.ndim - 1))
+        low = x.take(before, axis=0)
+        out[part] = low + share * (x.take(before + 1, axis=0) - low)
     return out
-
-
-def _interpolate_linearly(t_new: Array, t: Array, x: Array) -> Array:
-    # A single search for all columns is faster than np.interp for each.
-    before = np.searchsorted(t[1:-1], t_new, side="right")
-    start, end = t[before], t[before + 1]
-    share = np.minimum(np.maximum((t_new - start) / (end - start), 0.0), 1.0)
-    share = share.reshape(-1, *[1] * (x.ndim - 1))
-    first = x.take(before, axis=0)
-    return first + share * (x.take(before + 1, axis=0) - first)
 
 
 def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
@@ -95,13 +92,14 @@ def smooth_derivatives(
         for row in weights
     ]
     tau = dt * np.arange(1, half + 1)
-    derivatives = []
-    for order in range(3):
+
+    def derivative(order: int) -> Array:
         before = _evaluate_polynomial_derivatives([c[0] for c in inner], -tau[::-1], order)
         after = _evaluate_polynomial_derivatives([c[-1] for c in inner], tau, order)
         middle = math.factorial(order) * inner[order]
-        derivatives.append(np.concatenate([before, middle, after]).reshape(x.shape))
-    return derivatives[0], derivatives[1], derivatives[2]
+        return np.concatenate([before, middle, after]).reshape(x.shape)
+
+    return derivative(0), derivative(1), derivative(2)
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
@@ -172,17 +170,14 @@ def remove_delay(log: Log, delay_s: float) -> Log:
             f" ({_MIN_SAMPLES_AFTER_DELAY} are required)"
         )
         raise DrakeTeleopError(what, where=log.source, remedy="give a shorter delay, or `auto`")
-    motion = (resample(at[known], log.t, x) for x in log.motion)
-    gravity, R_WS = (
-        None if x is None else resample(at[known], log.t, x) for x in (log.gravity, log.R_WS)
-    )
-    bridged = None
+    names = ("specific_force", "angular_velocity", "angular_acceleration", "gravity", "R_WS")
+    present = {name: x for name in names if (x := getattr(log, name)) is not None}
+    moved: dict[str, Any] = {k: resample(at[known], log.t, x) for k, x in present.items()}
     if log.bridged is not None:
         # A gap can belong to the wrench or to the motion, so both positions are flagged.
-        moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
-        bridged = log.bridged[known] | moved
-    advanced: dict[str, Any] = {"gravity": gravity, "R_WS": R_WS, "bridged": bridged}
-    return log.select_rows(known).with_motion(*motion, **advanced)
+        bridged = resample(at[known], log.t, log.bridged.astype(float)) > 0
+        moved["bridged"] = log.bridged[known] | bridged
+    return replace(log.select_rows(known), **moved)
 
 
 def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
@@ -190,7 +185,7 @@ def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     if log.bridged is None:
         return np.ones(len(log), bool)
     reach = 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
-    return ~widen_flags(log.bridged, reach)
+    return samples_to_nearest_flag(log.bridged) > reach
 
 
 def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
@@ -203,13 +198,6 @@ def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[
     count = min(math.ceil(length_s / log.dt - 1e-6), len(log) // 4)
     out[:count] = out[len(out) - count :] = True
     return out
-
-
-def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Return flags (N,) that are also True within `by` samples of a set flag."""
-    count = np.concatenate([[0], np.cumsum(flags)])
-    at = np.arange(len(flags))
-    return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]
 
 
 MAX_SEARCHED_DELAY_S = 0.25
@@ -228,8 +216,8 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
     gap = ~is_far_from_gaps(log, cutoff)
-    gap = widen_flags(gap, math.ceil(reach / log.dt)) if gap.any() else gap
-    inside = np.flatnonzero(inside & ~gap)
+    inside &= samples_to_nearest_flag(gap) > math.ceil(reach / log.dt)
+    inside = np.flatnonzero(inside)
     if len(inside) < _MIN_SAMPLES_FOR_DELAY:
         return None
     stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES_FOR_DELAY)

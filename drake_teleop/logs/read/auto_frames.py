@@ -42,17 +42,15 @@ def estimate_auto_imu_mounting(description: Description, source: str, read: Read
         at_Io = read(replace_imu_fields(frame=start, position=(0.0, 0.0, 0.0)))
         mounting = find_mounting(at_Io, alone, position=description.pose.position is not None)
     if frame == "auto":
-        found = _require_imu_rotation(mounting, f"{source}:imu.frame")
-        frame = tuple(map(tuple, found.R_SI.tolist()))
-        notes += _imu_rotation_notes(found)
+        mounting = _require_imu_rotation(mounting, f"{source}:imu.frame")
+        frame = tuple(map(tuple, mounting.R_SI.tolist()))
+        notes += _imu_rotation_notes(mounting)
     if position == "auto":
         at_Io = read(replace_imu_fields(frame=frame, position=(0.0, 0.0, 0.0)))
         lever = _lever_arm_from_pose_or_wrench(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
-        notes.append(
-            f"imu.position found: {_format_arm_mm(lever)} mm, from the {lever.source}; write it"
-            f" into the description as imu.position: {round_for_yaml(lever.p_SoIo_S)}"
-        )
+        found = f": {_format_arm_mm(lever)} mm, from the {lever.source}"
+        notes.append(_found_note("imu.position", found, lever.p_SoIo_S))
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
 
@@ -85,10 +83,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     nearest = found.nearest_right_angled_rotation.astype(int).tolist()
     oblique = f"{found.angle_to_right_angled_deg:.1f} deg from the right-angled mounting {nearest}"
     std = f"{float(found.deviations_deg.max()):.2g} deg"
-    notes = [
-        f"imu.frame found: {oblique}, standard deviation {std}; write it into the description as"
-        f" imu.frame: {round_for_yaml(found.R_SI)}"
-    ]
+    notes = [_found_note("imu.frame", f": {oblique}, standard deviation {std}", found.R_SI)]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
     if abs(found.lag_s) > MIN_WARNED_IMU_LAG_S:
@@ -119,6 +114,11 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
         remedy = "turn faster, about more axes, or give imu.position in metres"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     return lever
+
+
+def _found_note(field: str, found: str, value: Array) -> str:
+    written = f"{field}: {round_for_yaml(value)}"
+    return f"{field} found{found}; write it into the description as {written}"
 
 
 def round_for_yaml(x: Array) -> list:
@@ -159,10 +159,7 @@ def estimate_auto_pose_frame(description: Description, source: str, read: ReadLo
             remedy = "turn the sensor faster, about more axes, without contact; or give the values"
             raise DrakeTeleopError(what, where=f"{source}:pose.{field}", remedy=remedy)
         changes[field] = tuple(map(tuple, value.tolist()) if value.ndim == 2 else value.tolist())
-        notes.append(
-            f"pose.{field} found, standard deviation {deviation}; write it into the description as"
-            f" pose.{field}: {round_for_yaml(value)}"
-        )
+        notes.append(_found_note(f"pose.{field}", f", standard deviation {deviation}", value))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 
 
@@ -215,9 +212,5 @@ def estimate_auto_gravity(description: Description, source: str, read: ReadLog) 
         what = "the data do not determine the direction of gravity"
         remedy = "record the load in more orientations, without contact; or give the vector"
         raise DrakeTeleopError(what, where=f"{source}:gravity", remedy=remedy)
-    gravity = tuple(round_for_yaml(estimated))
-    note = (
-        f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"
-        f" gravity: {list(gravity)}"
-    )
-    return description.model_copy(update={"gravity": gravity}), (note,)
+    note = _found_note("gravity", f", standard deviation {deviation:.2g} deg", estimated)
+    return description.model_copy(update={"gravity": tuple(round_for_yaml(estimated))}), (note,)

@@ -35,11 +35,10 @@ _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
 _CUT_REMEDY = "cut it, or write the topics one by one"
-_VECTOR_OF_MESSAGE_FIELD = {
-    **{name: name for name in ("force", "torque", "linear_acceleration", "angular_velocity")},
-    **{name: "orientation" for name in ("orientation", "rotation")},
-    **{name: "position" for name in ("position", "translation")},
-}
+_VECTOR_OF_MESSAGE_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
+_VECTOR_OF_MESSAGE_FIELD |= dict.fromkeys(("position", "translation"), "position")
+for _name in ("force", "torque", "linear_acceleration", "angular_velocity"):
+    _VECTOR_OF_MESSAGE_FIELD[_name] = _name
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -99,7 +98,12 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         if all(name in b and b[name].shape[1:] == values.shape[1:] for b in blocks)
     }
     received = columns.pop(_RECEPTION_TIME_COLUMN)
-    absent = _remove_fields_marked_absent(columns)
+    absent = tuple(
+        name.removesuffix("_covariance")
+        for name, values in columns.items()
+        if name.endswith("_covariance") and (values[:, 0] == -1).all()
+    )
+    columns = {k: x for k, x in columns.items() if k.rpartition(".")[0] not in absent}
     columns |= _columns_by_short_name(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
@@ -258,17 +262,6 @@ def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
                 yield path, value
         elif dataclasses.is_dataclass(value):
             yield from _numeric_fields(value, f"{path}.")
-
-
-def _remove_fields_marked_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
-    absent = tuple(
-        name.removesuffix("_covariance")
-        for name, values in columns.items()
-        if name.endswith("_covariance") and (values[:, 0] == -1).all()
-    )
-    for name in [name for name in columns if name.rpartition(".")[0] in absent]:
-        del columns[name]
-    return absent
 
 
 def _columns_by_short_name(columns: dict[str, NDArray]) -> dict[str, NDArray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -155,23 +155,18 @@ def describe_canonical(path: Path, table: Table) -> Description:
     Rows are static poses if `t` is absent, or if they are slower than 5 Hz and gravity turns by
     more than 10 deg in a fifth of the steps.
     """
-
-    def are_columns_present(names: Sequence[str]) -> bool:
-        found = [name for name in names if name in table.columns]
-        if found and len(found) < len(names):
-            table.finite_numbers(names, len(names), str(path))
-        return bool(found)
-
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"
         remedy = "describe it in a YAML file; `drake-teleop inspect` drafts one"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     table.finite_numbers(WRENCH_COLUMNS, 6, str(path))
-    fields: dict[str, dict[str, Any]] = {
-        name: {"columns": names}
-        for name, names in _KINEMATIC_COLUMNS.items()
-        if are_columns_present(names)
-    }
+    fields: dict[str, dict[str, Any]] = {}
+    for name, names in _KINEMATIC_COLUMNS.items():
+        present = [column for column in names if column in table.columns]
+        if present and len(present) < len(names):
+            table.finite_numbers(names, len(names), str(path))
+        if present:
+            fields[name] = {"columns": names}
     if "orientation" in fields:
         fields["orientation"]["form"] = "quaternion_wxyz"
     force, torque = {"columns": WRENCH_COLUMNS[:3]}, {"columns": WRENCH_COLUMNS[3:]}

@@ -42,9 +42,6 @@ class Clock:
     notes: tuple[str, ...] = ()
     num_episodes: int = 1
 
-    def select_timed_rows(self, x: Array) -> Array:
-        return x if len(self.kept_rows) == self.num_rows else x[self.kept_rows]
-
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
     """Return checked and corrected times of a stream's rows.
@@ -52,21 +49,18 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     A row that repeats the time stamp and the values in `columns` of the previous row is removed.
     """
     t, episodes = time_stamps_and_num_episodes(time, table, where)
-    total, rows = len(t), np.flatnonzero(np.isfinite(t))
+    total, rows, notes = len(t), np.flatnonzero(np.isfinite(t)), []
     if time.column is None:
         return Clock(_apply_clock_scale_and_offset(t, time), rows, total)
-    notes = []
-    if len(rows) < len(t):
-        notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
+    if len(rows) < total:
+        notes.append(f"{total - len(rows)} rows without a time stamp are removed")
     _check_stamps_go_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
-        before = len(rows)
-        rows = _remove_repeated_rows(rows, t, table, columns, where)
-        if len(rows) < before:
-            notes.append(
-                f"{before - len(rows)} rows that repeat the previous row and its time stamp"
-                " are removed"
-            )
+        same = _find_repeated_rows(rows, t, table, columns, where)
+        rows = rows[~same]
+        if same.any():
+            text = f"{same.sum()} rows that repeat the previous row and its time stamp are removed"
+            notes.append(text)
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
     if shared:
@@ -82,8 +76,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
             f" {np.abs(even - t).max():.2g} s"
         )
         t = even
-    _check_rate_is_plausible(t, time, where)
-    _check_stamps_are_even(t, rows, table, where)
+    _check_steps(t, rows, time, table, where)
     return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
 
 
@@ -127,22 +120,6 @@ def _row_numbers_without_other_streams(table: Table) -> NDArray[np.intp]:
             if not known[kept].any():
                 only_others |= known
     return np.searchsorted(np.flatnonzero(~only_others), kept)
-
-
-def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
-    """Return a note about the episodes of a wrench's clock; raise an error for several files."""
-    if num_files > 1:
-        what = (
-            f"the clock starts {clock.num_episodes} times, which requires all streams in one file"
-        )
-        remedy = "write all streams into one table, or each episode into files of its own"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
-    if not where.endswith("wrench.time"):
-        return []
-    return [
-        f"the clock starts {clock.num_episodes} times: the episodes follow each other, 1 s or more"
-        " apart; samples near their ends are not used"
-    ]
 
 
 def join_episodes(t: Array) -> tuple[Array, int]:
@@ -215,15 +192,15 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     return line + smooth
 
 
-def _remove_repeated_rows(
+def _find_repeated_rows(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
-) -> NDArray[np.intp]:
+) -> NDArray[np.bool_]:
     values = [table.numbers_with_nan(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0
     for x in values:
         same &= ((x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))).all(axis=1)
-    return rows[np.concatenate([[True], ~same])]
+    return np.concatenate([[False], same])
 
 
 def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
@@ -240,11 +217,22 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
         raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
 
 
-def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
+def _check_steps(t: Array, rows: NDArray[np.intp], time: Time, table: Table, where: str) -> None:
     if len(t) < 2:
         return
-    step = float(np.median(np.diff(t)))
+    steps = np.diff(t)
+    step = float(np.median(steps))
     if 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
+        if len(t) > 2 and t[-1] - t[0] > _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * step:
+            longest = int(np.argmax(steps))
+            row = table.line_in_file(rows[longest + 1])
+            raise DrakeTeleopError(
+                f"the time stamps are too uneven: median step {step:.3g} s, mean"
+                f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that),"
+                f" longest {steps[longest]:.3g} s to row {row} of {table.path.name}",
+                where=where,
+                remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",
+            )
         return
     counts = step / SI_VALUE_OF_UNIT[time.unit]
     # Typical sensor rates are 20 Hz to 10 kHz.
@@ -257,18 +245,3 @@ def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
         f" {1 / MIN_RATE_HZ:g} s are plausible), a rate of {1 / step:.3g} Hz"
     )
     raise DrakeTeleopError(what, where=f"{where}.unit", remedy=remedy)
-
-
-def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
-    steps = np.diff(t)
-    if len(t) < 3 or t[-1] - t[0] <= _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * np.median(steps):
-        return
-    longest = int(np.argmax(steps))
-    row = table.line_in_file(rows[longest + 1])
-    raise DrakeTeleopError(
-        f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
-        f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that), longest"
-        f" {steps[longest]:.3g} s to row {row} of {table.path.name}",
-        where=where,
-        remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",
-    )

@@ -22,7 +22,6 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.read import description_fields as fields
 from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY, Column, Number, StrictModel
 
@@ -280,28 +279,28 @@ class Description(StrictModel):
             return self
         if self.wrench is None:
             raise ValueError("no wrench: add wrench (from any file), or only static (at rest)")
-        if self.imu is None and self.pose is None:
-            raise ValueError("a wrench without kinematics: add imu or pose (from any file)")
-        if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
-            raise ValueError("the angular velocity is missing: add imu.angular_velocity or pose")
-        if self.pose is None and (self.imu is None or self.imu.specific_force is None):
-            raise ValueError("the specific force is missing: add imu.specific_force or pose")
-        if self.pose is None and self.imu is not None and self.imu.frame == "auto":
-            raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
-        if self.pose is not None and self.pose.is_frame_auto and self.wrench.frame == "base":
+        if self.pose is None:
+            if self.imu is None:
+                raise ValueError("a wrench without kinematics: add imu or pose (from any file)")
+            if self.imu.angular_velocity is None:
+                raise ValueError(
+                    "the angular velocity is missing: add imu.angular_velocity or pose"
+                )
+            if self.imu.specific_force is None:
+                raise ValueError("the specific force is missing: add imu.specific_force or pose")
+            if self.imu.frame == "auto":
+                raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
+            if self.wrench.weight is not None:
+                raise ValueError("wrench.weight requires an orientation: add pose")
+        elif self.pose.is_frame_auto and self.wrench.frame == "base":
             raise ValueError("pose: auto needs a wrench in the axes of the sensor, not in base")
-        self._check_weight(self.wrench)
-        return self
-
-    def _check_weight(self, wrench: Wrench) -> None:
-        if wrench.weight is not None and self.pose is None:
-            raise ValueError("wrench.weight requires an orientation: add pose")
         pose = self.pose is not None and self.pose.is_frame_auto
         kinds = {"pose: auto": pose, "gravity: auto": self.gravity == "auto"}
-        kinds["wrench.weight"] = wrench.weight is not None
+        kinds["wrench.weight"] = self.wrench.weight is not None
         both = [name for name, present in kinds.items() if present]
         if len(both) > 1:
             raise ValueError(f"{' and '.join(both)} cannot be combined: give one of them alone")
+        return self
 
     @property
     def streams(self) -> dict[str, Any]:
@@ -314,17 +313,10 @@ class Description(StrictModel):
         """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
-    def poses_with_frame(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
-        assert self.pose is not None
-        origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
-        rotation = np.eye(3) if rotation is None else rotation
-        return PosesOfLog(poses, self.gravity_W, np.array(origin), rotation, imu)
-
     def unit_in_si(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
-        return (
-            float(np.linalg.norm(self.gravity_W)) if unit == "g" else fields.SI_VALUE_OF_UNIT[unit]
-        )
+        in_si = fields.SI_VALUE_OF_UNIT
+        return float(np.linalg.norm(self.gravity_W)) if unit == "g" else in_si[unit]
 
 
 def load_description(path: str | Path) -> Description:

@@ -8,19 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, position_of_parabola_minimum
+from drake_teleop.common.numeric import Array, search_minimum
 from drake_teleop.common.rotations import right_angled_rotations, rotation_matrices
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.read.alignment import (
-    estimate_delay,
-    is_far_from_gaps,
-    low_pass,
-    low_pass_log,
-    remove_delay,
-    resample,
-)
+from drake_teleop.logs.read import alignment
+from drake_teleop.logs.read.alignment import low_pass_log, resample
 from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
@@ -55,14 +49,7 @@ def lag_of_imu_clock(
         parts = np.split(moved, len(expected), axis=1)
         return sum(_unexplained_share(y, x) for y, x in zip(expected, parts, strict=True))
 
-    step = 0.01
-    shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
-    costs = np.array([unexplained_at_shift(shift) for shift in shifts])
-    best = int(np.argmin(costs))
-    lag = float(shifts[best])
-    if 0 < best < len(shifts) - 1:
-        lag += step * position_of_parabola_minimum(*costs[best - 1 : best + 2])
-    return lag
+    return search_minimum(unexplained_at_shift, 0.01, reach)[0]
 
 
 def mid_record_lag_and_clock_drift(
@@ -179,14 +166,15 @@ class LeverArm:
 
     @property
     def is_determined_by_axis(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where the standard deviation is below 5 mm."""
         return self.deviations < MAX_LEVER_ARM_DEVIATION_M
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     """Return the accelerometer's position, Eq. (T21); None for a poor fit or few samples."""
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_pass_log(remove_delay(log, estimate_delay(log, None) or 0.0), cutoff)
+    smooth = low_pass_log(
+        alignment.remove_delay(log, alignment.estimate_delay(log, None) or 0.0), cutoff
+    )
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
     if len(t) < NUM_COMPARED_SAMPLES // 10:
@@ -216,7 +204,9 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 def times_outside_gaps(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, NUM_COMPARED_SAMPLES)
-    known = [np.interp(t, x.t, is_far_from_gaps(x, cutoff).astype(float)) > 0.99 for x in logs]
+    known = [
+        np.interp(t, x.t, alignment.is_far_from_gaps(x, cutoff).astype(float)) > 0.99 for x in logs
+    ]
     return t[np.all(known, axis=0)]
 
 
@@ -229,7 +219,9 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) True for axes along which the motion K determines a lever arm."""
     alpha = log.angular_acceleration
-    above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
+    above = alignment.low_pass(alpha, log.dt, 2 * cutoff) - alignment.low_pass(
+        alpha, log.dt, cutoff
+    )
     noise = above.var(axis=0) / 7
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)
@@ -289,7 +281,6 @@ class Mounting:
 
     @property
     def is_right_angled(self) -> bool:
-        """Whether R_SI maps axes to axes, within 5 deg."""
         return self.angle_to_right_angled_deg < MAX_RIGHT_ANGLE_ERROR_DEG
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,13 @@ from drake_teleop.common import rotations
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation
-from drake_teleop.logs.pose_motion.poses import ImuData, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.read import alignment, auto_frames, streams, table_files
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angular_motion, resample
 from drake_teleop.logs.read.auto_frames import restore_removed_weight
 from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
+from drake_teleop.logs.read.clocks import Clock, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
     Description,
     Imu,
@@ -101,20 +102,19 @@ class _LogReader:
             if keep_time_origin:
                 self.notes.append("each row is interpreted as a pose at rest")
             return self._read_static_poses(self.description.static)
-        assert self.description.wrench is not None
-        weight = self.description.wrench.weight
-        causes = {"gravity": self.description.gravity == "auto", "weight": weight == "removed"}
-        free = tuple(name for name, is_free in causes.items() if is_free)
-        if self.description.gravity == "auto":
+        stream = self.description.wrench
+        assert stream is not None
+        weight, gravity = stream.weight, self.description.gravity
+        free = {"gravity": gravity == "auto", "weight": weight == "removed"}
+        if gravity == "auto":
             self._replace_auto_fields(auto_frames.estimate_auto_gravity)
         if self.description.pose is not None and self.description.pose.is_frame_auto:
             self._replace_auto_fields(auto_frames.estimate_auto_pose_frame, differentiate=False)
         if self.description.imu is not None and self.description.imu.is_mounting_auto:
             self._replace_auto_fields(auto_frames.estimate_auto_imu_mounting)
-        table = self._table_of_stream(self.description.wrench)
-        clock = self._read_clock_and_gaps("wrench", self.description.wrench, table)
-        wrench = self._read_wrench("wrench", self.description.wrench, table, clock.num_rows)
-        wrench = clock.select_timed_rows(wrench)
+        table = self._table_of_stream(stream)
+        clock = self._read_clock_and_gaps("wrench", stream, table)
+        wrench = self._read_wrench("wrench", stream, table, clock.num_rows)[clock.kept_rows]
         pose = imu = None
         if self.description.pose is not None:
             pose = self._read_pose(self.description.pose, differentiate=differentiate)
@@ -122,18 +122,12 @@ class _LogReader:
             imu = self._read_imu(self.description.imu, pose)
         kinematics = [stream for stream in (imu, pose) if stream is not None]
         t = streams.uniform_times_of_streams(clock.t, kinematics, self.source)
-        wrench = resample(t, clock.t, wrench)
-        log = self._make_log(t, wrench, imu, pose)
-        posed, gain_std = None, self.description.wrench.gain_std
-        if pose is not None and pose.recorded_poses is not None:
-            inertial = None if imu is None else imu.imu_data
-            posed = self.description.poses_with_frame(pose.recorded_poses, inertial)
-        log = replace(log, gain_std=gain_std, estimated=free, described=self.description)
-        log = replace(log, posed=posed)
+        log = self._make_log(t, resample(t, clock.t, wrench), imu, pose)
+        log = replace(log, estimated=tuple(name for name, is_free in free.items() if is_free))
         log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
-        without = self.description.wrench.model_copy(update={"weight": None})
+        without = stream.model_copy(update={"weight": None})
         other = self.description.model_copy(update={"wrench": without})
         return restore_removed_weight(log, np.array(weight), self._read_edited_log(other))
 
@@ -156,27 +150,27 @@ class _LogReader:
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
-            self._read_vectors(name, field, quantity, table, rows, stream.sign)
-            for field, quantity in (("force", stream.force), ("torque", stream.torque))
+            self._read_vectors(f"{name}.{field}", table, rows, stream.sign)
+            for field in ("force", "torque")
         ]
         if isinstance(stream.frame, tuple):
             R = np.array(stream.frame)
             both = [vectors @ R.T for vectors in both]
         return np.hstack(both)
 
-    def _read_vectors(
-        self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
-    ) -> Array:
-        where = f"{self.source}:{name}.{field}.columns"
+    def _read_vectors(self, name: str, table: Table, rows: int, sign: float = 1.0) -> Array:
+        """Return the vectors (rows, 3) of a quantity such as `wrench.force` [SI]."""
+        quantity, where = attrgetter(name)(self.description), f"{self.source}:{name}.columns"
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self.description.unit_in_si(quantity.unit) * np.array(quantity.scale)
         of_table = table_files.note_that_table_needs_description(self.source)
         remedy = (
-            f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
+            f"if these are raw counts, set {name}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_magnitude(values, *streams.MAX_PLAUSIBLE_VALUES[field], where, remedy)
+        limit = streams.MAX_PLAUSIBLE_VALUES[name.partition(".")[2]]
+        table.check_magnitude(values, *limit, where, remedy)
         return values
 
     def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -190,7 +184,7 @@ class _LogReader:
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, recorded_poses=raw)
         dt = alignment.mean_time_step(t)
-        self._raise_one_sided_length_to_window(dt)
+        self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
         raw_R = rotations.rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -204,9 +198,7 @@ class _LogReader:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            quantity = "pose", "position", stream.position
-            position = self._read_vectors(*quantity, table, clock.num_rows)
-            position = clock.select_timed_rows(position)
+            position = self._read_vectors("pose.position", table, clock.num_rows)[clock.kept_rows]
         where, form = f"{self.source}:pose.orientation", stream.orientation
         orientations = OrientationColumns(self.description, form, table, clock.num_rows, where)
         quaternion = orientations.allocate_quaternions(len(clock.kept_rows))
@@ -231,34 +223,37 @@ class _LogReader:
         dt = alignment.mean_time_step(t)
 
         def imu_vectors(field: str, sign: float = 1.0) -> Array | None:
-            quantity = getattr(stream, field)
-            if quantity is None:
+            if getattr(stream, field) is None:
                 return None
-            values = self._read_vectors("imu", field, quantity, table, clock.num_rows, sign)
-            values = resample(t, raw_t, clock.select_timed_rows(values))
-            return self._imu_to_S(stream.frame, values, t, pose)
+            values = self._read_vectors(f"imu.{field}", table, clock.num_rows, sign)
+            values = resample(t, raw_t, values[clock.kept_rows])
+            if stream.frame == "sensor":
+                return values
+            if isinstance(stream.frame, tuple):
+                return values @ np.array(stream.frame).T
+            if pose is None or pose.R_WS is None:
+                raise self._no_R_WS_error("imu")
+            R_WS = nearest_rotation(resample(t, pose.t, pose.R_WS))
+            return streams.rotate_world_to_S(R_WS, values)
 
         s = imu_vectors("specific_force", stream.sign)
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._raise_one_sided_length_to_window(dt)
+            self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
             alpha = alignment.smooth_derivatives(omega, dt, self.bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = streams.specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
+            turning: list[Any] = [omega, alpha]
+            if omega is None:
+                assert pose is not None
+                both = pose.angular_velocity, pose.angular_acceleration
+                turning = [resample(t, pose.t, x) for x in both if x is not None]
+            p, (omega_S, alpha_S) = np.array(stream.position), turning
+            s = s - np.cross(alpha_S, p) - np.cross(omega_S, np.cross(omega_S, p))  # Io to So
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
         outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt
-        both = (None if x is None else x[outside_gaps] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
-
-    def _imu_to_S(self, frame: Any, vectors: Array, t: Array, pose: Stream | None) -> Array:
-        if isinstance(frame, tuple):
-            return vectors @ np.array(frame).T
-        if frame == "sensor":
-            return vectors
-        if pose is None or pose.R_WS is None:
-            raise self._no_R_WS_error("imu")
-        return streams.rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+        signals = (None if x is None else x[outside_gaps] for x in (s, omega))
+        return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *signals))
 
     def _no_R_WS_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         what = "vectors in the axes of the base cannot be rotated to S without an orientation"
@@ -269,10 +264,9 @@ class _LogReader:
         wrench = self._read_wrench("static", stream, table, table.rows)
         R_SW = None
         if stream.gravity is not None:
-            gravity = self._read_vectors("static", "gravity", stream.gravity, table, table.rows)
+            gravity = self._read_vectors("static.gravity", table, table.rows)
         elif stream.specific_force is not None:
-            quantity = stream.specific_force
-            gravity = -self._read_vectors("static", "specific_force", quantity, table, table.rows)
+            gravity = -self._read_vectors("static.specific_force", table, table.rows)
         else:
             assert stream.orientation is not None
             where, form = f"{self.source}:static.orientation", stream.orientation
@@ -291,23 +285,19 @@ class _LogReader:
             what = f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)"
             remedy = "record 12 or more, with different orientations"
             raise DrakeTeleopError(what, where=f"{self.source}:static", remedy=remedy)
-        rest = np.zeros((n, 3))
+        rest, steps = np.zeros((n, 3)), []
+        for name, quantity in (("force", stream.force), ("torque", stream.torque)):
+            values = table.finite_numbers(quantity.columns, 3, f"static.{name}", table.rows)
+            unit = self.description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
+            steps.append(decimal_resolution(values) * unit)
         return Log(
             *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),
             notes=tuple(self.notes),
             source=self.source,
             gain_std=stream.gain_std,
             described=self.description,
-            resolution=self._quantization_steps(stream, table),
+            resolution=(steps[0], steps[1]),
         )
-
-    def _quantization_steps(self, stream: Static, table: Table) -> tuple[float, float]:
-        steps = []
-        for name, quantity in (("force", stream.force), ("torque", stream.torque)):
-            values = table.finite_numbers(quantity.columns, 3, f"static.{name}", table.rows)
-            unit = self.description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
-            steps.append(decimal_resolution(values) * unit)
-        return steps[0], steps[1]
 
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         clock = read_clock(stream.time, table, stream.columns, f"{self.source}:{name}.time")
@@ -323,8 +313,16 @@ class _LogReader:
             )
         found_gaps = find_gaps_in_times(t, self.bandwidth_hz)
         if clock.num_episodes > 1:
-            files = len({stream.source for stream in self.description.streams.values()})
-            self.notes += episodes_note(clock, files, f"{self.source}:{name}.time")
+            starts = f"the clock starts {clock.num_episodes} times"
+            if len({stream.source for stream in self.description.streams.values()}) > 1:
+                what = f"{starts}, which requires all streams in one file"
+                remedy = "write all streams into one table, or each episode into files of its own"
+                raise DrakeTeleopError(what, where=f"{self.source}:{name}.time", remedy=remedy)
+            if name == "wrench":
+                self.notes.append(
+                    f"{starts}: the episodes follow each other, 1 s or more apart; samples near"
+                    " their ends are not used"
+                )
         elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self.notes.append(
@@ -340,9 +338,6 @@ class _LogReader:
         window = SMOOTHER_WINDOW_OVER_PERIOD / self.bandwidth_hz if self.bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _raise_one_sided_length_to_window(self, dt: float) -> None:
-        self.one_sided_s = max(self.one_sided_s, self._half_smoother_window_s(dt))
-
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
@@ -350,32 +345,41 @@ class _LogReader:
                     return streams.resample_to_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
-        gravity = R_WS = None
-        described, described_pose = self.description.wrench, self.description.pose
-        in_base = described is not None and described.frame == "base"
+        gravity = R_WS = posed = None
+        described, wrench_stream = self.description, self.description.wrench
+        assert wrench_stream is not None
+        in_base = wrench_stream.frame == "base"
         if pose is not None and pose.R_WS is not None:
             R_WS = nearest_rotation(streams.resample_to_clock(t, pose, pose.R_WS))
-            gravity = np.swapaxes(R_WS, 1, 2) @ self.description.gravity_W
+            gravity = np.swapaxes(R_WS, 1, 2) @ described.gravity_W
             if in_base:
                 wrench = streams.rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
             raise self._no_R_WS_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
-        if not accelerometer and described_pose and described_pose.position is None:
+        if not accelerometer and described.pose and described.pose.position is None:
             self.notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
+        if described.pose and pose is not None and pose.recorded_poses is not None:
+            inertial = None if imu is None else imu.imu_data
+            R_SP = np.eye(3) if described.pose.R_SP is None else described.pose.R_SP
+            p_SoPo_S = np.array(described.pose.position_in_sensor)
+            posed = PosesOfLog(pose.recorded_poses, described.gravity_W, p_SoPo_S, R_SP, inertial)
         names = ("specific_force", "angular_velocity", "angular_acceleration")
         s, omega, alpha = map(signal_on_clock, names)
         return Log(
             *(t, wrench, s, omega, alpha),
             gravity=gravity,
             R_WS=R_WS,
-            gravity_W=None if R_WS is None else self.description.gravity_W,
+            gravity_W=None if R_WS is None else described.gravity_W,
             bridged=self._flag_bridged_samples(t),
             notes=tuple(self.notes),
             source=self.source,
+            posed=posed,
+            gain_std=wrench_stream.gain_std,
             one_sided_s=self.one_sided_s,
+            described=described,
         )
 
     def _flag_bridged_samples(self, t: Array) -> NDArray[np.bool_] | None:

@@ -63,23 +63,6 @@ def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     return np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
-def specific_force_at_So(
-    s: Array,
-    p_SoIo_S: Array,
-    t: Array,
-    omega: Array | None,
-    alpha: Array | None,
-    pose: Stream | None,
-) -> Array:
-    """Return the specific force (N, 3) of So from that of Io, a point of the same rigid body."""
-    if omega is None or alpha is None:
-        assert pose is not None and pose.angular_velocity is not None
-        assert pose.angular_acceleration is not None
-        omega = resample(t, pose.t, pose.angular_velocity)
-        alpha = resample(t, pose.t, pose.angular_acceleration)
-    return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))
-
-
 class OrientationColumns:
     """Columns of a table with orientations of S, or of the posed frame P, in any form."""
 
@@ -131,12 +114,9 @@ class OrientationColumns:
 
 def uniform_times_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
     """Return uniform times at the wrench's rate, within the time spans of all streams."""
-    start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
-    stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
-    spans = "; ".join(
-        f"{name} {t[0]:.6g} to {t[-1]:.6g} s"
-        for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
-    )
+    named = [("wrench", wrench_t), *((stream.name, stream.t) for stream in streams)]
+    start, stop = max(t[0] for _, t in named), min(t[-1] for _, t in named)
+    spans = "; ".join(f"{name} {t[0]:.6g} to {t[-1]:.6g} s" for name, t in named)
     if stop <= start:
         what = f"the streams do not overlap in time ({spans})"
         remedy = "check time.unit of each stream, or shift its clock by time.offset"

@@ -1,16 +1,21 @@
 """Reading of tables from text, Excel, Parquet, Arrow, JSON lines, NumPy, MATLAB, HDF5 and Zarr.
 
 Nested columns become several: `name.field` for the fields of a structure, and `name[k]` for the
-elements of a list or array of constant length, besides the whole as `name`.
+elements of a list or array of constant length, besides the whole as `name`. Separator, decimal
+sign, header and encoding (UTF-8, UTF-16) of text are detected. Lines with `#` before the header are
+comments, except column names directly before the numbers.
 """
 
 from __future__ import annotations
 
+import codecs
 import math
 import os
+import re
 import zipfile
-from collections import UserDict
 from collections.abc import Callable, Mapping, MutableMapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,8 +27,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
-from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.tables import Table
+from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -32,6 +36,15 @@ _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
 _WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
+_INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
+_ROWS_FOR_TYPE_INFERENCE = 1000  # rows from which column types are inferred
+_UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
+_BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
+_QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
+_THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
+_QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
+_DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
 
 
@@ -71,6 +84,97 @@ def _read_text(path: Path, header: bool = True) -> Table:
     return Table(path, _add_lower_case_names_if_canonical(columns), first_row)
 
 
+def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
+    """Return the table of a CSV file, and the number of its first data line."""
+    import polars as pl
+
+    with path.open("rb") as file:
+        head = file.read(_INSPECTED_HEAD_BYTES)
+    source: Path | bytes = path
+    if head.startswith(_UTF_16_MARKS):
+        source = path.read_text("utf-16").encode()
+        head = source[:_INSPECTED_HEAD_BYTES]
+    if (text := _normalize_line_ends_and_decimal_commas(path, source, head)) is not None:
+        source, head = text, text[:_INSPECTED_HEAD_BYTES]
+    lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
+    table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
+    before = next(table, 0)
+    rest = lines[before:]
+    separator = _find_separator(rest[0]) if rest else ","
+    if separator == " " and any(line != " ".join(line.split()) for line in rest):
+        text = path.read_bytes() if isinstance(source, Path) else source
+        aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
+        source = b"\n".join([b" ".join(line.split()) for line in aligned])
+        rest = [" ".join(line.split()) for line in rest]
+    names = _names_in_comment(lines[:before], rest, separator) if header else None
+    header = header and names is None
+    cells = (cell for line in rest for cell in line.split(separator))
+    parse = partial(
+        pl.read_csv,
+        source,
+        has_header=header,
+        separator=separator,
+        decimal_comma=separator in ";\t" and any(map(_DECIMAL_COMMA_CELL_PATTERN.fullmatch, cells)),
+        skip_lines=before,
+        try_parse_dates=True,
+    )
+    frame = None
+    with suppress(pl.exceptions.ComputeError):
+        frame = parse(infer_schema_length=_ROWS_FOR_TYPE_INFERENCE)
+    if frame is None or not all(kind.is_numeric() for kind in frame.dtypes):
+        frame = parse(infer_schema_length=None)
+    if names is not None:
+        frame.columns = names
+    return frame, before + (2 if header else 1)
+
+
+def _normalize_line_ends_and_decimal_commas(
+    path: Path, source: Path | bytes, head: bytes
+) -> bytes | None:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _INSPECTED_HEAD_BYTES))
+        tail = file.read() if isinstance(source, Path) else source
+    returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
+    # "1,500" can be 1500.
+    commas = [found for found in commas if not _THOUSANDS_PATTERN.fullmatch(b",".join(found))]
+    if not (returns or commas or _length_without_blank_end(tail) < len(tail)):
+        return None
+    text = path.read_bytes() if isinstance(source, Path) else source
+    text = _LONE_CR_PATTERN.sub(b"\n", text) if returns else text
+    text = _QUOTED_NUMBER_PATTERN.sub(rb"\1.\2", text) if commas else text
+    return text[: _length_without_blank_end(text)]
+
+
+def _length_without_blank_end(text: bytes) -> int:
+    line = text.find(b"\n", len(text.rstrip(_BLANK_BYTES)))
+    return len(text) if line < 0 else line + 1
+
+
+def _find_separator(line: str) -> str:
+    bare = _QUOTED_TEXT_PATTERN.sub("", line).strip()
+    if ";" in bare or "\t" in bare:
+        return ";" if ";" in bare else "\t"
+    return " " if "," not in bare and " " in bare else ","
+
+
+def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+    marked = [line for line in comments if line.startswith("#")]
+    if not marked or not all(_is_number(cell) for cell in rest[0].split(separator)):
+        return None
+    cells = None if separator == " " else separator
+    names = [name.strip() for name in marked[-1].lstrip("# ").split(cells)]
+    matching = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
+    return names if matching else None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
 def _strip_column_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
@@ -84,7 +188,7 @@ def _add_lower_case_names_if_canonical(columns: dict[str, _ColumnType]) -> dict[
     return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
 
 
-def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
+def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
     import polars as pl
 
     kind = path.suffix.lower()
@@ -99,76 +203,54 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
     columns = _column_expressions(frame)
     rows = frame.select(pl.len()).collect().item()
     if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
-        return _LazyColumns(frame, columns)  # each is read on access, to limit memory
+
+        def read_column(name: str) -> NDArray:
+            return _to_numpy(frame.select(columns[name].alias("x")).collect().to_series())
+
+        return ColumnsOnAccess(columns, read_column)  # to limit memory
     return _collect_columns(frame, columns)
-
-
-def numeric_and_nested_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
-    """Return columns of numbers, and elements of lists and structures, of a frame by name."""
-    frame = frame.select(numeric_or_nested_column_names(frame)).collect().lazy()
-    return _collect_columns(frame, _column_expressions(frame))
-
-
-def numeric_or_nested_column_names(frame: pl.LazyFrame) -> list[str]:
-    """Return the names of the columns of numbers, lists and arrays."""
-    import polars as pl
-
-    return [
-        name
-        for name, dtype in frame.collect_schema().items()
-        if dtype.is_numeric() or isinstance(dtype, (pl.List, pl.Array))
-    ]
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     import polars as pl
 
     columns: dict[str, pl.Expr] = {}
+
+    def add(label: str, column: pl.Expr, dtype: Any) -> None:
+        length = 0
+        if isinstance(dtype, pl.Struct):
+            for field in dtype.fields:
+                add(f"{label}.{field.name}", column.struct.field(field.name), field.dtype)
+            return
+        if isinstance(dtype, pl.List):
+            lengths = frame.select(column.list.len().drop_nulls().unique()).collect().to_series()
+            if not dtype.inner.is_numeric() or len(lengths) != 1 or not lengths[0]:
+                return
+            column, length = column.list.to_array(lengths[0]), int(lengths[0])
+        elif isinstance(dtype, pl.Array):
+            if not (dtype.inner.is_numeric() or isinstance(dtype.inner, pl.Array)):
+                return
+            length = dtype.shape[0] if len(dtype.shape) == 1 else 0
+        elif isinstance(dtype, (pl.Binary, pl.Object)):
+            return
+        for k in range(min(length, _MAX_ELEMENT_COLUMNS)):
+            columns[f"{label}[{k}]"] = column.arr.get(k)
+        columns[label] = column
+
     for name, dtype in frame.collect_schema().items():
-        columns |= _expand_nested_column(name.strip(), pl.col(name), dtype, frame)
+        add(name.strip(), pl.col(name), dtype)
     _strip_column_names(list(frame.collect_schema()))
     return _add_lower_case_names_if_canonical(columns)
+
+
+def columns_of_frame(frame: pl.LazyFrame) -> dict[str, NDArray]:
+    """Return the columns of a frame, and the elements of lists and structures, by name."""
+    return _collect_columns(frame, _column_expressions(frame))
 
 
 def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
     whole = frame.select(column.alias(name) for name, column in columns.items()).collect()
     return {series.name: _to_numpy(series) for series in whole.get_columns()}
-
-
-def _expand_nested_column(
-    label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame
-) -> dict[str, pl.Expr]:
-    import polars as pl
-
-    if isinstance(dtype, pl.Struct):
-        parts: dict[str, pl.Expr] = {}
-        for field in dtype.fields:
-            of_field = column.struct.field(field.name)
-            parts |= _expand_nested_column(f"{label}.{field.name}", of_field, field.dtype, frame)
-        return parts
-    if isinstance(dtype, pl.List):
-        lengths = frame.select(column.list.len().drop_nulls().unique()).collect().to_series()
-        if not dtype.inner.is_numeric() or len(lengths) != 1 or not lengths[0]:
-            return {}
-        column, length = column.list.to_array(lengths[0]), int(lengths[0])
-    elif isinstance(dtype, pl.Array):
-        if not (dtype.inner.is_numeric() or isinstance(dtype.inner, pl.Array)):
-            return {}
-        length = dtype.shape[0] if len(dtype.shape) == 1 else 0
-    else:
-        return {} if isinstance(dtype, (pl.Binary, pl.Object)) else {label: column}
-    length = min(length, _MAX_ELEMENT_COLUMNS)
-    elements = {f"{label}[{k}]": column.arr.get(k) for k in range(length)}
-    return {**elements, label: column}
-
-
-class _LazyColumns(UserDict[str, Any]):
-    def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
-        super().__init__(columns)
-        self._frame = frame
-
-    def __getitem__(self, key: str) -> NDArray:
-        return _to_numpy(self._frame.select(self.data[key].alias("x")).collect().to_series())
 
 
 def _to_numpy(series: pl.Series) -> NDArray:

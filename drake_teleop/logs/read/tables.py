@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections import UserDict
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -56,7 +56,12 @@ class Table:
         rows = np.flatnonzero(np.isfinite(np.hstack(numbers)).any(axis=1))
         if not 0 < len(rows) < self.rows:
             return self
-        columns = _SelectedRows(self.columns, rows)
+
+        def selected(name: str) -> NDArray:
+            column = self.columns[name]
+            return column[rows] if rows[-1] < len(column) else column
+
+        columns = ColumnsOnAccess(self.columns, selected)
         return replace(self, columns=columns, whole_table=self, kept_rows=rows)
 
     @property
@@ -173,14 +178,15 @@ def decimal_resolution(values: Array) -> float:
     return 0.0
 
 
-class _SelectedRows(UserDict[str, Any]):
-    def __init__(self, columns: MutableMapping[str, NDArray], rows: NDArray[np.intp]) -> None:
-        super().__init__(dict.fromkeys(columns))
-        self._columns, self._rows = columns, rows
+class ColumnsOnAccess(UserDict[str, Any]):
+    """Columns by name, which `read` returns at each access."""
+
+    def __init__(self, names: Iterable[str], read: Callable[[str], NDArray]) -> None:
+        super().__init__(dict.fromkeys(names))
+        self._read = read
 
     def __getitem__(self, key: str) -> NDArray:
-        column = self._columns[key]
-        return column[self._rows] if self._rows[-1] < len(column) else column
+        return self._read(key)
 
 
 def _column_to_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:
