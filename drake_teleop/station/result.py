@@ -13,13 +13,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from drake_teleop.common.errors import (
-    DrakeTeleopError,
-    expect_type,
-    refuse_polars_in_forked_process,
-    remedy_to_install_extra,
-    wrap_read_errors,
-)
+from drake_teleop.common import errors
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
 from drake_teleop.common.numeric import Array, float_array
 from drake_teleop.common.parquet_sizes import check_parquet
@@ -181,7 +176,7 @@ class SimulationResult:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
             what = f"{error.name or 'a library'} is not installed, but pandas frames require it"
-            remedy = remedy_to_install_extra("notebook")
+            remedy = errors.remedy_to_install_extra("notebook")
             raise DrakeTeleopError(what, where="to_pandas", remedy=remedy) from None
 
     def to_dataframe(self) -> pl.DataFrame:
@@ -257,9 +252,9 @@ class SimulationResult:
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
         parts = _files_of_log(path)
         for part in parts:
-            with wrap_read_errors(part, remedy, "is not a simulation result"):
+            with errors.wrap_read_errors(part, remedy, "is not a simulation result"):
                 check_parquet(part)
-        with wrap_read_errors(path, remedy, "is not a simulation result"):
+        with errors.wrap_read_errors(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(parts[0])[_SIGNAL_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = _read_columns(path, ["t"])[:, 0]
@@ -333,7 +328,7 @@ class _SignalsOnDisk(Mapping[str, Array]):
 
     def __getitem__(self, name: str) -> Array:
         columns = self._columns[name]
-        with wrap_read_errors(self._path, "write it again"):
+        with errors.wrap_read_errors(self._path, "write it again"):
             return _read_only_view(_read_columns(self._path, columns))
 
     def __contains__(self, name: object) -> bool:
@@ -368,7 +363,7 @@ def _files_of_log(path: Path) -> list[Path]:
 def _read_columns(path: Path, columns: list[str]) -> Array:
     import polars as pl
 
-    refuse_polars_in_forked_process()
+    errors.refuse_polars_in_forked_process()
     table = pl.read_parquet(_files_of_log(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"columns {', '.join(columns)} do not contain numbers")

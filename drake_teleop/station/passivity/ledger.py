@@ -13,6 +13,7 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
+from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.ledger_slave import (
     ANGLE_PER_LENGTH,
     CONTACT_DIRECTION,
@@ -42,24 +43,7 @@ from drake_teleop.station.passivity.ledger_slave import (
     work_along,
     wrench_component_along,
 )
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    MAX_HAND_WRENCH_RATE,
-    PACKET_LOAD_WRENCH,
-    PACKET_NUMBER,
-    POSE,
-    VELOCITY,
-    WRENCH,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    length_of_group,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-    scale_group,
-)
+from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, limit_group
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 _HAND_VELOCITY_FILTER_S = 4e-3
@@ -174,16 +158,16 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
-        memory[slots.STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
+        memory[slots.STORED_ENERGY][g] += fields.count_newly_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
-    if has_arrived(received):
-        pose_difference_into(pose, received[POSE], offset_to_slave)
+    if fields.has_arrived(received):
+        fields.pose_difference_into(pose, received[fields.POSE], offset_to_slave)
         for i in range(6):
             offset_to_slave[i] -= memory[_LOST_HAND_MOTION][i]
     _predict_contact(received, steady, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
-        wrench[i] += received[PACKET_LOAD_WRENCH][i]
-    newest = received[PACKET_NUMBER]
+        wrench[i] += received[fields.PACKET_LOAD_WRENCH][i]
+    newest = received[fields.PACKET_NUMBER]
     if newest > memory[_LAST_RECEIVED_PACKET_NUMBER] + 1.0:
         memory[_IS_WRENCH_CROSS_FADING] = 1.0
     memory[_LAST_RECEIVED_PACKET_NUMBER] = newest
@@ -199,13 +183,13 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[slots.STORED_ENERGY][g] -= surplus
         _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
-        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
         packet[PACKET_LEDGER_LEVEL][g] = memory[slots.STORED_ENERGY][g]
-    fill_packet(pose, velocity, wrench, packet)
+    fields.fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
         steady[i] = -memory[_LOST_HAND_MOTION][i]
-    move_pose_into(packet[POSE], steady, packet[POSE])
-    packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
+    fields.move_pose_into(packet[fields.POSE], steady, packet[fields.POSE])
+    packet[NEWEST_SLAVE_PACKET] = received[fields.PACKET_NUMBER]
 
 
 @njit(cache=True)
@@ -238,7 +222,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal = received[WRENCH], memory[CONTACT_DIRECTION]
+    contact_wrench, normal = received[fields.WRENCH], memory[CONTACT_DIRECTION]
     inward = memory[_DIRECTION_INTO_WALL]
     k = min(_CONTACT_STIFFNESS_FACTOR * received[PACKET_CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
     if not is_in_contact(contact_wrench, p):
@@ -266,7 +250,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     if onset or not wrench_component_along(contact_wrench, memory[MEAN_CONTACT_WRENCH], p) > 0.0:
         memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
     size = update_contact_direction(contact_wrench, received[ROUND_TRIP], T, p, memory)
-    damper, speed = received[PACKET_CONTACT_DAMPING], work_along(normal, received[VELOCITY])
+    damper, speed = received[PACKET_CONTACT_DAMPING], work_along(normal, received[fields.VELOCITY])
     depth = max(size + damper * speed, 0.0) / max(k, _MIN_WALL_STIFFNESS)
     depth -= work_along(normal, offset_to_slave)
     if onset:
@@ -281,7 +265,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         memory[_FRICTION_COEFFICIENT] = memory[_HAND_RETREAT_DISTANCE] = 0.0
         for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _UNMODELLED_FRICTION):
             memory[friction] = 0.0
-        copy_into(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
+        copy_into(memory, _LAST_SLAVE_POSE.start, received, fields.POSE.start, 7)
     fade = 1.0 - min(T / _HAND_OFFSET_FADE_S, 1.0)
     for i in range(6):
         offset[i] *= fade
@@ -299,8 +283,8 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     memory[_HAND_RETREAT_DISTANCE] = retreat
     force *= min(max(3.0 * (1.0 - retreat / _ZERO_FORCE_RETREAT_DISTANCE_M), 0.0), 1.0)
     last = memory[_LAST_SLAVE_POSE]
-    pose_difference_into(received[POSE], last, memory[_SLAVE_DISPLACEMENT])
-    copy_into(last, 0, received, POSE.start, 7)
+    fields.pose_difference_into(received[fields.POSE], last, memory[_SLAVE_DISPLACEMENT])
+    copy_into(last, 0, received, fields.POSE.start, 7)
     _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
@@ -320,7 +304,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     rest, normal = memory[_UNMODELLED_FRICTION], memory[CONTACT_DIRECTION]
     slave_step, cone = memory[_SLAVE_DISPLACEMENT], memory[_FRICTION_COEFFICIENT]
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
-    copy_into(wrench, 0, received, WRENCH.start, 6)
+    copy_into(wrench, 0, received, fields.WRENCH.start, 6)
     _remove_normal_component(wrench, p, memory)
     decay = min(T / max(_FRICTION_COEFFICIENT_DECAY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):
@@ -371,9 +355,9 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
     size = length_of_group(wrench, g)
-    most = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+    most = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
     if fading[g] > 0.0 and size > most:
-        scale_group(wrench, g, most / size)
+        fields.scale_group(wrench, g, most / size)
     else:
         fading[g] = 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -397,7 +381,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
     memory[_WITHHELD_WRENCH_SHARE][g] = 1.0 - share
     if not cost > 0.0:
         share *= _permitted_braking_share(g, dx, T, p, memory)
-    scale_group(wrench, g, share)
+    fields.scale_group(wrench, g, share)
 
 
 @njit(cache=True)

@@ -38,16 +38,11 @@ from drake_teleop.station.passivity import (
     wave,
 )
 from drake_teleop.station.passivity import memory as slots
+from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.four_channel import FourChannelConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.packet import (
-    PACKET_NUMBER,
-    PACKET_SIZE,
-    POSE,
-    SENDER_INPUTS_FINITE,
-    are_vectors_finite,
-)
+from drake_teleop.station.passivity.packet import are_vectors_finite
 from drake_teleop.station.passivity.pspm import PspmConfig
 from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
 from drake_teleop.station.passivity.tdpa import TdpaConfig, charged_tdpa_config
@@ -233,7 +228,7 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(slots.MEMORY_SIZE)
     memory[slots.COMMAND_POSE] = pose
-    memory[slots.LAST_HEALTHY_SENT_PACKET][POSE] = pose
+    memory[slots.LAST_HEALTHY_SENT_PACKET][fields.POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -261,12 +256,12 @@ def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
 @njit(cache=True)
 def _set_packet_number_and_health(healthy, memory, packet):
     if healthy:
-        packet[SENDER_INPUTS_FINITE] = 1.0
-        copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, PACKET_SIZE)
+        packet[fields.SENDER_INPUTS_FINITE] = 1.0
+        copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, fields.PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, slots.LAST_HEALTHY_SENT_PACKET.start, PACKET_SIZE)
-        packet[SENDER_INPUTS_FINITE] = 0.0
-    packet[PACKET_NUMBER] = memory[slots.STEP_COUNT]
+        copy_into(packet, 0, memory, slots.LAST_HEALTHY_SENT_PACKET.start, fields.PACKET_SIZE)
+        packet[fields.SENDER_INPUTS_FINITE] = 0.0
+    packet[fields.PACKET_NUMBER] = memory[slots.STEP_COUNT]
     memory[slots.STEP_COUNT] += 1.0
 
 
