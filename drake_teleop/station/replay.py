@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Meshcat, Rgba, SceneGraph
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
@@ -194,8 +194,7 @@ class ReplayScene:
         self._bodies = dict(self._draw_bodies_and_yield_moving_ones(meshcat))
         _draw_room_and_set_camera(meshcat, scenario, with_table=self._master is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
-        alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
-        self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
+        self._R_BW = scenario.kinematic_scaling.R_WB.T
         kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
         self._arrows = [
             (force, place, ForceArrow(meshcat, f"{force}_at_{place}", colour))

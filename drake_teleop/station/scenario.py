@@ -331,8 +331,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"
         remedy = "set it to pose, or remove network, passivity and contact_detection"
         raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
-    scaling = scenario.kinematic_scaling
-    scales = (scaling.translation_scale, scaling.rotation_scale)
+    scales = scenario.kinematic_scaling.scales
     if scenario.passivity.method != "none" and min(scales) < _MIN_KINEMATIC_SCALE_WITH_PASSIVITY:
         least = _MIN_KINEMATIC_SCALE_WITH_PASSIVITY
         what = f"passivity methods require kinematic scales >= {least:g}, not {min(scales):g}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
@@ -105,7 +104,7 @@ def MakeSlaveSide(
         else:
             connect_ports(builder, controller, "pose_command", ik, "pose_command")
 
-    R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
+    R_WB = scenario.kinematic_scaling.R_WB
     largest = scenario.wrist_sensor.largest_plausible_wrench()
     max_age_s = max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz)
     scaling = ForceScaling(scenario.force_scaling, arm, R_WB, largest, max_age_s)

@@ -99,8 +99,7 @@ def start_energy(scenario: Scenario) -> Array:
 
 
 def _kinematic_scales(scenario: Scenario) -> Array:
-    scaling = scenario.kinematic_scaling
-    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    scales = scenario.kinematic_scaling.scales
     return np.where(scales > 0.0, scales, 1.0)
 
 

@@ -5,7 +5,7 @@ wrench times motion of the slave's command is the work at the hand, docs/theory.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -112,29 +112,18 @@ METHODS = Registry(
 """All methods by name."""
 
 
-@settings
-@dataclass
-class MethodConfigs:
-    """Parameters of the shipped passivity methods."""
-
-    wave: WaveConfig = field(default_factory=WaveConfig)
-    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
-    charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)
-    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
-    pspm: PspmConfig = field(default_factory=PspmConfig)
-    ledger: LedgerConfig = field(default_factory=LedgerConfig)
-    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
-    local_force_limit: ForceLimitConfig = field(
-        default_factory=ForceLimitConfig, metadata={"method": "force_limit"}
-    )
-
-
-_CONFIG_FIELD_OF_METHOD = {f.metadata.get("method", f.name): f.name for f in fields(MethodConfigs)}
 _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
+@settings
 @dataclass
-class _CommonMethodConfig:
+class PassivityConfig:
+    """Method that keeps the station passive, and the parameters of each method.
+
+    The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
+    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
+    """
+
     method: str = choice(
         "none", (),
         "passivity method of the channel; two_layer, pspm, four_channel and force_limit are"
@@ -159,16 +148,14 @@ class _CommonMethodConfig:
         " mass and servo of the station's arm at the start", length=2,
     )  # fmt: skip
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
-
-
-@settings
-@dataclass
-class PassivityConfig(MethodConfigs, _CommonMethodConfig):
-    """Method that keeps the station passive, and the parameters of each method.
-
-    The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
-    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
-    """
+    wave: WaveConfig = field(default_factory=WaveConfig)
+    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
+    charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)
+    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
+    pspm: PspmConfig = field(default_factory=PspmConfig)
+    ledger: LedgerConfig = field(default_factory=LedgerConfig)
+    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
+    local_force_limit: ForceLimitConfig = field(default_factory=ForceLimitConfig)
 
     def check(self, where: str) -> None:
         METHODS.check(self.method, f"{where}.method")
@@ -184,8 +171,10 @@ class PassivityConfig(MethodConfigs, _CommonMethodConfig):
                     where=f"{where}.registered",
                     remedy="leave them out; a shipped method has its own block of parameters",
                 )
-            entry = _CONFIG_FIELD_OF_METHOD.get(self.method)
-            return None if entry is None else getattr(self, entry)
+            # The number `force_limit` is a limit of all methods.
+            name = "local_force_limit" if self.method == "force_limit" else self.method
+            own = getattr(self, name, None)
+            return own if is_dataclass(own) else None
         for name in self.registered:
             check_field_name(schema, name, f"{where}.registered.{name}")
         with unchecked_assignments():

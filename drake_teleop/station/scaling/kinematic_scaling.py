@@ -38,6 +38,16 @@ class KinematicScalingConfig:
         [0.0] * 3, "rad", -7.0, 7.0, "R_WB as roll, pitch, yaw (Drake's RollPitchYaw)"
     )
 
+    @property
+    def R_WB(self) -> Array:
+        """Alignment (3, 3) of the master's base B with the world."""
+        return RollPitchYaw(self.alignment).ToRotationMatrix().matrix()
+
+    @property
+    def scales(self) -> Array:
+        """Scales (2,) of translation and rotation, slave over master."""
+        return np.array([self.translation_scale, self.rotation_scale])
+
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
