@@ -322,23 +322,17 @@ class SimulationResult:
         return f"<b>SimulationResult</b>: {self._time_range_text()}{table}"
 
 
-class _SignalsOnDisk(Mapping[str, Array]):
+class _SignalsOnDisk(dict[str, Any]):
+    """Columns of each signal; an access by name reads the signal from the disk."""
+
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
-        self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
+        super().__init__((spec.name, spec.columns) for spec in specs)
+        self._path = path
 
     def __getitem__(self, name: str) -> Array:
-        columns = self._columns[name]
+        columns = super().__getitem__(name)
         with errors.wrap_read_errors(self._path, "write it again"):
             return _read_only_view(_read_columns(self._path, columns))
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._columns
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
 
 
 def _curve_extremes(t: Array, values: Array) -> tuple[Array, Array]:
