@@ -125,19 +125,15 @@ class LoadEstimator(LeafSystem):
         if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._load_state_index(discrete_state) == STATE_LEARNING:
-            self._update_estimate(estimate, sample, discrete_state, context.get_time())
-        else:
+        if self._load_state_index(discrete_state) != STATE_LEARNING:
             memory = discrete_state.get_mutable_value(2)
             monitor_load(estimate, memory, sample, *self._watch_arguments)
-
-    def _update_estimate(
-        self, estimate: Array, sample: Array, discrete_state: DiscreteValues, time: float
-    ) -> None:
+            return
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
+        step = round(context.get_time() / self._period)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _SAMPLES_PER_SETTLING_CHECK == 0
+        due = self._watches and step % _SAMPLES_PER_SETTLING_CHECK == 0
         if due and self._estimator.is_state_settled(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
