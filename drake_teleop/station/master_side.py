@@ -13,8 +13,7 @@ from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.operator import Operator
-from drake_teleop.station.scaling.joint_coupling import JointCoupling
-from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
+from drake_teleop.station.scaling.kinematic_scaling import JointCoupling, KinematicScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
 from drake_teleop.station.wiring import export_outputs
