@@ -16,15 +16,9 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
+from drake_teleop.station.slave import joint_commands
 from drake_teleop.station.slave.arm import ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
-from drake_teleop.station.slave.joint_commands import (
-    IK_METHODS,
-    ExcitationCommand,
-    JointRangeMonitor,
-    LeaderJointFollower,
-    ik_method_name,
-)
 from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
 from drake_teleop.station.slave.joint_friction import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
@@ -96,8 +90,10 @@ def MakeSlaveSide(
         connect_ports(builder, controller, "joint_torque", joint_control, "requested_torque")
     else:
         follows_leader = scenario.master.is_joint_leader
-        name = ik_method_name(scenario.slave.inverse_kinematics, arm)
-        make_ik = LeaderJointFollower if follows_leader else IK_METHODS[name]
+        name = joint_commands.ik_method_name(scenario.slave.inverse_kinematics, arm)
+        make_ik = joint_commands.IK_METHODS[name]
+        if follows_leader:
+            make_ik = joint_commands.LeaderJointFollower
         ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, slave.start, held))
         connect_matching_inputs(builder, ik, {"joint_position": sample["joint_position"]})
         connect_ports(builder, ik, "joint_command", joint_control, "joint_command")
@@ -173,7 +169,7 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
     _add_slave_blocks(builder, scenario, q_start=start)
-    command = ExcitationCommand(trajectory, scenario.simulation.settle)
+    command = joint_commands.ExcitationCommand(trajectory, scenario.simulation.settle)
     builder.AddNamedSystem("joint_trajectory", command)
     joint_control = builder.GetSubsystemByName("joint_control")
     connect_ports(builder, command, "joint_command", joint_control, "joint_command")
@@ -214,7 +210,8 @@ def _add_slave_blocks(
     builder.Connect(torque["joint_torque"], plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    monitor = builder.AddNamedSystem("monitor", JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S))
+    range_monitor = joint_commands.JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S)
+    monitor = builder.AddNamedSystem("monitor", range_monitor)
     connect_matching_inputs(builder, monitor, ports)
 
     motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz

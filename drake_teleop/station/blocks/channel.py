@@ -8,15 +8,9 @@ from pydrake.systems.framework import Context, DiscreteStateIndex
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.station.channel import channel as steps
 from drake_teleop.station.channel import network
-from drake_teleop.station.channel.channel import (
-    MIN_TIMEOUT_S,
-    PORTS_SIGNAL_SIZE,
-    initial_state_of_ends,
-    method_parameters_and_frame,
-    step_master_end,
-    step_slave_end,
-)
+from drake_teleop.station.channel.channel import MIN_TIMEOUT_S, PORTS_SIGNAL_SIZE
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -116,11 +110,11 @@ class _PassivityEndBlock(SteppedBlock):
     ) -> None:
         super().__init__()
         start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
-        rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
-        parameters, frame = method_parameters_and_frame(passivity, rotation, scales, force_scale)
+        R = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
+        parameters, frame = steps.method_parameters_and_frame(passivity, R, scales, force_scale)
         self._method = methods.step_addresses(passivity.method)
         self._constants = period, timeout, frame, parameters
-        ends = initial_state_of_ends(passivity.method, parameters, start)
+        ends = steps.initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
@@ -168,7 +162,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         ends, _, port_energies, wrench, packet = results
         inputs, *received = self._inputs_and_packet(context)
         states = *self._constants, ends, port_energies[:2], packet, wrench
-        step_master_end(self._method, *inputs, *received, *states)
+        steps.step_master_end(self._method, *inputs, *received, *states)
 
 
 class PassivityAtSlave(_PassivityEndBlock):
@@ -205,4 +199,4 @@ class PassivityAtSlave(_PassivityEndBlock):
         (*values, saturated, contact), *received = self._inputs_and_packet(context)
         flags = bool(saturated[0] > 0.5), float(contact[0])
         states = *self._constants, ends, pose, port_energies, packet
-        step_slave_end(self._method, *values, *flags, *received, *states)
+        steps.step_slave_end(self._method, *values, *flags, *received, *states)

@@ -12,16 +12,10 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.load.online import watched
 from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import METHODS
-from drake_teleop.load.online.watched import (
-    MEMORY_SIZE,
-    STATE_LEARNING,
-    STATE_SETTLED,
-    initial_monitor_memory,
-    load_state_index,
-    monitor_load,
-)
+from drake_teleop.load.online.watched import STATE_LEARNING, load_state_index
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
 _SAMPLES_PER_SETTLING_CHECK = 16
@@ -106,9 +100,9 @@ class LoadEstimator(LeafSystem):
         calculate = weak_callback(self._calc_load_state)
         self.DeclareVectorOutputPort("load_state", 1, calculate, {self.xd_ticket()})
         if config.watch:
-            monitor = np.zeros(MEMORY_SIZE)
+            monitor = np.zeros(watched.MEMORY_SIZE)
             if covariance is not None:
-                monitor = initial_monitor_memory(start, covariance)
+                monitor = watched.initial_monitor_memory(start, covariance)
             self.DeclareDiscreteState(monitor)
             noise, share = (noise_std, motion_std, period), config.relative_wrench_error
             change = change_detector_parameters(*noise, relative_wrench_error=share)
@@ -127,7 +121,7 @@ class LoadEstimator(LeafSystem):
         estimate = discrete_state.get_mutable_value(0)
         if self._load_state_index(discrete_state) != STATE_LEARNING:
             memory = discrete_state.get_mutable_value(2)
-            monitor_load(estimate, memory, sample, *self._watch_arguments)
+            watched.monitor_load(estimate, memory, sample, *self._watch_arguments)
             return
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
@@ -136,7 +130,7 @@ class LoadEstimator(LeafSystem):
         due = self._watches and step % _SAMPLES_PER_SETTLING_CHECK == 0
         if due and self._estimator.is_state_settled(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
-            discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
+            discrete_state.set_value(2, watched.initial_monitor_memory(estimate, covariance))
 
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
         return load_state_index(discrete_state.value(2)) if self._watches else STATE_LEARNING
@@ -147,4 +141,4 @@ class LoadEstimator(LeafSystem):
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.is_state_settled(estimate, memory.reshape(self._shape))
-            output[0] = STATE_SETTLED if settled else STATE_LEARNING
+            output[0] = watched.STATE_SETTLED if settled else STATE_LEARNING

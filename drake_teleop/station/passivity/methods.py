@@ -12,16 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
+from drake_teleop.common import config
 from drake_teleop.common.compiled import address_of_function, make_call_at_address, njit
-from drake_teleop.common.config import (
-    check_all_field_values,
-    check_field_name,
-    choice,
-    plain,
-    quantity,
-    settings,
-    unchecked_assignments,
-)
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
@@ -176,11 +169,11 @@ class PassivityConfig:
             own = getattr(self, name, None)
             return own if is_dataclass(own) else None
         for name in self.registered:
-            check_field_name(schema, name, f"{where}.registered.{name}")
-        with unchecked_assignments():
-            config = schema(**self.registered)
-        check_all_field_values(config, f"{where}.registered")
-        return config
+            config.check_field_name(schema, name, f"{where}.registered.{name}")
+        with config.unchecked_assignments():
+            own = schema(**self.registered)
+        config.check_all_field_values(own, f"{where}.registered")
+        return own
 
 
 def method_parameters(

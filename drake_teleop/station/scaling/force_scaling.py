@@ -8,25 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    apply_matrix,
-    matrix_as_tuple,
-    scale_vector,
-    transposed,
-    vector_at,
-)
-from drake_teleop.load import regressor
-from drake_teleop.load.compensation import (
-    add_excess_weight_into,
-    scaled_wrench_into,
-    scales_from_eta,
-    weight_scales_and_inertia_scales,
-)
+from drake_teleop.common.vectors import apply_matrix, matrix_as_tuple, scale_vector, vector_at
+from drake_teleop.load import compensation, regressor
+from drake_teleop.load.compensation import add_excess_weight_into, scaled_wrench_into
 from drake_teleop.station.slave.arm import (
     ArmModel,
     acceleration_from_specific_force_into,
@@ -93,7 +83,8 @@ class ForceScalingConfig:
             raise DrakeTeleopError(what, where=f"{where}.gripper_phi", remedy=remedy)
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
-            weights, inertias = weight_scales_and_inertia_scales(self.sigma, self.sigma, *separate)
+            sigmas = self.sigma, self.sigma, *separate
+            weights, inertias = compensation.weight_scales_and_inertia_scales(*sigmas)
             return Scales(*inertias, self.gamma, *weights)
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
@@ -101,7 +92,7 @@ class ForceScalingConfig:
             required = "set sigma: 0, gamma: 1 and gripper_phi (section V of the paper)"
             remedy = f"{required}, and leave sigma_weight and sigma_inertia out"
             raise DrakeTeleopError(what, where=f"{where}.eta", remedy=remedy)
-        gripper, grasped, gamma = scales_from_eta(self.eta)
+        gripper, grasped, gamma = compensation.scales_from_eta(self.eta)
         return Scales(gripper, grasped, gamma, gripper, grasped)
 
 
@@ -110,7 +101,7 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
     for base in (0, 3):
         scale = torque_scale if base == 3 else force_scale
         in_W = apply_matrix(matrix_as_tuple(R_WS), vector_at(wrench_S, base))
-        in_B = scale_vector(-scale, apply_matrix(transposed(matrix_as_tuple(R_WB)), in_W))
+        in_B = scale_vector(-scale, apply_matrix(vectors.transposed(matrix_as_tuple(R_WB)), in_W))
         out[base], out[base + 1], out[base + 2] = in_B
 
 

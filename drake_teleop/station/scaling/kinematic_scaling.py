@@ -9,25 +9,13 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    copy_into,
-    minus,
-    normalized_quaternion,
-    plus,
-    quaternion_at,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    rotate_vector,
-    scale_vector,
-    vector_at,
-)
+from drake_teleop.common.vectors import quaternion_at, quaternion_product, scale_vector, vector_at
 from drake_teleop.station.slave.arm import ArmModel, pose_into
 
 
@@ -56,7 +44,8 @@ class KinematicScalingConfig:
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
     """Return the quaternion of the rotation about the same axis by `scale` times the angle."""
-    return quaternion_exponential(scale_vector(scale, quaternion_logarithm(rotation)))
+    turn = vectors.quaternion_logarithm(rotation)
+    return vectors.quaternion_exponential(scale_vector(scale, turn))
 
 
 @njit(cache=True)
@@ -70,14 +59,15 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
     the clutch, `alignment` is the quaternion of R_WB.
     """
     R_WB, R_BE = quaternion_at(alignment, 0), quaternion_at(pose, 0)
-    offset = rotate_vector(R_WB, minus(vector_at(pose, 4), vector_at(master, 4)))
-    turn = quaternion_product(R_BE, conjugate_quaternion(quaternion_at(master, 0)))
+    offset = vectors.rotate_vector(R_WB, vectors.minus(vector_at(pose, 4), vector_at(master, 4)))
+    turn = quaternion_product(R_BE, vectors.conjugate_quaternion(quaternion_at(master, 0)))
     turn_B = scaled_rotation(turn, rotation_scale)
-    turn_W = quaternion_product(quaternion_product(R_WB, turn_B), conjugate_quaternion(R_WB))
+    R_BW = vectors.conjugate_quaternion(R_WB)
+    turn_W = quaternion_product(quaternion_product(R_WB, turn_B), R_BW)
     orientation = quaternion_product(turn_W, quaternion_at(command, 0))
-    out[0], out[1], out[2], out[3] = normalized_quaternion(orientation)
+    out[0], out[1], out[2], out[3] = vectors.normalized_quaternion(orientation)
     scaled = scale_vector(translation_scale, offset)
-    out[4], out[5], out[6] = plus(vector_at(command, 4), scaled)
+    out[4], out[5], out[6] = vectors.plus(vector_at(command, 4), scaled)
 
 
 @njit(cache=True, omits_reference_counting=True)
@@ -86,7 +76,7 @@ def _pose_command_into(pose, references, alignment, translation_scale, rotation_
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
     else:
-        copy_into(out, 0, references, 0, 7)
+        vectors.copy_into(out, 0, references, 0, 7)
 
 
 class KinematicScaling(DoubleOnly, LeafSystem):
