@@ -12,15 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import (
-    Cylinder,
-    GeometryId,
-    Meshcat,
-    MeshcatCone,
-    MeshcatParams,
-    Rgba,
-    SceneGraphInspector,
-)
+from pydrake import geometry
+from pydrake.geometry import Cylinder, GeometryId, Meshcat, MeshcatCone, MeshcatParams, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.files import make_folder, write_text
@@ -176,7 +169,7 @@ def set_plain_background(meshcat: Meshcat) -> None:
 def add_shapes(
     meshcat: Meshcat,
     path: str,
-    inspector: SceneGraphInspector,
+    inspector: geometry.SceneGraphInspector,
     shapes: Iterable[GeometryId],
     colour: Rgba = _DEFAULT_SHAPE_COLOUR,
 ) -> None:

@@ -14,7 +14,8 @@ from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.energy import energy_balance, port_work
+from drake_teleop.station.passivity.energy import port_work
+from drake_teleop.station.passivity.memory import STORED_ENERGY
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import (
@@ -94,8 +95,7 @@ def start_energy(scenario: Scenario) -> Array:
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    memory = methods.initial_method_memory(scenario.passivity.method, p, pose)
-    return 2 * energy_balance(memory).stored
+    return 2 * methods.initial_method_memory(scenario.passivity.method, p, pose)[STORED_ENERGY]
 
 
 def _kinematic_scales(scenario: Scenario) -> Array:

@@ -49,11 +49,9 @@ def count_newly_received_energy(g, received, memory):
 
 @njit(cache=True)
 def fill_packet(pose, twist, wrench, packet):
-    now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
-    for i in range(7):
-        now[i] = pose[i]
-    for i in range(6):
-        velocity[i], force[i] = twist[i], wrench[i]
+    vectors.copy_into(packet, POSE.start, pose, 0, 7)
+    vectors.copy_into(packet, VELOCITY.start, twist, 0, 6)
+    vectors.copy_into(packet, WRENCH.start, wrench, 0, 6)
 
 
 @njit(cache=True)
@@ -109,7 +107,6 @@ def move_pose_into(pose, e, out):
     """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
     turn = vectors.quaternion_exponential((e[3], e[4], e[5]))
     q = normalized_quaternion(quaternion_product(turn, (pose[0], pose[1], pose[2], pose[3])))
-    for i in range(4):
-        out[i] = q[i]
+    out[0], out[1], out[2], out[3] = q
     for i in range(3):
         out[4 + i] = pose[4 + i] + e[i]
