@@ -89,6 +89,7 @@ class SimulationResult:
     ) -> None:
         self._t = _read_only_view(float_array("t", t))
         self._specs = {spec.name: spec for spec in specs}
+        self._columns = {c: (spec.name, i) for spec in specs for i, c in enumerate(spec.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             what = f"only one of `signals` and `specs` contains {', '.join(odd)}"
@@ -142,7 +143,7 @@ class SimulationResult:
             return SimulationResult(self._t[name], rows, self.specs)
         if name == "t":
             return self._t
-        if (found := self._find_column(name)) is not None:
+        if (found := self._columns.get(name)) is not None:
             return self._values[found[0]][:, found[1]]
         try:
             return self._values[name]
@@ -151,14 +152,8 @@ class SimulationResult:
             near = difflib.get_close_matches(str(name), names, n=3) or self.signals
             raise KeyError(f"there is no signal {name!r}; there are {', '.join(near)}") from None
 
-    def _find_column(self, name: object) -> tuple[str, int] | None:
-        signal = str(name).partition(".")[0]
-        if signal not in self._specs or name not in self._specs[signal].columns:
-            return None
-        return signal, self._specs[signal].columns.index(str(name))
-
     def __contains__(self, name: object) -> bool:
-        return name == "t" or name in self._specs or self._find_column(name) is not None
+        return name == "t" or name in self._specs or name in self._columns
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._specs)
@@ -167,8 +162,7 @@ class SimulationResult:
         return len(self._specs)
 
     def _ipython_key_completions_(self) -> list[str]:
-        columns = (column for spec in self.specs for column in spec.columns)
-        return ["t", *self._specs, *columns]
+        return ["t", *self._specs, *self._columns]
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the samples as a pandas frame, with the columns of `to_dataframe`."""
@@ -287,8 +281,8 @@ class SimulationResult:
         return figure
 
     def _plot_panels(self, name: str) -> list[tuple[str, str, list[int]]]:
-        if (found := self._find_column(name)) is not None:
-            signal, index = found
+        if name in self._columns:
+            signal, index = self._columns[name]
             return [(signal, self._specs[signal].units[index], [index])]
         if name not in self._specs:
             self[name]  # a KeyError with a suggestion

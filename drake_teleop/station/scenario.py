@@ -146,12 +146,9 @@ class Scenario:
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
         config.check_all_field_values(self, where)
-        self.operator.check(f"{where}:operator")
-        self.passivity.check(f"{where}:passivity")
         self.force_scaling.scales(f"{where}:force_scaling")
-        self.load_estimator.check(f"{where}:load_estimator")
-        self.master.check(f"{where}:master")
-        self.slave.check(f"{where}:slave")
+        for name in ("operator", "passivity", "load_estimator", "master", "slave"):
+            getattr(self, name).check(f"{where}:{name}")
         self.joint_control.check(f"{where}:joint_control", self.rates.joint_control_hz)
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
         for index, thing in enumerate(self.environment):

@@ -51,14 +51,8 @@ class LoadEstimatorConfig:
 class LoadEstimator(LeafSystem):
     """Block with the estimate of load and offsets: constant, updated in every period or monitored.
 
-    .. pydrake_system::
-
-        name: LoadEstimator
-        input_ports:
-        - sample: the wrist sensor's sample
-        output_ports:
-        - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
-        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATE_NAMES`
+    Ports are those of `blocks.LoadEstimator`, with one input `sample` of the wrist sensor in the
+    place of its parts. load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
