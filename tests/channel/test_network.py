@@ -45,6 +45,10 @@ ROUGH = NetworkConfig(
 )
 
 
+def packet_delays(config, seed, direction, steps, period):
+    return network.packet_delays(network_parameters(config, seed, direction, period), steps)
+
+
 def share(high: float = 1.0) -> st.SearchStrategy[float]:
     return st.one_of(st.sampled_from([0.0, high]), st.floats(0.0, high))
 
@@ -75,20 +79,6 @@ def _exchange(p, state, packets, received, newest, fresh):
     for k in range(len(packets)):
         send_packet(p, state, k, packets[k])
         newest[k], fresh[k] = receive_packet(p, state, k, received[k])
-
-
-@njit
-def _packet_delays(p, delays):
-    bad = p[network._BAD_STATE_SHARE]
-    for k in range(len(delays)):
-        bad, delays[k, 0], delays[k, 1] = network._draw_loss_and_delays(p, k, bad)
-
-
-def packet_delays(config, seed, direction, steps, period):
-    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
-    delays = np.empty((steps, 2), np.int64)
-    _packet_delays(network_parameters(config, seed, direction, period), delays)
-    return delays
 
 
 def exchange(config: NetworkConfig, packets: np.ndarray, seed=0, neutral=None):

@@ -13,17 +13,11 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import finite_array
-from drake_teleop.load.compensation import (
-    add_excess_weight_into,
-    scaled_wrench_into,
-    unknown_gravity_error,
-)
+from drake_teleop.load import compensation
+from drake_teleop.load.compensation import add_excess_weight_into, scaled_wrench_into
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.station.scaling.force_scaling import (
-    ForceScalingConfig,
-    Scales,
-    wrench_to_master_into,
-)
+from drake_teleop.station.scaling import force_scaling
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, Scales
 
 _GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
@@ -153,7 +147,8 @@ def WrenchScaling_(T: Any) -> Any:
             excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
             if any(excess):
                 if not self._orientation.HasValue(context):
-                    raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
+                    where = "WrenchScaling: gravity in S"
+                    raise compensation.unknown_gravity_error(where, "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
                 _compiled_or_python(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
@@ -174,7 +169,8 @@ def WrenchScaling_(T: Any) -> Any:
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled(context, self._scales), self._R_WS(context)
-            _compiled_or_python(wrench_to_master_into, T)(scaled, R_WS, self._R_WB, k, k, wrench)
+            to_master_into = _compiled_or_python(force_scaling.wrench_to_master_into, T)
+            to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)
 
     return Impl

@@ -1,4 +1,4 @@
-"""Channel between master and slave (long: one file for one compiled step of both ends)."""
+"""Channel between master and slave: one compiled step of both ends."""
 
 import dataclasses
 from dataclasses import dataclass

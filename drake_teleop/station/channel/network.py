@@ -301,20 +301,26 @@ def _apply_silence_policy(policy, silent, packet):
 
 
 @njit(cache=True)
-def _exchange_empty_packets(p, state, packet, newest):
-    for k in range(len(newest)):
-        send_packet(p, state, k, packet)
-        newest[k], _ = receive_packet(p, state, k, packet)
+def packet_delays(p, steps):
+    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
+    delays, bad = np.empty((steps, 2), np.int64), p[_BAD_STATE_SHARE]
+    for k in range(steps):
+        bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
+    return delays
 
 
 def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
-    p, empty = network_parameters(config, seed, direction, period), np.zeros(0)
-    p[_SILENCE_POLICY], newest = 0.0, np.empty(steps, np.int64)
-    _exchange_empty_packets(p, initial_network_state(p, empty), empty, newest)
-    return newest
+    p = network_parameters(config, seed, direction, period)
+    sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_STEPS])
+    for travel in packet_delays(p, steps).T:
+        used = travel if config.redundant else np.maximum(travel, playout)
+        seen = (travel >= 0) & (sent + used < steps)
+        np.maximum.at(arrived, (sent + used)[seen], sent[seen])
+    newest = np.maximum.accumulate(arrived)
+    return np.minimum(newest, np.maximum(sent - playout, -1)) if config.redundant else newest
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:

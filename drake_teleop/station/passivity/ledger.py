@@ -1,4 +1,4 @@
-"""Master's end of the passivity method "ledger" (long: one file for steps M1 to M7).
+"""Master's end of the passivity method "ledger", steps M1 to M7.
 
 docs/theory.md, "The energy ledger", has the equations of these steps.
 """

@@ -1,4 +1,4 @@
-"""Slave's end of the passivity method "ledger" (long: one file for steps S1 to S6).
+"""Slave's end of the passivity method "ledger", steps S1 to S6.
 
 docs/theory.md, "The energy ledger", has the equations of these steps.
 """
