@@ -237,7 +237,7 @@ def step_slave_end(
 
 @njit(cache=True)
 def _update_pose(pose, before, T, dx, twist):
-    """Write change (6,) and twist (6,), 0 unless both are valid; return if `pose` is valid."""
+    """Write change (6,) and twist (6,), 0 unless both poses are valid; return whether `pose` is."""
     valid = are_finite_and_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)

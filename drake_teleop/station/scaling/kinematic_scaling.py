@@ -1,6 +1,4 @@
-"""Command of the slave by the master's motion: kinematic scaling (Fig. 4 of the paper), or joint by
-joint by a leader arm, q_slave = q_start + (q_leader - q_home).
-"""
+"""Slave's command from the master's motion: kinematic scaling (Fig. 4) or joint coupling."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
