@@ -30,6 +30,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import use_spline_motion_and_flag_edges
+from drake_teleop.logs.explained_log import _noise_of_spline_acceleration
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     _taper_zero_in_gaps,
@@ -173,6 +174,20 @@ def test_noise_is_estimated_from_the_residual_of_the_splines():
     place, turn = PoseSplines(poses, 0.05).estimate_pose_noise()
     assert place == pytest.approx(3e-4, rel=0.08)
     assert turn == pytest.approx(7e-4, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("rate", "spacing", "noise"), [(100.0, 0.05, 1e-4), (250.0, 0.08, 3e-4), (500.0, 0.04, 1e-5)]
+)
+def test_noise_of_the_acceleration_of_splines_is_predicted(rate, spacing, noise):
+    """The second derivative of splines through positions of pure noise has this deviation."""
+    t = np.arange(0.0, 60.0, 1.0 / rate)
+    position = noise * np.random.default_rng(1).standard_normal((len(t), 3))
+    splines = PoseSplines(Poses(t, position, np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))), spacing)
+    at = np.arange(2.0, 58.0, 0.002)
+    acceleration = np.diff(splines.position(at), 2, axis=0) / 0.002**2
+    predicted = _noise_of_spline_acceleration(splines)
+    assert predicted == pytest.approx(np.sqrt(np.mean(acceleration**2)), rel=0.1)
 
 
 def test_noise_moments_predict_the_effect_of_noise():
