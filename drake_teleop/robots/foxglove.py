@@ -23,9 +23,9 @@ class _FoxgloveSink:
         require_library("foxglove", "foxglove-sdk", "robots", where)
         import foxglove
 
-        text = resources.files("drake_teleop.robots").joinpath("foxglove_schema.json").read_text()
+        schema = resources.files("drake_teleop.robots") / "foxglove_schema.json"
         self._context = foxglove.Context()
-        options = {"schema": json.loads(text), "context": self._context}
+        options = {"schema": json.loads(schema.read_bytes()), "context": self._context}
         self._channel = foxglove.Channel(WRENCH_TOPIC, **options)
 
     def _log(self, out: CompensatedWrench, ns: int | None) -> None:
