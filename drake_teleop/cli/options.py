@@ -96,7 +96,7 @@ class DocumentedCommand(click.Command):
         texts = _help_of_options(_SHARED_HELP) | _help_of_options(listed)
         for each in self.params:
             if isinstance(each, click.Option):
-                each.help = each.help or texts[each.opts[0]]
+                each.help = each.help or texts.get(each.opts[0])  # `python -OO` has no docstrings
 
 
 class CommandGroup(click.Group):
