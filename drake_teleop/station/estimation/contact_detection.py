@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
@@ -71,7 +71,7 @@ class ContactDetection(LeafSystem):
         - contact: (1,) 1 in contact, else 0
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel | None, period: float

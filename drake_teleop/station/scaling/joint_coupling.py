@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import ArmModel, pose_into
@@ -30,7 +30,7 @@ class JointCoupling(LeafSystem):
     The command is `start` (n,) [rad] when the leader is at `home` (n,) [rad].
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
         super().__init__()

@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, DoubleOnlySystem, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
@@ -75,7 +75,7 @@ def _pose_command_into(pose, references, alignment, translation_scale, rotation_
         copy_into(out, 0, references, 0, 7)
 
 
-class KinematicScaling(DoubleOnly, LeafSystem):
+class KinematicScaling(DoubleOnlySystem, LeafSystem):
     """Block that scales the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
@@ -96,7 +96,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         start: (7,) commanded pose X_WS at the start.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, config: KinematicScalingConfig, period: float, start: Array) -> None:
         super().__init__()
