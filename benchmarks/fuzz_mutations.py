@@ -26,7 +26,7 @@ import polars
 import yaml
 from scipy.io import savemat
 
-from drake_teleop.common.parquet_sizes import check_parquet_content
+from drake_teleop.common.parquet_sizes import check_parquet_content_sizes
 from drake_teleop.logs.read.array_files import read_mat
 
 Mutation = Callable[[random.Random, bytes, bytes], bytes]
@@ -360,7 +360,7 @@ def decoded(suffix: str, content: bytes) -> dict[str, np.ndarray]:
 
 def read_parquet(content: io.BytesIO) -> polars.DataFrame:
     """Return a table, or raise an exception: damaged content would abort polars."""
-    check_parquet_content(content.getvalue())
+    check_parquet_content_sizes(content.getvalue())
     return polars.read_parquet(content)
 
 

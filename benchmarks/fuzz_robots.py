@@ -143,7 +143,7 @@ def _pieces(content: bytes, size: int) -> list[bytes]:
 
 
 def _checked(assembly: ReadingAssembler, parts: Iterator[Reading]) -> None:
-    compensator = Compensator(LOAD, DT, gamma=2.0, largest=np.full(6, RANGE))
+    compensator = Compensator(LOAD, DT, gamma=2.0, sensor_range=np.full(6, RANGE))
     for k, part in enumerate(parts):
         found: list[Reading] = assembly.readings_completed_by(part._replace(arrival=DT * k / 3))
         for reading in found:

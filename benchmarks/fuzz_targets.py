@@ -31,7 +31,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.cli import main as cli
 from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.common.files import models_dir, scenarios_dir, studies_dir
-from drake_teleop.common.parquet_sizes import check_parquet_content
+from drake_teleop.common.parquet_sizes import check_parquet_content_sizes
 from drake_teleop.common.texts import parse_yaml, read_json
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
@@ -336,7 +336,7 @@ def _result_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
     if rng.random() < 0.4:
         return mutations.damaged(rng, content, other)
     try:
-        check_parquet_content(content)
+        check_parquet_content_sizes(content)
         found = dict(pl.read_parquet_metadata(io.BytesIO(content)))
         key = next(name for name in found if name != "ARROW:schema")
         if rng.random() < 0.5:
@@ -557,7 +557,7 @@ def _wrenches(path: Path) -> None:
         readings = [udp.unpack_reading(part) for part in parts]
     else:
         readings = [reading_of_json_line(line, k) for k, line in enumerate(content.split(b"\n"))]
-    compensator = Compensator(robots.LOAD, 1e-3, gamma=2.0, largest=np.full(6, 50.0))
+    compensator = Compensator(robots.LOAD, 1e-3, gamma=2.0, sensor_range=np.full(6, 50.0))
     for k, reading in enumerate(readings):
         out = compensator.step(reading, 1e-3 * k)
         numbers = np.array([out.t, *out.contact, *out.scaled])

@@ -33,7 +33,7 @@ from drake_teleop.robots.compensation_step import (
     contact_and_scaled_wrench_into,
     reading_problem,
 )
-from drake_teleop.robots.controller.export import CFLAGS, ControllerTarget, kernel_files
+from drake_teleop.robots.controller.export import CFLAGS, ExportedCompensation, kernel_files
 from drake_teleop.robots.streams import Reading
 
 HERE = Path(__file__).parent
@@ -45,7 +45,7 @@ LOAD = Identification(
 )
 SCALES = {"sigma_weight": 0.3, "sigma_inertia": 1.2, "gamma": 1.3}
 DT = 1.0 / 1024.0  # exact, because times decide whether the low-pass restarts
-TARGET = ControllerTarget(LOAD, DT, 30.0, np.repeat([170.0, 9.0], 3), -1, [])
+TARGET = ExportedCompensation(LOAD, DT, 30.0, np.repeat([170.0, 9.0], 3), -1, [])
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
 WASM = runpy.run_path(str(HERE.parent / "docs" / "_ext" / "kernel_page.py"))
 NODE = """

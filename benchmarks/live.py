@@ -52,7 +52,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     scenario = live_scenario(LoadScenario("contact_transition"))
     load = identified_load(scenario)
     clock = time.perf_counter
-    live = Live(scenario, load, folder, PageScene("own", scenario).frame_part, clock())
+    live = Live(scenario, load, folder, PageScene("own", scenario).scene_values, clock())
     live.join(1, clock())
     for _ in range(200):  # compilation and imports of the first call
         live.tick(clock)

@@ -22,7 +22,7 @@ import numpy as np
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.inputs import choice_names
-from drake_teleop.live.scenarios import channel_fill_time_s, chosen_scenario, live_scenario
+from drake_teleop.live.scenarios import channel_fill_time_s, live_scenario, scenario_of_inputs
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -83,7 +83,7 @@ class Driven:
 def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, float]:
     """Return the figures of one network and method."""
     still = driven.inputs.with_changes({"network": network, "method": method})
-    fills = channel_fill_time_s(chosen_scenario(driven.scenario, driven.load, still))
+    fills = channel_fill_time_s(scenario_of_inputs(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
     driven.go(0.8 + fills, z=z)  # at rest, with no packet on its way
     back = driven.change(0.8, network=0, method=0)

@@ -61,7 +61,7 @@ class Kept(list[CompensatedWrench]):
 def replayed(path: Path, load: Identification, chunk: int, mode: str) -> Kept:
     """Return the output of `compensate` for a log at its measured instants."""
     source, kept = ReplayLogSource(path, load, chunk=chunk), Kept()
-    late = {"wait": source.wait, "predicted": mode == "predicted"}
+    late = {"delay_readings": source.delay_readings, "predicted": mode == "predicted"}
     compensate_stream(source, Compensator(load, source.dt, sigma=0.3, gamma=1.5, **late), kept)  # type: ignore[arg-type]
     return Kept(row for row in kept if not row.flags)
 

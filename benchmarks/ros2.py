@@ -130,7 +130,8 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
             return read(timeout_s) if time.monotonic() < end else None
 
         sink.write, source.read = timed, until  # type: ignore[method-assign]
-        compensator = Compensator(load, source.dt, wait=getattr(source, "wait", 0))
+        delay = getattr(source, "delay_readings", 0)
+        compensator = Compensator(load, source.dt, delay_readings=delay)
         counts = compensate_stream(source, compensator, sink)
         echo.kill()
         heard.seek(0)

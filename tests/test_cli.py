@@ -9,6 +9,7 @@ import types
 import warnings
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from numba.core.errors import NumbaWarning
@@ -70,6 +71,18 @@ def test_the_shell_completes_names_and_options(capsys, monkeypatch, words, expec
     assert f"plain,{expected}" in out.splitlines()
     if not words.split()[1].startswith("-"):
         assert f"file,{words.split()[1]}" in out.splitlines()
+
+
+def test_each_option_of_each_command_has_a_help_text():
+    for command in cli.cli.commands.values():
+        options = [each for each in command.params if isinstance(each, click.Option)]
+        assert [each.opts for each in options if not each.help] == []
+
+
+def test_help_needs_no_docstrings():
+    code = "from drake_teleop.cli.main import main; main(['run', '--help'])"
+    command = [sys.executable, "-OO", "-B", "-c", code]
+    assert "--inputs DIR" in subprocess.run(command, capture_output=True, text=True).stdout
 
 
 def test_no_command_shows_the_help(capsys):

@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.parquet_sizes import check_parquet, check_parquet_content
+from drake_teleop.common.parquet_sizes import check_parquet_content_sizes, check_parquet_sizes
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.station.result import Signal, SimulationResult
@@ -41,7 +41,7 @@ MIXED = pl.DataFrame(
 def test_good_files_pass(tmp_path, compression, options, rows):
     path = tmp_path / "good.parquet"
     MIXED.head(rows).write_parquet(path, compression=compression, **options)
-    check_parquet(path)
+    check_parquet_sizes(path)
 
 
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
@@ -51,9 +51,9 @@ def test_good_files_of_arrow_pass(tmp_path, version, dictionary):
     path = tmp_path / "good.parquet"
     options = {"data_page_version": version, "use_dictionary": dictionary, "data_page_size": 500}
     parquet.write_table(MIXED.to_arrow(), path, write_page_index=True, **options)
-    check_parquet(path)
+    check_parquet_sizes(path)
     parquet.ParquetWriter(path, MIXED.to_arrow().schema).close()  # file without a row group
-    check_parquet(path)
+    check_parquet_sizes(path)
 
 
 def _read_rows(path: Path) -> pl.DataFrame:
@@ -96,13 +96,13 @@ def test_the_part_of_a_log_that_is_damaged_is_named(tmp_path: Path) -> None:
 )
 def test_content_that_is_no_parquet_is_refused(content: bytes, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
-        check_parquet_content(content)
+        check_parquet_content_sizes(content)
 
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.parquet").touch()
     with pytest.raises(ValueError, match="it is empty"):
-        check_parquet(tmp_path / "x.parquet")
+        check_parquet_sizes(tmp_path / "x.parquet")
 
 
 _READ_EACH = """

@@ -19,7 +19,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import REGISTRIES, Registry, register_from_script
 from drake_teleop.lab.identification import true_load
 from drake_teleop.live.inputs import Inputs, csv_header, csv_row, read_inputs
-from drake_teleop.live.scenarios import chosen_scenario
+from drake_teleop.live.scenarios import scenario_of_inputs
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
@@ -155,7 +155,7 @@ def test_a_live_session_records_the_registered_name(folder):
     register_from_script(folder / "parts.py")
     inputs = Inputs().with_changes({"method": 99})
     assert inputs.method == before + 1
-    assert chosen_scenario(Scenario(), None, inputs).passivity.method == "share"
+    assert scenario_of_inputs(Scenario(), None, inputs).passivity.method == "share"
     path = folder / "inputs.csv"
     path.write_text(csv_header() + csv_row(0, inputs) + csv_row(10, inputs))
     assert ",share," in path.read_text() and read_inputs(path)[0][1] == inputs

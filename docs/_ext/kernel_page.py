@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_teleop.load.identification import Identification
-from drake_teleop.robots.controller.export import CFLAGS, ControllerTarget, kernel_files
+from drake_teleop.robots.controller.export import CFLAGS, ExportedCompensation, kernel_files
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -50,7 +50,7 @@ __attribute__((export_name("step"))) unsigned step(void) {
 _EXPORTS = [f"-Wl,--export={name}" for name in ("load", "reading", "result")]
 _TARGET = ("-target", "wasm32-freestanding", "-nostdlib", "-s", "-Wl,--no-entry")
 # The page sets load and low-pass.
-_ANY_LOAD = ControllerTarget(
+_ANY_LOAD = ExportedCompensation(
     Identification(
         *(np.ones(10), np.zeros(6), np.zeros((16, 16)), np.ones(16, bool), 1.0, 0.0, np.zeros(6)),
         *("none", 0),
@@ -59,7 +59,7 @@ _ANY_LOAD = ControllerTarget(
 )
 
 
-def compiled(target: ControllerTarget = _ANY_LOAD) -> bytes:
+def compiled(target: ExportedCompensation = _ANY_LOAD) -> bytes:
     """Return the kernel as WebAssembly, with the limits of `target`."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -19,7 +19,7 @@ from drake_teleop.load import tolerance as tolerances
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
 from drake_teleop.robots.connections import open_source_and_recorder
 
-_PROGRESS_CELLS, _PROGRESS_DECADES = 24, 3.0  # of a bar; of half-width over tolerance
+_BAR_CHARACTERS, _BAR_DECADES = 24, 3.0  # of a bar; of half-width over tolerance
 
 
 def calibrate_command(
@@ -27,7 +27,7 @@ def calibrate_command(
     out: Path,
     *,
     until: str = DEFAULT_TOLERANCE,
-    largest: tuple[float, float] | None = None,
+    sensor_range: tuple[float, float] | None = None,
     seconds: float = 120.0,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
@@ -36,11 +36,11 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `until` is the required accuracy of the load, `largest` the range of the sensor: [N, N m].
+    `until` is the required accuracy of the load, `sensor_range` the range of the sensor: [N, N m].
     """
     tolerance = tolerances.parse_tolerance(until)
     make_folder(out)
-    limits = None if largest is None else np.repeat(largest, 3)
+    limits = None if sensor_range is None else np.repeat(sensor_range, 3)
     stream, recorder = open_source_and_recorder(source, limits, **stream_options)
     path = out / recorder.log_file_name
     console = Console(stderr=True, quiet=quiet)
@@ -51,14 +51,14 @@ def calibrate_command(
             def show_progress(at: RecordEvaluation) -> None:
                 live.update(make_progress_table(at, tolerance), refresh=True)
 
-            looks = calibrate(
+            evaluations = calibrate(
                 stream, recorder, path, tolerance, seconds=seconds, show=show_progress, **processing
             )
     finally:
         stream.close()
-    last = looks[-1]
+    last = evaluations[-1]
     summary = identify_command(path, out, quiet=True, **processing)
-    write_picture(out / "settling.png", draw_settling(looks, tolerance))
+    write_picture(out / "settling.png", draw_accuracy(evaluations, tolerance))
     names = tolerance.required_entry_names
     summary |= {
         "tolerance": str(tolerance),
@@ -68,7 +68,7 @@ def calibrate_command(
         "doubts": list(last.doubts),
         "advice": last.advice,
         "seconds": last.record_length_s,
-        "looks": len(looks),
+        "looks": len(evaluations),
         "left_out": recorder.left_out,
         "clock_changes": recorder.clock_changes,
     }
@@ -84,7 +84,7 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
-    table.add_column("settled", width=_PROGRESS_CELLS)
+    table.add_column("settled", width=_BAR_CHARACTERS)
     table.add_column("verdict")
     # The first word of an entry's name is its quantity.
     entries = [entry.split()[0] for entry in tolerance.required_entry_names]
@@ -109,9 +109,9 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
 
 
 def _make_progress_bar(relative_half_width: float, known: bool) -> Text:
-    share = 1.0 - np.log10(np.clip(relative_half_width, 1.0, None)) / _PROGRESS_DECADES
-    cells = int(np.clip(np.nan_to_num(share), 0.0, 1.0) * _PROGRESS_CELLS)
-    return Text("█" * cells + "·" * (_PROGRESS_CELLS - cells), style="green" if known else "yellow")
+    share = 1.0 - np.log10(np.clip(relative_half_width, 1.0, None)) / _BAR_DECADES
+    cells = int(np.clip(np.nan_to_num(share), 0.0, 1.0) * _BAR_CHARACTERS)
+    return Text("█" * cells + "·" * (_BAR_CHARACTERS - cells), style="green" if known else "yellow")
 
 
 def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
@@ -124,12 +124,12 @@ def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
     return "almost" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
 
 
-def draw_settling(looks: list[RecordEvaluation], tolerance: tolerances.Tolerance) -> Figure:
+def draw_accuracy(evaluations: list[RecordEvaluation], tolerance: tolerances.Tolerance) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()
-        t = np.array([at.record_length_s for at in looks])
-        halves = np.array([at.relative_half_widths for at in looks])
+        t = np.array([at.record_length_s for at in evaluations])
+        halves = np.array([at.relative_half_widths for at in evaluations])
         for k, entry in enumerate(tolerance.required_entry_names):
             style = ("-", "--")[k // len(COLOURS) % 2]
             finite = np.isfinite(halves[:, k])
@@ -137,7 +137,7 @@ def draw_settling(looks: list[RecordEvaluation], tolerance: tolerances.Tolerance
             axes.plot(t[finite], halves[finite, k], style, marker=".", color=colour, label=entry)
         axes.axhline(1.0, color=BLACK, linestyle=":")
         last = ""
-        for at in looks:
+        for at in evaluations:
             if at.advice and at.advice != last:
                 x, last, transform = at.record_length_s, at.advice, axes.get_xaxis_transform()
                 axes.axvline(x, color=GREY, linewidth=0.6)

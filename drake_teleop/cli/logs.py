@@ -201,21 +201,21 @@ def _detection_table(found: processing.DetectedLog) -> pl.DataFrame:
     return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})
 
 
-def _make_table(
-    title: str, summary: dict[str, Any], headings: Sequence[str], left: Sequence[str] = ()
+def _summary_table(
+    title: str, summary: dict[str, Any], headings: Sequence[str], left_aligned: Sequence[str] = ()
 ) -> Any:
     from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=f"{title} {Path(summary['log']).name}", title_justify="left")
     for heading in headings:
-        table.add_column(escape(heading), justify="left" if heading in left else "right")
+        table.add_column(escape(heading), justify="left" if heading in left_aligned else "right")
     return table
 
 
 def print_identification(summary: dict[str, Any], out: Path) -> None:
     headings = ("", "value", "std", "unit")
-    table = _make_table("Load identified from", summary, headings, left=("", "unit"))
+    table = _summary_table("Load identified from", summary, headings, left_aligned=("", "unit"))
     offsets, deviations, units = summary["offsets"], summary["offsets_std"], ["N", "N m"]
     rows = _load_rows(summary) + [
         (name, offsets[i], deviations[i], 1.0, units[i // 3], name)
@@ -265,7 +265,7 @@ def _add_parameter_rows(table: Any, rows: list[_ParameterRow], identifiable: lis
 
 def print_elimination(summary: dict[str, Any], out: Path) -> None:
     headings = ("rms of", "|F| [N]", "|tau| [N m]")
-    table = _make_table("Contact wrench in", summary, headings, left=("rms of",))
+    table = _summary_table("Contact wrench in", summary, headings, left_aligned=("rms of",))
     for label, name in (
         ("measured, without offsets", "raw"),
         ("less static weight only", "gravity_only"),
@@ -298,7 +298,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
     headings = ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "direction in S")
-    table = _make_table("Contact in", summary, headings)
+    table = _summary_table("Contact in", summary, headings)
     for c in summary["contacts"]:
         push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
         table.add_row(

@@ -228,7 +228,7 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @option.gripper_file
 @option.sigma
 @click.option("--sigma-object", type=option.SCALE_TYPE)
-@option.separate_sigmas
+@option.sigma_weight_and_inertia
 @option.gamma
 @option.number("--eta", limits=(0, 1))
 @option.choice("--offsets", ["record", "load"], "record")
@@ -337,7 +337,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @option.load_file(required=True)
 @click.option("--out", "sink", default="-", show_default=False, metavar="SINK")
 @option.sigma
-@option.separate_sigmas
+@option.sigma_weight_and_inertia
 @option.gamma
 @option.rate_hz()
 @click.option("--predicted", is_flag=True)
@@ -377,7 +377,7 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @click.argument("sink")
 @option.load_file(required=True)
 @option.sigma
-@option.separate_sigmas
+@option.sigma_weight_and_inertia
 @option.gamma
 @option.rate_hz(required=True)
 @click.option("--watch", is_flag=True)
@@ -403,7 +403,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
         words += ["--out", str(out)]
         given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
         given |= {"--sensor-frame": "sensor_frame", "--motion": "motion"}
-        given |= {"--range": "largest", "--sensor-pose": "sensor_pose"}
+        given |= {"--range": "sensor_range", "--sensor-pose": "sensor_pose"}
         for name, parameter in given.items():
             if (value := ctx.params[parameter]) is not None:
                 words += [name, *map(str, value if isinstance(value, tuple) else [value])]
@@ -455,7 +455,7 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
 @option.sensor_range
 @option.output_folder("export")
 def export(
-    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **loop: Any
+    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **options: Any
 ) -> None:
     """Write a load for a robot, model or controller.
 
@@ -474,12 +474,12 @@ def export(
 
     if to not in _CONTROLLER_FORMATS:
         remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
-        option.refuse_given_options("out", "rate_hz", "cutoff_hz", "largest", remedy=remedy)
+        option.refuse_given_options("out", "rate_hz", "cutoff_hz", "sensor_range", remedy=remedy)
     found = Identification.load(identification)
     if to in _CONTROLLER_FORMATS:
         from drake_teleop.robots.controller.export import export_controller
 
-        notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **loop)
+        notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **options)
         text = ""
     else:
         from drake_teleop.robots.export import export_load
@@ -491,7 +491,7 @@ def export(
 
 
 @cli.command("sample-log")
-@option.seed_0
+@option.seed_with_default_0
 @option.output_folder("sample-log")
 @option.quiet
 def sample_log(out: Path, **options: Any) -> None:
@@ -531,7 +531,7 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 @click.option("--scenario", default="contact_transition")
 @option.jobs
 @option.output_folder("compare-passivity")
-@option.seed_0
+@option.seed_with_default_0
 @option.quiet
 def compare_passivity(
     networks: tuple[str, ...] | None, methods: tuple[str, ...] | None, out: Path, **options: Any
@@ -643,7 +643,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 @option.integer("--harmonics", limits=(2, 20))
 @click.option("--until", metavar="TOLERANCE")
 @option.number("--time", "seconds", limits=(0, 1e6), min_open=True, metavar="SECONDS")
-@option.seed_0
+@option.seed_with_default_0
 @option.output_folder("excite")
 @option.quiet
 def excite(scenario: str, out: Path, **options: Any) -> None:

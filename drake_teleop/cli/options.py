@@ -82,7 +82,7 @@ _SHARED_HELP = """
     --yes: Start more than 100,000 runs without a question."""
 
 
-def _help_of_options(text: str) -> dict[str, str]:
+def _parse_option_help(text: str) -> dict[str, str]:
     found = re.findall(r"^ {4}(--[\w-]+): ((?:.|\n {8})+)", text, re.M)
     return {name: meaning.replace("\n" + " " * 8, " ") for name, meaning in found}
 
@@ -93,10 +93,10 @@ class DocumentedCommand(click.Command):
     def __init__(self, name: str | None, *, help: str | None = None, **settings: Any) -> None:
         text, _, listed = cleandoc(help or "").partition("\n\nOptions:")
         super().__init__(name, help=text, **settings)
-        texts = _help_of_options(_SHARED_HELP) | _help_of_options(listed)
+        texts = _parse_option_help(_SHARED_HELP) | _parse_option_help(listed)
         for each in self.params:
             if isinstance(each, click.Option):
-                each.help = each.help or texts[each.opts[0]]
+                each.help = each.help or texts.get(each.opts[0])  # `python -OO` has no docstrings
 
 
 class CommandGroup(click.Group):
@@ -105,7 +105,7 @@ class CommandGroup(click.Group):
     command_class = DocumentedCommand
 
 
-class Number(click.FloatRange):
+class FiniteNumber(click.FloatRange):
     """Parameter type of finite numbers in a range; click's type accepts nan and inf."""
 
     name, _type_without_range = "number", click.FLOAT
@@ -122,20 +122,20 @@ class Number(click.FloatRange):
         return number
 
 
-class Integer(click.IntRange):
+class IntegerInRange(click.IntRange):
     """Parameter type of integers in a range."""
 
-    name, _type_without_range, convert = "integer", click.INT, Number.convert
+    name, _type_without_range, convert = "integer", click.INT, FiniteNumber.convert
 
 
 def number(
     *names: str, limits: tuple[float, float], min_open: bool = False, **settings: Any
 ) -> Any:
-    return click.option(*names, type=Number(*limits, min_open=min_open), **settings)
+    return click.option(*names, type=FiniteNumber(*limits, min_open=min_open), **settings)
 
 
 def integer(name: str, limits: tuple[int, int], **settings: Any) -> Any:
-    return click.option(name, type=Integer(*limits), **settings)
+    return click.option(name, type=IntegerInRange(*limits), **settings)
 
 
 def choice(name: str, words: list[str], default: str) -> Any:
@@ -148,11 +148,11 @@ class DelayOrAuto(click.ParamType):
     name = "auto|SECONDS"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
-        return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
+        return "auto" if value == "auto" else FiniteNumber(-10, 10).convert(value, param, ctx)
 
 
-SCALE_TYPE = Number(0, 100)
-POSITIVE_TYPE = Number(0, 1e5, min_open=True)
+SCALE_TYPE = FiniteNumber(0, 100)
+POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
 
 
 class CommaSeparated(click.ParamType):
@@ -218,15 +218,15 @@ def _remove_empty_folders(new: list[Path]) -> None:
 
 
 jobs = click.option(
-    "--jobs", type=Integer(1, 4096), callback=lambda _ctx, _param, count: count or -1
+    "--jobs", type=IntegerInRange(1, 4096), callback=lambda _ctx, _param, count: count or -1
 )
-seed = partial(click.option, "--seed", type=Integer(0, 2**32 - 1))
-seed_0 = seed(default=0, help="Random seed.")
+seed = partial(click.option, "--seed", type=IntegerInRange(0, 2**32 - 1))
+seed_with_default_0 = seed(default=0, help="Random seed.")
 dask_cluster = click.option("--cluster", metavar="ADDRESS")
 quiet = click.option("--quiet", is_flag=True)
 cutoff_hz = click.option("--cutoff", "cutoff_hz", type=POSITIVE_TYPE, default=30.0, metavar="HZ")
 rate_hz = partial(click.option, "--rate", "rate_hz", type=POSITIVE_TYPE, metavar="HZ")
-sensor_range = click.option("--range", "largest", type=POSITIVE_TYPE, nargs=2, metavar="N NM")
+sensor_range = click.option("--range", "sensor_range", type=POSITIVE_TYPE, nargs=2, metavar="N NM")
 delay = click.option("--delay", type=DelayOrAuto(), default="auto")
 sigma = click.option("--sigma", type=SCALE_TYPE, default=0.0)
 gamma = click.option("--gamma", type=SCALE_TYPE, default=1.0)
@@ -236,7 +236,7 @@ free_motion_log = path("--free", metavar="LOG")
 package_paths = path("--package-path", "package_paths", multiple=True, metavar="DIR")
 sensor_frame = partial(click.option, "--sensor-frame", metavar="NAME")
 sensor_pose = click.option(
-    "--sensor-pose", nargs=6, type=Number(-1e3, 1e3), metavar="X Y Z ROLL PITCH YAW"
+    "--sensor-pose", nargs=6, type=FiniteNumber(-1e3, 1e3), metavar="X Y Z ROLL PITCH YAW"
 )
 
 
@@ -267,7 +267,7 @@ skip_run_count_question = click.option(
 )
 
 
-def separate_sigmas(command: Any) -> Any:
+def sigma_weight_and_inertia(command: Any) -> Any:
     for part in ("inertia", "weight"):
         command = click.option(f"--sigma-{part}", type=SCALE_TYPE)(command)
     return command

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 
-ONE_DICT: tuple[str, ...] = ()
+NO_EXTRA_SLOTS: tuple[str, ...] = ()
 """`__slots__` of a system; its attributes are in the `__dict__` of the bound class."""
 
 
@@ -24,10 +24,10 @@ def weak_callback(method: Any) -> Callable[..., None]:
     return call_method
 
 
-class DoubleOnly:
+class DoubleOnlySystem:
     """Base class of Drake systems without AutoDiffXd or symbolic version; a conversion raises."""
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def _refuse_scalar_conversion(self, *_: Any) -> NoReturn:
         what = "has no AutoDiffXd or symbolic version: compiled code is for double only"

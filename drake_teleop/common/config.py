@@ -18,7 +18,7 @@ from pathlib import Path
 from textwrap import TextWrapper
 from typing import Any, NamedTuple, TypeVar
 
-from drake_teleop.common.errors import DrakeTeleopError, field_place, suggest_name
+from drake_teleop.common.errors import DrakeTeleopError, field_location, suggest_name
 from drake_teleop.common.registry import Registry
 
 TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
@@ -111,7 +111,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
     for key, value in data.items():
         if key == "_tag":
             continue
-        place = field_place(where, key)
+        place = field_location(where, key)
         check_field_name(schema, key, place)
         _check_type(kinds[key], value, place, from_file=True)
 
@@ -137,7 +137,7 @@ def check_all_field_values(config: Any, where: str) -> None:
     """Check types, lengths, ranges and choices of all values of a dataclass, recursively."""
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
-        value, place = getattr(config, field.name), field_place(where, field.name)
+        value, place = getattr(config, field.name), field_location(where, field.name)
         _check_field_value(field, kinds[field.name], value, place)
         for item_place, item in _items_with_places(value, place):
             if dataclasses.is_dataclass(item):

@@ -94,7 +94,7 @@ def require_library(module: str, library: str, extra: str, where: str) -> None:
         raise DrakeTeleopError(what, where=where, remedy=remedy_to_install_extra(extra))
 
 
-def field_place(where: str, name: Any) -> str:
+def field_location(where: str, name: Any) -> str:
     """Return the place of a field: `file:field`, or `file:field.inner`."""
     return f"{where}.{name}" if ":" in where else f"{where}:{name}"
 

@@ -150,7 +150,7 @@ def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]
     return [(float(times[a]), float(times[b - 1])) for a, b in runs]
 
 
-def narrowest_half_width_and_centre(x: Array) -> tuple[Array, Array]:
+def width_and_centre_of_narrowest_half(x: Array) -> tuple[Array, Array]:
     """Return width and centre (k,) of the narrowest interval with half of the samples x (N, k)."""
     ordered = np.sort(x, axis=0)
     half = len(ordered) // 2

@@ -20,7 +20,7 @@ _MAX_VARINT_BYTES = 10
 _ThriftStruct = dict[int, Any]
 
 
-def check_parquet(path: Path) -> None:
+def check_parquet_sizes(path: Path) -> None:
     """Raise ValueError if a Parquet file is empty or damaged.
 
     A file is damaged if its numbers of rows, values or bytes are inconsistent.
@@ -29,10 +29,10 @@ def check_parquet(path: Path) -> None:
         if not file.read(1):
             raise ValueError("it is empty")
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            check_parquet_content(content)
+            check_parquet_content_sizes(content)
 
 
-def check_parquet_content(content: bytes | mmap.mmap) -> None:
+def check_parquet_content_sizes(content: bytes | mmap.mmap) -> None:
     try:
         _check_sizes_in_file(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):

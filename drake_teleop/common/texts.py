@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from drake_teleop.common.errors import DrakeTeleopError, field_place, to_one_line
+from drake_teleop.common.errors import DrakeTeleopError, field_location, to_one_line
 
 _MAX_YAML_VALUES = 50_000  # including repetitions by aliases
 _MAX_BRACKET_NESTING = 50  # nested brackets
@@ -129,7 +129,7 @@ def read_json(path: str | Path) -> Any:
         found: dict[str, Any] = {}
         for name, value in pairs:
             if name in found:
-                place = field_place(where, name)
+                place = field_location(where, name)
                 raise DrakeTeleopError("is defined twice", where=place, remedy="remove one")
             found[name] = value
         return found
@@ -179,7 +179,7 @@ class _NodeConverter:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
                 what = f"a field's name is a word, not {_quote_value(key.value)}"
                 raise _error_at_node(what, key, place)
-            field = field_place(place, key.value)
+            field = field_location(place, key.value)
             if key.value in found:
                 raise _error_at_node("is defined twice", key, field)
             if key.value == "_tag":

@@ -25,7 +25,7 @@ _WARNED_PACKET_SILENCE_S = 0.05  # s
 
 
 @njit(cache=True)
-def force_range_into(vectors, origins, out):
+def norm_range_into(vectors, origins, out):
     """Write the smallest and largest norm of the rows' first three elements minus `origins`."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
@@ -74,9 +74,9 @@ class PageValueCalculator:
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
-        force_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        force_range_into(contact_S, zeros, contact)
-        force_range_into(rows["force_to_master"], zeros, rendered)
+        norm_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        norm_range_into(contact_S, zeros, contact)
+        norm_range_into(rows["force_to_master"], zeros, rendered)
         touches = rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         self._forces[:2] *= inputs.force_scales["force_scale"]
         t, states, hand, twist = (
@@ -107,7 +107,7 @@ class PageValueCalculator:
         if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
-        force_range_into(rows["hand_wrench_E"], zeros, hand)
+        norm_range_into(rows["hand_wrench_E"], zeros, hand)
         if hand[1] > _WARNED_HAND_FORCE_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:

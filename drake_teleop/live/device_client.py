@@ -29,7 +29,7 @@ from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 _CLIENT_PERIOD_S, _MAX_CLIENT_PERIOD_S = 1e-3, 0.1  # s
 _MAX_STORED_FORCE_AGES = 100_000  # ticks
 _SIMULATION_STEPS_PER_MS = 10  # per ms
-_MASS_KG, _DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
+_VIRTUAL_MASS_KG, _VIRTUAL_DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
 HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
 """Function from time [s] to intended position [m] and velocity [m/s]."""
 
@@ -122,7 +122,7 @@ class VirtualDevice:
 
     def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
         held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
-        self._mass, self._k, self._d = _MASS_KG + held.mass, held.stiffness, held.damping
+        self._mass, self._k, self._d = _VIRTUAL_MASS_KG + held.mass, held.stiffness, held.damping
         self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
         self.energy, self._t = 0.0, 0.0
 
@@ -136,7 +136,7 @@ class VirtualDevice:
             for i in range(3):
                 x, v = self.position[i], self.velocity[i]
                 elastic, damped = self._k * (at[i] - x), self._d * (speed[i] - v)
-                pull = force[i] - _DAMPING_NS_M * v + elastic + damped
+                pull = force[i] - _VIRTUAL_DAMPING_NS_M * v + elastic + damped
                 v += h * pull / self._mass
                 self.velocity[i], self.position[i] = v, x + h * v
                 self.energy -= force[i] * h * v

@@ -13,10 +13,10 @@ from pydrake.systems import framework
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.live.station_swap import finish_master_side
+from drake_teleop.live.station_swap import build_master_side
 from drake_teleop.station.master_side import CLUTCH_PERIOD_S, MakeMasterSide
 from drake_teleop.station.operator import operator
 from drake_teleop.station.passivity.packet import limit_group
@@ -146,7 +146,7 @@ class LiveHand(operator.Operator):
         - intent: (7,) intended X_BE
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, config: operator.OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
@@ -215,7 +215,7 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
     side = builder.AddNamedSystem("inner_side", MakeMasterSide(scenario, hand))
-    return finish_master_side(builder, side, side, 1 / scenario.rates.hand_hz, cross_fade)
+    return build_master_side(builder, side, side, 1 / scenario.rates.hand_hz, cross_fade)
 
 
 @njit(cache=True)
@@ -284,7 +284,7 @@ class ExternalMaster(framework.LeafSystem):
         - hand_wrench_E: (6,) minus the displayed wrench
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, start: Array, period: float, limits: Array) -> None:
         super().__init__()
@@ -365,4 +365,4 @@ def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> D
     )
     builder.Connect(master.GetOutputPort("pose_master"), inner_side.GetInputPort("pose_master"))
     export_outputs(builder, inner_side, "pose_command")
-    return finish_master_side(builder, master, inner_side, 1 / scenario.rates.hand_hz, cross_fade)
+    return build_master_side(builder, master, inner_side, 1 / scenario.rates.hand_hz, cross_fade)

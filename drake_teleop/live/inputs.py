@@ -52,7 +52,7 @@ def choices_as_in_scenario(scenario: Scenario) -> dict[str, int]:
     }
 
 
-def _integer(default: int, low: int, high: int) -> Any:
+def _integer_field(default: int, low: int, high: int) -> Any:
     return dataclasses.field(default=default, metadata={"range": (low, high)})
 
 
@@ -76,28 +76,28 @@ class Inputs:
         detection: 1 with contact detection.
     """
 
-    x: int = _integer(0, -15_000, 15_000)
-    y: int = _integer(0, -15_000, 15_000)
-    z: int = _integer(0, -15_000, 15_000)
-    rx: int = _integer(0, -10_000, 10_000)
-    ry: int = _integer(0, -10_000, 10_000)
-    rz: int = _integer(0, -10_000, 10_000)
-    held: int = _integer(1, 0, 1)
-    clutch: int = _integer(1, 0, 1)
-    sigma: int = _integer(0, 0, 300)
-    sigma_weight: int = _integer(-1, -1, 300)
-    sigma_object: int = _integer(0, 0, 300)
-    gamma: int = _integer(100, 0, 300)
-    force_scale: int = _integer(5714, 0, 100_000)
-    network: int = _integer(0, 0, len(NETWORKS) - 1)
-    delay: int = _integer(500, 0, 20_000)
-    jitter: int = _integer(20, 0, 100)
-    loss: int = _integer(0, 0, 500)
-    method: int = _integer(0, 0, 0)  # see `input_range`
-    grip: int = _integer(1, 0, len(GRIP_IMPEDANCES) - 1)
-    object: int = _integer(0, 0, 1)
-    detection: int = _integer(0, 0, 1)
-    sensor: int = _integer(0, 0, len(SENSOR_NAMES) - 1)
+    x: int = _integer_field(0, -15_000, 15_000)
+    y: int = _integer_field(0, -15_000, 15_000)
+    z: int = _integer_field(0, -15_000, 15_000)
+    rx: int = _integer_field(0, -10_000, 10_000)
+    ry: int = _integer_field(0, -10_000, 10_000)
+    rz: int = _integer_field(0, -10_000, 10_000)
+    held: int = _integer_field(1, 0, 1)
+    clutch: int = _integer_field(1, 0, 1)
+    sigma: int = _integer_field(0, 0, 300)
+    sigma_weight: int = _integer_field(-1, -1, 300)
+    sigma_object: int = _integer_field(0, 0, 300)
+    gamma: int = _integer_field(100, 0, 300)
+    force_scale: int = _integer_field(5714, 0, 100_000)
+    network: int = _integer_field(0, 0, len(NETWORKS) - 1)
+    delay: int = _integer_field(500, 0, 20_000)
+    jitter: int = _integer_field(20, 0, 100)
+    loss: int = _integer_field(0, 0, 500)
+    method: int = _integer_field(0, 0, 0)  # see `input_range`
+    grip: int = _integer_field(1, 0, len(GRIP_IMPEDANCES) - 1)
+    object: int = _integer_field(0, 0, 1)
+    detection: int = _integer_field(0, 0, 1)
+    sensor: int = _integer_field(0, 0, len(SENSOR_NAMES) - 1)
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Inputs:
@@ -166,7 +166,7 @@ class Inputs:
 #: Range of each input. The end stops of the device are outside the hand's 0.3 m wide box.
 INPUT_RANGES = {entry.name: entry.metadata["range"] for entry in dataclasses.fields(Inputs)}
 #: Inputs whose change requires another station.
-STATION_INPUTS = frozenset(list(INPUT_RANGES)[list(INPUT_RANGES).index("network") :])
+STATION_SWAP_INPUTS = frozenset(list(INPUT_RANGES)[list(INPUT_RANGES).index("network") :])
 _CSV_COLUMNS = ("ms", *INPUT_RANGES)
 
 

@@ -47,10 +47,10 @@ MAX_MESSAGE_BYTES = 4096
 MAX_SLOWDOWN = 20.0
 #: Lateness above which lost time is not caught up [s].
 _MAX_CAUGHT_UP_LATENESS_S = 0.1
-_PACE_STATISTICS_SLICES = 400  # slices
+_SCHEDULE_STATISTICS_SLICES = 400  # slices
 
 
-class Pace:
+class SliceSchedule:
     """Schedule of the simulation slices of `slice_s` simulated seconds; times `now` in s.
 
     Attributes:
@@ -61,8 +61,8 @@ class Pace:
     def __init__(self, slice_s: float, now: float) -> None:
         self.slowdown, self.lost_time_s = 1.0, 0.0
         self._slice = slice_s
-        self._lateness: deque[float] = deque(maxlen=_PACE_STATISTICS_SLICES)
-        self._starts: deque[float] = deque(maxlen=_PACE_STATISTICS_SLICES)
+        self._lateness: deque[float] = deque(maxlen=_SCHEDULE_STATISTICS_SLICES)
+        self._starts: deque[float] = deque(maxlen=_SCHEDULE_STATISTICS_SLICES)
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -142,7 +142,7 @@ class Live:
         self.recorded: list[str] = []
         self._write_error = ""
         self._alone_since = now
-        self.pace = Pace(1e-3 * self._slice_ms, now)
+        self.pace = SliceSchedule(1e-3 * self._slice_ms, now)
         self._frame_due, self._last_frame_at, self._show_now = now, now, False
         self._start_session(now)
 
@@ -224,7 +224,7 @@ class Live:
         if client != self._driver:
             return
         if "set" in message:
-            if not live_inputs.STATION_INPUTS.isdisjoint(message["set"]):
+            if not live_inputs.STATION_SWAP_INPUTS.isdisjoint(message["set"]):
                 self._refusal = ""
             self._requested = self._requested.with_changes(message["set"])
             self._rates = RateInputs()
@@ -314,7 +314,7 @@ class Live:
                 self.stopped = to_one_line(str(error))
             else:  # there is no such station: keep the present one
                 self._refusal = to_one_line(str(error))
-                removed = {name: getattr(present, name) for name in live_inputs.STATION_INPUTS}
+                removed = {name: getattr(present, name) for name in live_inputs.STATION_SWAP_INPUTS}
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))

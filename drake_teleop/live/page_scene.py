@@ -47,7 +47,7 @@ class PageScene:
         except _SCENE_FAILURE_EXCEPTIONS as error:
             self._report_scene_failure(error)
 
-    def frame_part(self, rows: LogRows) -> dict[str, Any]:
+    def scene_values(self, rows: LogRows) -> dict[str, Any]:
         """Return a message: poses (4x4, by columns) and sizes of the last row by Meshcat path."""
         moves = {} if self.failure else self._poses_and_sizes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}

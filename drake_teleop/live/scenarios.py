@@ -23,7 +23,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Payload
 
 #: Gripped object, if the scenario has no payload.
-DEFAULT_OBJECT = Payload(mass=0.8)
+DEFAULT_GRIPPED_OBJECT = Payload(mass=0.8)
 #: Duration of the cross-fade to the rendered wrench of a new station [s].
 CROSS_FADE_S = 0.25
 # Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
@@ -56,10 +56,10 @@ def with_task_space_device(scenario: Scenario) -> Scenario:
     return replace(scenario, master=Master(model="haply_inverse3"))
 
 
-def load_scene(name: str, own: Scenario) -> Scenario:
-    """Return the scenario of a scene in `SCENE_NAMES`; `own` is the user's scenario."""
+def scenario_of_scene(name: str, user_scenario: Scenario) -> Scenario:
+    """Return the scenario of a scene in `SCENE_NAMES`; "own" is that of the user."""
     if name == "own":
-        return own
+        return user_scenario
     scenario = LoadScenario(_SHIPPED_SCENES[name])
     if name == "wall":
         wall = Wall(position=[0.55, 0.0, 0.17], stiffness=1e4)
@@ -68,7 +68,7 @@ def load_scene(name: str, own: Scenario) -> Scenario:
     return live_scenario(scenario)
 
 
-def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
+def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
     """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`.
 
     Contact detection requires the noise floor of `load`, which belongs to the scenario's sensor.
@@ -98,8 +98,8 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         changes["contact_detection"] = ContactDetectionConfig()
     has_payload = scenario.slave.payload.mass > 0.0
     if inputs.object != has_payload:
-        payload = DEFAULT_OBJECT if inputs.object else dataclasses.replace(DEFAULT_OBJECT, mass=0.0)
-        changes["slave__payload"] = payload
+        mass = DEFAULT_GRIPPED_OBJECT.mass if inputs.object else 0.0
+        changes["slave__payload"] = dataclasses.replace(DEFAULT_GRIPPED_OBJECT, mass=mass)
     changed = replace(scenario, **changes)
     if inputs.object and load is not None and scenario.force_scaling.gripper_phi is None:
         gripper = load.identification.phi - has_payload * _payload_phi(changed)

@@ -44,7 +44,7 @@ from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import (
     SCENE_NAMES,
     live_scenario,
-    load_scene,
+    scenario_of_scene,
     with_task_space_device,
 )
 from drake_teleop.live.session import Session
@@ -109,7 +109,7 @@ class LiveDrive:
             self._load = _identify_load(scenario, stage)
             progress = stage("Prepare the station and its 3D scenes")
             for name in SCENE_NAMES:
-                setup = load_scene(name, scenario)
+                setup = scenario_of_scene(name, scenario)
                 setup = with_task_space_device(setup) if device else setup
                 self._views[name] = PageScene(name, setup)
                 progress(len(self._views) / (1 + len(SCENE_NAMES)))
@@ -180,7 +180,7 @@ class LiveDrive:
             self._ready.set()
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
-        show = self._views[SCENE_NAMES[0]].frame_part
+        show = self._views[SCENE_NAMES[0]].scene_values
         live = Live(scenario, self._load, record, show, time.perf_counter(), self._link)
         self.recorded = live.recorded
         return live
@@ -258,7 +258,7 @@ class LiveDrive:
                 return
             await asyncio.sleep(0.05)
         try:
-            live.change_scene(view.scenario, found.result(), view.frame_part, time.perf_counter())
+            live.change_scene(view.scenario, found.result(), view.scene_values, time.perf_counter())
         except DrakeTeleopError as error:
             live.reject_scene(str(error), time.perf_counter())
             return

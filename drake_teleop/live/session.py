@@ -33,7 +33,7 @@ from drake_teleop.live.scenarios import (
     CROSS_FADE_S,
     adapt_estimate,
     channel_fill_time_s,
-    chosen_scenario,
+    scenario_of_inputs,
 )
 from drake_teleop.live.station_swap import copy_station_state
 from drake_teleop.station import simulation
@@ -137,7 +137,7 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def take_over(self, other: _Station, new_channel: bool) -> float:
+    def take_over_state(self, other: _Station, new_channel: bool) -> float:
         """Take over another station's state and fade to this station's force.
 
         With a new channel, open the clutch and return how long it must stay open [s]; else 0.
@@ -227,11 +227,11 @@ class Session:
             self._record.write(self.ms, inputs)
 
     def _swap_station(self, inputs: Inputs) -> None:
-        scenario = chosen_scenario(self.scenario, self._load, inputs)
+        scenario = scenario_of_inputs(self.scenario, self._load, inputs)
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.take_over(
+        wait_s = station.take_over_state(
             self._station, inputs.channel_choices != self.inputs.channel_choices
         )
         if wait_s:

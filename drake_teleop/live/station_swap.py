@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
     System,
 )
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.wiring import export_outputs
@@ -26,18 +26,18 @@ _BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
 def copy_station_state(
-    before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
+    old: Diagram, old_context: Context, new: Diagram, new_context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states, changeable parameters to `station`, except of blocks `excluded`."""
-    context.SetTime(then.get_time())
-    sources = dict(_blocks_by_path(before))
-    for path, block in _blocks_by_path(station):
+    """Copy time, states, changeable parameters of a station, except of blocks `excluded`."""
+    new_context.SetTime(old_context.get_time())
+    sources = dict(_blocks_by_path(old))
+    for path, block in _blocks_by_path(new):
         source, names = sources.get(path), path.split("/")
         if source is None or type(source) is not type(block) or excluded & set(names):
             continue
         _copy_block_state(
-            source.GetMyContextFromRoot(then),
-            block.GetMyMutableContextFromRoot(context),
+            source.GetMyContextFromRoot(old_context),
+            block.GetMyMutableContextFromRoot(new_context),
             names[-1] in _BLOCKS_WITH_CHANGED_PARAMETERS,
         )
 
@@ -89,7 +89,7 @@ def _force_norm(wrench):
     return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
 
 
-def finish_master_side(
+def build_master_side(
     builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
 ) -> Diagram:
     """Export the ports of a master side, with a block `CrossFade` on request, and build it."""
@@ -117,7 +117,7 @@ class CrossFade(LeafSystem):
         - felt: (6,) rendered wrench
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, period: float) -> None:
         super().__init__()

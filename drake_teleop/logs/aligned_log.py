@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import (
     Array,
-    narrowest_half_width_and_centre,
     one_blas_thread,
     samples_to_nearest_flag,
+    width_and_centre_of_narrowest_half,
 )
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
@@ -167,7 +167,7 @@ def read_aligned_log(
         log = aligned.log
         residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
         residual = low_pass(residual, log.dt, cutoff_hz)[~aligned.edge]
-        return float(np.log(narrowest_half_width_and_centre(residual)[0] + 1e-12).sum())
+        return float(np.log(width_and_centre_of_narrowest_half(residual)[0] + 1e-12).sum())
 
     return min(candidates, key=summed_logarithms_of_residual_spread)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half_width_and_centre
+from drake_teleop.common.numeric import Array, find_runs_of_true, width_and_centre_of_narrowest_half
 from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.load.contact.noise_floor import (
@@ -237,7 +237,7 @@ def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, 
 
 def robust_offsets(residual: Array) -> tuple[Array, float]:
     """Return offsets (6,) of a residual (N, 6), and the share of samples that agree, Eq. (T12)."""
-    offsets = narrowest_half_width_and_centre(residual)[1]
+    offsets = width_and_centre_of_narrowest_half(residual)[1]
     agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):
         distance = np.abs(residual - offsets)
@@ -252,7 +252,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 def noise_floor(contact: Array) -> Array:
     """Return the RMS noise (6,) of a wrench (N, 6) that is half free of contact, Eq. (T12)."""
-    floor = narrowest_half_width_and_centre(contact)[0] / 1.349
+    floor = width_and_centre_of_narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet

@@ -24,9 +24,9 @@ from drake_teleop.logs.read.alignment import (
     vectors_of_skew_parts,
 )
 from drake_teleop.robots.compensator import (
-    CLOCK_JUMP_S,
     MAX_CLOCK_DRIFT,
     MAX_SENSOR_OFFSET_DRIFT,
+    MIN_CLOCK_JUMP_S,
     STALE_AGE_S,
 )
 from drake_teleop.robots.streams import (
@@ -308,7 +308,7 @@ class _StreamClockOffset:
     def update(self, t: float, now: float) -> None:
         if math.isfinite(t):
             ahead, faded = now - t, self.offset + MAX_CLOCK_DRIFT * (now - self._now)
-            known = abs(ahead - self.offset) <= CLOCK_JUMP_S
+            known = abs(ahead - self.offset) <= MIN_CLOCK_JUMP_S
             self.offset, self._now = min(ahead, faded) if known else ahead, now
 
 

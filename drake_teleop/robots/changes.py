@@ -20,7 +20,7 @@ from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_mean
 from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import FittedModel
 from drake_teleop.robots import streams
-from drake_teleop.robots.compensator import CLOCK_JUMP_S
+from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S
 
 TESTED_RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
@@ -38,7 +38,7 @@ TimedChangeText = tuple[float, str]
 """Time of a change [s], and the change in words."""
 
 
-class ChangeMonitor:
+class ZeroAndLoadMonitor:
     """Monitor that reports each change of sensor zero or load once, by `report`."""
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
@@ -53,7 +53,7 @@ class ChangeMonitor:
     def add_reading(self, reading: streams.Reading, flags: int) -> None:
         if flags & _UNTESTED_READING_FLAGS:
             return
-        if not 0.0 < reading.t - self._last < CLOCK_JUMP_S:
+        if not 0.0 < reading.t - self._last < MIN_CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
         t = self._last = reading.t
         row = self._rows[self._count % len(self._rows)]

@@ -17,7 +17,7 @@ from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
-from drake_teleop.robots.changes import ChangeMonitor
+from drake_teleop.robots.changes import ZeroAndLoadMonitor
 from drake_teleop.robots.compensator import SCALE_NAMES, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
@@ -55,7 +55,7 @@ def compensate_stream(
     *,
     control: TareRequestPort | None = None,
     tare: bool = False,
-    changes: ChangeMonitor | None = None,
+    changes: ZeroAndLoadMonitor | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
     """Compensate readings until the source ends, or Ctrl-C; count wrenches and flags."""
@@ -100,7 +100,7 @@ def run_compensate_command(
     sink: str,
     *,
     cutoff_hz: float | None = 30.0,
-    largest: tuple[float, float] | None = None,
+    sensor_range: tuple[float, float] | None = None,
     predicted: bool = False,
     tare: bool = False,
     watch: bool = False,
@@ -112,7 +112,7 @@ def run_compensate_command(
     """Run the command `compensate`; messages go to stderr.
 
     Args:
-        largest: range of the sensor: force [N], torque [N m].
+        sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
         options: scales of a `Compensator`, and options of `open_source`.
@@ -129,9 +129,9 @@ def run_compensate_command(
             dt,
             **scales,
             cutoff_hz=cutoff_hz,
-            wait=getattr(readings, "wait", 0),
+            delay_readings=getattr(readings, "delay_readings", 0),
             predicted=predicted,
-            largest=None if largest is None else np.repeat(largest, 3),
+            sensor_range=None if sensor_range is None else np.repeat(sensor_range, 3),
             watch=ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None,
             detector=detector,
         )
@@ -146,13 +146,13 @@ def run_compensate_command(
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
     control_port = None if control is None else TareRequestPort(control)
-    changes = ChangeMonitor(readings.dt, live=readings.live, report=report) if watch else None
+    changes = ZeroAndLoadMonitor(readings.dt, live=readings.live, report=report) if watch else None
     for note in notes_on_undetermined_load(found):
         report(f"warning: {note}")
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     report(f"outputs are {1e3 * late:.1f} ms late")
     report(f"readings are stale after {1e3 * STALE_AGE_S:.0f} ms; invalid wrenches are zero")
-    if largest is None:
+    if sensor_range is None:
         report("no --range: saturation of the sensor is not detected")
     try:
         counts = compensate_stream(

@@ -28,7 +28,7 @@ from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetect
 
 STALE_AGE_S = 0.05
 """Age of a reading above which the output wrench is zero [s]."""
-CLOCK_JUMP_S = 1.0
+MIN_CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 MAX_CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
@@ -87,9 +87,9 @@ class Compensator:
     """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
-        wait: delay of the motion, in readings, for which the source has corrected.
-        predicted: extrapolate over `wait` and the delay of the low-pass.
-        largest: (6,) range of the sensor [N, N m].
+        delay_readings: delay of the motion, in readings, for which the source has corrected.
+        predicted: extrapolate over `delay_readings` and the delay of the low-pass.
+        sensor_range: (6,) range of the sensor [N, N m].
         scales: arguments of `set_scales`.
     """
 
@@ -99,9 +99,9 @@ class Compensator:
         dt: float,
         *,
         cutoff_hz: float | None = 30.0,
-        wait: int = 0,
+        delay_readings: int = 0,
         predicted: bool = False,
-        largest: Array | None = None,
+        sensor_range: Array | None = None,
         watch: ContactAndLoadMonitor | None = None,
         detector: StreamContactDetector | None = None,
         **scales: Any,
@@ -111,18 +111,18 @@ class Compensator:
         self._scales = np.empty(4)
         self.set_scales(**scales)
         self.offsets = load.offsets.copy()
-        self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
+        self.lag_s = delay_readings * dt + filter_lag(dt, cutoff_hz)
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
         if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
             ahead = self.lag_s if predicted else 0.0
             self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
-        self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
+        self._range = np.full(6, np.inf) if sensor_range is None else np.array(sensor_range, float)
         self._largest = _MAX_READING_VALUES.copy()
         self._largest[:6] = np.minimum(self._largest[:6], 2.0 * self._range)
         noise_limit = _MAX_REST_WRENCH_RMS_OVER_RESIDUAL * load.residual_rms
         self._noise_limit = np.maximum(noise_limit, _MIN_REST_WRENCH_RMS_LIMIT)
         self._memory = np.full((2, 12), np.nan)
-        self._delay_line: deque[Array] = deque(maxlen=wait + 1)
+        self._delay_line: deque[Array] = deque(maxlen=delay_readings + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
@@ -249,9 +249,9 @@ class Compensator:
         step = reading.t - self._t
         # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
         lost = now - self._now > STALE_AGE_S
-        if started and reading.number <= self._number and (abs(step) > CLOCK_JUMP_S or lost):
+        if started and reading.number <= self._number and (abs(step) > MIN_CLOCK_JUMP_S or lost):
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
-        if started and (abs(ahead - self._min_offset) > CLOCK_JUMP_S or (step <= 0.0 and lost)):
+        if started and (abs(ahead - self._min_offset) > MIN_CLOCK_JUMP_S or (step <= 0.0 and lost)):
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         if started and step <= 0.0:
             return flags | int(ReadingFlag.REORDERED)
@@ -261,7 +261,7 @@ class Compensator:
         self._min_offset = min(ahead, self._min_offset + drift)
         if ahead - self._min_offset <= STALE_AGE_S:
             self._last_in_time = now
-        elif now - self._last_in_time > CLOCK_JUMP_S:
+        elif now - self._last_in_time > MIN_CLOCK_JUMP_S:
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         else:
             flags |= _STALE_FLAG

@@ -18,7 +18,7 @@ from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
-from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
+from drake_teleop.robots.udp import UdpSink, UdpSource, UdpWrenchPoseSource
 
 _REPLAY_PREFIX = "replay:"
 _UNUSED_SOURCE_RATE_HZ = 1000.0
@@ -70,19 +70,19 @@ def open_source(
 
 
 def open_source_and_recorder(
-    address: str, largest: Array | None, *, real_time: bool = False, **motion_options: Any
+    address: str, sensor_range: Array | None, *, real_time: bool = False, **motion_options: Any
 ) -> tuple[Source, Recorder]:
     """Return the source that `calibrate` reads, and its recorder."""
     kind = _address_scheme(address)
     if kind == "replay":
         source = open_source(address, None, real_time=real_time, **motion_options)
-        return source, Recorder(largest=largest)
+        return source, Recorder(sensor_range=sensor_range)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
     source = _open_streams(address, rate_hz, **motion_options)
     two_clocks = isinstance(source, assembly.WrenchAndMotionStreams) and source.two_clocks
     X_FS = _pose_from_option(motion_options.get("sensor_pose"))
-    return source, Recorder(source.streams, largest, X_FS, two_clocks=two_clocks)
+    return source, Recorder(source.streams, sensor_range, X_FS, two_clocks=two_clocks)
 
 
 def is_file_address(address: str) -> bool:
@@ -170,7 +170,7 @@ SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], Source]] = Regi
     {
         "udp": lambda at, hz, joints: UdpSource(at, _period_s(hz, at)),
         "-": lambda at, hz, joints: JsonLineSource(sys.stdin.fileno(), _period_s(hz, at)),
-        "posed": lambda at, hz, joints: PosedSource(at, _period_s(hz, at)),
+        "posed": lambda at, hz, joints: UdpWrenchPoseSource(at, _period_s(hz, at)),
         "rtde": lambda at, hz, joints: _make("rtde", "RtdeSource", at),
         "netft": lambda at, hz, joints: _make("netft", "NetFtSource", at, hz and 1.0 / hz),
         "zenoh": lambda at, hz, joints: _make(

@@ -120,7 +120,7 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
     return [*warnings, format.note] if format.note else warnings
 
 
-def _from_template(name: str) -> Callable[[ExportedLoad], str]:
+def _make_template_writer(name: str) -> Callable[[ExportedLoad], str]:
     """Return the function that writes a load by the template `formats/NAME.j2`."""
 
     def numbers(values: Iterable[float], separator: str = ", ") -> str:
@@ -140,19 +140,19 @@ def _from_template(name: str) -> Callable[[ExportedLoad], str]:
 
 
 _SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
-_OF_SENSOR: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
+_SENSOR_FORMAT_OPTIONS: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
 _SHIPPED_FORMATS: dict[str, dict[str, Any]] = {
     "ur": {"comment": "#"},
     "franka": {"note": "transformation is the identity: use that of your end effector"},
     "xarm": {"inertia": False, "comment": "#"},
     "kth": {
-        **_OF_SENSOR,
+        **_SENSOR_FORMAT_OPTIONS,
         "offsets": True,
         "note": f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
         " compensated force is twice the weight, change the sign of the mass",
     },
-    "ft_tools": _OF_SENSOR | {"offsets": True},
-    "ros2-admittance": _OF_SENSOR | {"note": _SENSOR_FRAME_NOTE},
+    "ft_tools": _SENSOR_FORMAT_OPTIONS | {"offsets": True},
+    "ros2-admittance": _SENSOR_FORMAT_OPTIONS | {"note": _SENSOR_FRAME_NOTE},
     "bota": {
         "of_sensor": True,
         "offsets": True,
@@ -164,7 +164,7 @@ _SHIPPED_FORMATS: dict[str, dict[str, Any]] = {
 }
 FORMATS = Registry(
     "export format",
-    {name: Format(_from_template(name), **each) for name, each in _SHIPPED_FORMATS.items()},
+    {name: Format(_make_template_writer(name), **each) for name, each in _SHIPPED_FORMATS.items()},
     Format,
 )
 """Export formats by name."""

@@ -18,24 +18,24 @@ DEFAULT_SERVER_PORT = 8765
 WRENCH_TOPIC = "/wrench"
 
 
-class _FoxgloveSink:
+class _WrenchChannelSink:
     def __init__(self, where: str) -> None:
         require_library("foxglove", "foxglove-sdk", "robots", where)
         import foxglove
 
-        text = resources.files("drake_teleop.robots").joinpath("foxglove_schema.json").read_text()
+        schema = resources.files("drake_teleop.robots") / "foxglove_schema.json"
         self._context = foxglove.Context()
-        options = {"schema": json.loads(text), "context": self._context}
+        options = {"schema": json.loads(schema.read_bytes()), "context": self._context}
         self._channel = foxglove.Channel(WRENCH_TOPIC, **options)
 
-    def _log(self, out: CompensatedWrench, ns: int | None) -> None:
+    def _log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
         self._channel.log(json.dumps(data).encode(), log_time=ns)
 
 
-class FoxgloveSink(_FoxgloveSink):
+class FoxgloveSink(_WrenchChannelSink):
     """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
@@ -52,14 +52,14 @@ class FoxgloveSink(_FoxgloveSink):
         self.port = self._server.port
 
     def write(self, out: CompensatedWrench) -> None:
-        self._log(out, None)
+        self._log_wrench(out, None)
 
     def close(self) -> None:
         self._channel.close()
         self._server.stop()
 
 
-class McapSink(_FoxgloveSink):
+class McapSink(_WrenchChannelSink):
     """Sink that writes an MCAP file continuously; messages have the times of the readings."""
 
     def __init__(self, path: Path) -> None:
@@ -71,7 +71,7 @@ class McapSink(_FoxgloveSink):
             self._file = foxglove.open_mcap(path, allow_overwrite=True, context=self._context)
 
     def write(self, out: CompensatedWrench) -> None:
-        self._log(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
+        self._log_wrench(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
 
     def close(self) -> None:
         self._file.close()

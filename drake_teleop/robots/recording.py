@@ -17,7 +17,7 @@ from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import IDENTITY_POSE
-from drake_teleop.robots.compensator import CLOCK_JUMP_S
+from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S
 from drake_teleop.robots.streams import (
     IMU,
     NUM_READING_VALUES,
@@ -55,7 +55,7 @@ class Recorder:
 
     Args:
         streams: streams of the source.
-        largest: (6,) range of the sensor [N, N m]; None: unknown.
+        sensor_range: (6,) range of the sensor [N, N m]; None: unknown.
         X_FS: (7,) pose of the sensor in the posed frame F.
         two_clocks: whether wrench and motion have different clocks.
 
@@ -68,13 +68,13 @@ class Recorder:
     def __init__(
         self,
         streams: tuple[str, ...] = (WRENCH_AND_MOTION,),
-        largest: Array | None = None,
+        sensor_range: Array | None = None,
         X_FS: Array = IDENTITY_POSE,
         *,
         two_clocks: bool = False,
     ) -> None:
         self._streams, self._two_clocks = streams, two_clocks
-        self._largest = np.full(6, np.inf) if largest is None else largest
+        self._sensor_range = np.full(6, np.inf) if sensor_range is None else sensor_range
         self._R_SF = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0].T
         self._p_FS = X_FS[4:]
         tables = [] if WRENCH_AND_MOTION in streams else list(_LOG_COLUMNS_OF_STREAM)
@@ -96,7 +96,7 @@ class Recorder:
         if stream == POSE:
             valid &= abs(float(np.linalg.norm(values[:4])) - 1.0) < _QUATERNION_NORM_TOLERANCE
         elif stream in (WRENCH, WRENCH_AND_MOTION):
-            valid &= not (np.abs(values[:6]) >= self._largest).any()
+            valid &= not (np.abs(values[:6]) >= self._sensor_range).any()
         if not valid:
             self.left_out += 1
             return
@@ -156,7 +156,7 @@ class _SampleSeries:
         self.min_offset = math.inf
 
     def is_clock_jump(self, t: float) -> bool:
-        return bool(self.t) and abs(t - self.t[-1]) > CLOCK_JUMP_S
+        return bool(self.t) and abs(t - self.t[-1]) > MIN_CLOCK_JUMP_S
 
     def add(self, reading: Reading) -> bool:
         if self.t and reading.t <= self.t[-1]:

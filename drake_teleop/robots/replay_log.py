@@ -20,8 +20,8 @@ from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 class ReplayLogSource(Source):
     """Source of a log's readings, with the motion aligned to the wrench.
 
-    `wait` is the removed delay of the motion, in readings; `chunk` the largest number of readings
-    per call. Without a `load` the motion is not aligned.
+    `delay_readings` is the removed delay of the motion, in readings; `chunk` the largest number of
+    readings per call. Without a `load` the motion is not aligned.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class ReplayLogSource(Source):
                 delay_s = load.delay_s
             log = remove_delay(log, delay_s)
         self.dt, self.live = log.dt, real_time
-        self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
+        self.delay_readings = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])
         self._gravity = log.gravity
         self._flags = np.where(is_far_from_gaps(log, cutoff_hz), 0, int(ReadingFlag.GAP))

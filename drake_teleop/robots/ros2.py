@@ -110,7 +110,7 @@ class MessageConverter:
 
     def _message_values(self, name: str, data: Any) -> Array | None:
         if name == WRENCH:
-            return self._sign * _six_numbers(data.wrench.force, data.wrench.torque)
+            return self._sign * _concatenate_xyz(data.wrench.force, data.wrench.torque)
         if name == POSE:
             return _pose_array(data.pose.position, data.pose.orientation)
         if name == JOINTS:
@@ -118,7 +118,7 @@ class MessageConverter:
             if not self._joints or not all(joint in positions for joint in self._joints):
                 return None
             return np.array([positions[joint] for joint in self._joints], float)
-        return _six_numbers(data.linear_acceleration, data.angular_velocity)
+        return _concatenate_xyz(data.linear_acceleration, data.angular_velocity)
 
     def _pose_from_transforms(self, data: Any) -> list[tuple[Any, Array]]:
         newest = {each.child_frame_id: each for each in data.transforms}
@@ -139,7 +139,7 @@ class MessageConverter:
         return []
 
 
-def _six_numbers(v: Any, w: Any) -> Array:
+def _concatenate_xyz(v: Any, w: Any) -> Array:
     return np.array([v.x, v.y, v.z, w.x, w.y, w.z])
 
 

@@ -68,20 +68,20 @@ def open_session(address: Address) -> Any:
         raise DrakeTeleopError(what, where=address.text, remedy=remedy) from error
 
 
-def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
-    """Return the zenoh key of a topic; `hashed` is the type hash (default: any)."""
-    return f"{domain}/{topic}/{_dds_type_name(kind)}/{hashed}"
+def topic_key(domain: int, topic: str, kind: str, type_hash: str = "*") -> str:
+    """Return the zenoh key of a topic, by default for any hash of the type."""
+    return f"{domain}/{topic}/{_dds_type_name(kind)}/{type_hash}"
 
 
 def liveliness_tokens(
-    domain: int, session: str, node: str, topic: str, kind: str, hashed: str
+    domain: int, session: str, node: str, topic: str, kind: str, type_hash: str
 ) -> list[str]:
     """Return the Zenoh liveliness tokens by which ROS 2 finds a node with one publisher."""
     here = f"@ros2_lv/{domain}/{session}/0"
     name = "%" + topic.replace("/", "%")
     return [
         f"{here}/0/NN/%/%/{node}",
-        f"{here}/1/MP/%/%/{node}/{name}/{_dds_type_name(kind)}/{hashed}/::,10:,:,:,,",
+        f"{here}/1/MP/%/%/{node}/{name}/{_dds_type_name(kind)}/{type_hash}/::,10:,:,:,,",
     ]
 
 
@@ -182,15 +182,15 @@ class ZenohSink:
         require_libraries(address)
         self._types = message_types()
         self._frame = parsed.optional_parameter("frame") or ""
-        hashed = self._types.hash_rihs01(WRENCH_STAMPED)
+        type_hash = self._types.hash_rihs01(WRENCH_STAMPED)
         self._session = open_session(parsed)
         zid = str(self._session.info.zid())
         self._sender, self._number = bytes.fromhex(zid.rjust(32, "0"))[:16], 0
         self._tokens = [
-            self._session.liveliness().declare_token(token)
-            for token in liveliness_tokens(domain, zid, _NODE_NAME, topic, WRENCH_STAMPED, hashed)
+            self._session.liveliness().declare_token(each)
+            for each in liveliness_tokens(domain, zid, _NODE_NAME, topic, WRENCH_STAMPED, type_hash)
         ]
-        key = topic_key(domain, topic, WRENCH_STAMPED, hashed)
+        key = topic_key(domain, topic, WRENCH_STAMPED, type_hash)
         self._publisher = self._session.declare_publisher(key, express=True)
 
     def write(self, out: CompensatedWrench) -> None:

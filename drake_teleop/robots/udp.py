@@ -25,9 +25,9 @@ from drake_teleop.robots.streams import (
 
 LOCALHOST = "127.0.0.1"
 READING_FORMAT = struct.Struct("<4sIQd15d")
-POSED_FORMAT = struct.Struct("<4sIQd13d")
+WRENCH_POSE_FORMAT = struct.Struct("<4sIQd13d")
 WRENCH_FORMAT = struct.Struct("<4sIQd12d")
-_READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
+_READING_TAG, _WRENCH_POSE_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _PACKET_HEADER = struct.Struct("<4sIQd")
 _MAX_PACKETS_PER_CALL = 256
 _SOCKET_BUFFER_BYTES = 1 << 20  # a tenth of a second at 8 kHz
@@ -49,12 +49,12 @@ def unpack_reading(packet: bytes) -> Reading:
 
 
 def pack_wrench_and_pose(wrench: Reading, pose: Reading) -> bytes:
-    head = _POSED_TAG, wrench.flags, wrench.number, wrench.t
-    return POSED_FORMAT.pack(*head, *wrench.values, *pose.values)
+    head = _WRENCH_POSE_TAG, wrench.flags, wrench.number, wrench.t
+    return WRENCH_POSE_FORMAT.pack(*head, *wrench.values, *pose.values)
 
 
 def unpack_wrench_and_pose(packet: bytes) -> list[Reading]:
-    if len(packet) != POSED_FORMAT.size or packet[:4] != _POSED_TAG:
+    if len(packet) != WRENCH_POSE_FORMAT.size or packet[:4] != _WRENCH_POSE_TAG:
         return [DAMAGED_WRENCH_READING]
     _, flags, number, t = _PACKET_HEADER.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _PACKET_HEADER.size).astype(np.float64)
@@ -128,7 +128,7 @@ class UdpSource(_PacketReceiver):
         return [unpack_reading(packet) for packet in self.receive_packets(timeout_s)]
 
 
-class PosedSource(_PacketReceiver):
+class UdpWrenchPoseSource(_PacketReceiver):
     """Source of wrenches and poses at posed://[HOST]:PORT[?sign=-1]."""
 
     streams = WRENCH, POSE

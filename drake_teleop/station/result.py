@@ -17,7 +17,7 @@ from drake_teleop.common import errors
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
 from drake_teleop.common.numeric import Array, float_array
-from drake_teleop.common.parquet_sizes import check_parquet
+from drake_teleop.common.parquet_sizes import check_parquet_sizes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -247,7 +247,7 @@ class SimulationResult:
         parts = _files_of_log(path)
         for part in parts:
             with errors.wrap_read_errors(part, remedy, "is not a simulation result"):
-                check_parquet(part)
+                check_parquet_sizes(part)
         with errors.wrap_read_errors(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(parts[0])[_SIGNAL_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]

@@ -10,11 +10,11 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
 
-from drake_teleop.common.blocks import DoubleOnly, weak_callback
+from drake_teleop.common.blocks import DoubleOnlySystem, weak_callback
 from drake_teleop.common.numeric import Array
 
 
-class SteppedBlock(DoubleOnly, LeafSystem):
+class SteppedBlock(DoubleOnlySystem, LeafSystem):
     """Block whose discrete states advance by a step that outputs and states share."""
 
     __slots__ = ()

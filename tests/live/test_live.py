@@ -13,7 +13,13 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.progress import show_no_progress
-from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, Pace, parse_message
+from drake_teleop.live.live import (
+    FRAME_PERIOD_S,
+    MAX_MESSAGE_BYTES,
+    Live,
+    SliceSchedule,
+    parse_message,
+)
 from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
 
@@ -115,7 +121,7 @@ def test_impossible_station_is_reported_and_the_drive_continues(scenario, load, 
     def no_such(*_):
         raise DrakeTeleopError("there is no such station")
 
-    monkeypatch.setattr("drake_teleop.live.session.chosen_scenario", no_such)
+    monkeypatch.setattr("drake_teleop.live.session.scenario_of_inputs", no_such)
     live.handle_message(1, '{"set": {"network": 3, "x": 100}}', clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["inputs"]["network"], frame["inputs"]["x"]) == ("running", 0, 100)
@@ -270,7 +276,7 @@ def test_simulation_waits_without_a_page(scenario, load, clock, tmp_path):
 
 
 def test_short_delays_are_caught_up_and_long_ones_given_up():
-    pace = Pace(5e-3, 0.0)
+    pace = SliceSchedule(5e-3, 0.0)
     for k in range(10):
         pace.begin_slice(5e-3 * k)
     assert pace.real_time_factor == pytest.approx(1.0) and pace.lateness_p99_s() == pytest.approx(

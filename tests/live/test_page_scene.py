@@ -33,7 +33,7 @@ def rows(scenario, load) -> dict[str, np.ndarray]:
 def test_moving_objects_have_the_poses_of_the_station(scenario, view, rows):
     objects = json.loads(view.objects)
     commands = [base64.b64decode(text) for text in objects["commands"]]
-    frame = view.frame_part(rows)
+    frame = view.scene_values(rows)
     moves = frame["moves"]
     assert (frame["view"], frame["no_view"], view.failure) == ("own", "", "")
     for path in (*moves["poses"], *moves["sizes"]):
@@ -44,14 +44,15 @@ def test_moving_objects_have_the_poses_of_the_station(scenario, view, rows):
     X_WTool = tool.reshape(4, 4).T
     assert np.linalg.norm(X_WTool[:3, 3] - p_WS) < 0.2
     np.testing.assert_allclose(X_WTool[:3, :3].T @ X_WTool[:3, :3], np.eye(3), atol=1e-4)
-    earlier = view.frame_part({name: values[:1] for name, values in rows.items()})["moves"]["poses"]
+    first = {name: values[:1] for name, values in rows.items()}
+    earlier = view.scene_values(first)["moves"]["poses"]
     moved = [path for path in earlier if earlier[path] != moves["poses"][path]]
     assert len(moved) > 10 and sum("arm" in path or "link" in path for path in moved) > 3
     json.dumps(frame, allow_nan=False)
 
 
 def test_scene_without_forces_has_no_arrow(scenario, rows):
-    moves = PageScene("0", scenario, forces=False).frame_part(rows)["moves"]
+    moves = PageScene("0", scenario, forces=False).scene_values(rows)["moves"]
     assert not moves["sizes"] and not any("forces" in path for path in moves["poses"])
 
 
@@ -68,7 +69,7 @@ def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, 
 
     monkeypatch.setattr(page_scene, broken, fail)
     view = PageScene("own", scenario)
-    assert view.frame_part(rows) == {
+    assert view.scene_values(rows) == {
         "view": "own", "no_view": "no 3D scene: no port is free for this", "moves": {},
     }  # fmt: skip
     said = capsys.readouterr().err
@@ -78,7 +79,7 @@ def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, 
 def test_scene_that_fails_later_is_reported_once(scenario, rows, capsys):
     view = PageScene("own", scenario)
     for _ in range(3):
-        frame = view.frame_part(
+        frame = view.scene_values(
             {name: values for name, values in rows.items() if name != "slave_state"}
         )
     assert frame["no_view"] == "no 3D scene: 'slave_state'" and frame["moves"] == {}
@@ -88,7 +89,7 @@ def test_scene_that_fails_later_is_reported_once(scenario, rows, capsys):
 @pytest.mark.parametrize("name", ["slave_state", "master_state", "contact_wrench_S"])
 def test_non_finite_poses_are_not_sent(view, rows, name):
     for value in (np.nan, np.inf):
-        wild = view.frame_part(rows | {name: np.full_like(rows[name], value)})
+        wild = view.scene_values(rows | {name: np.full_like(rows[name], value)})
         json.dumps(wild, allow_nan=False)
         assert wild["moves"] == {}
-    assert view.frame_part(rows)["moves"]
+    assert view.scene_values(rows)["moves"]

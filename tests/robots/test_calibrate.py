@@ -210,7 +210,7 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
 
 
 def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: Path) -> None:
-    rows, recorder = recorded(1.0, [0]), Recorder(largest=np.full(6, 80.0))
+    rows, recorder = recorded(1.0, [0]), Recorder(sensor_range=np.full(6, 80.0))
     broken = rows[3].copy()
     broken[1], rows[5, 0] = np.nan, 80.0
     for reading in (Reading(0, 0.0, rows[0]), DAMAGED_READING, Reading(1, DT, broken),

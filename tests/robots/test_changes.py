@@ -18,7 +18,7 @@ from drake_teleop.logs.causes.instants import NUM_SIGNALS, SPECIFIC_FORCE_SIGNAL
 from drake_teleop.logs.causes.model import Model, StepChange
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots import changes
-from drake_teleop.robots.changes import ChangeMonitor
+from drake_teleop.robots.changes import ZeroAndLoadMonitor
 from drake_teleop.robots.compensate import compensate_stream, run_compensate_command
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import CompensatedWrench, Reading, ReadingFlag
@@ -84,7 +84,7 @@ def compensated(
 ) -> tuple[list[CompensatedWrench], list[str]]:
     """Return outputs and reports."""
     messages: list[str] = []
-    sought = ChangeMonitor(DT, live=live, report=messages.append) if looked_for else None
+    sought = ZeroAndLoadMonitor(DT, live=live, report=messages.append) if looked_for else None
     sink = ListSink()
     compensator = Compensator(LOAD, DT, watch=ContactAndLoadMonitor(LOAD, DT, 30.0))
     # As fast as possible: the clock of the loop is that of the readings.
@@ -221,7 +221,7 @@ def test_failing_explanation_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPa
 
 def test_record_contains_the_last_20_s_after_a_clock_change() -> None:
     seen = []
-    sought = ChangeMonitor(DT, live=False, report=print)
+    sought = ZeroAndLoadMonitor(DT, live=False, report=print)
     sought._executor.shutdown()
     sought._next_attempt = np.inf
     row = np.zeros(15)

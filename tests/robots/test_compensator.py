@@ -19,7 +19,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensate import compensate_stream
-from drake_teleop.robots.compensator import CLOCK_JUMP_S, STALE_AGE_S, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import DAMAGED_READING, CompensatedWrench, Reading, ReadingFlag
 
@@ -96,7 +96,7 @@ def test_replayed_log_equals_eliminate(log: Path, mode: str, weight: float | Non
     @given(chunk=st.integers(1, 2000))
     def at(chunk: int) -> None:
         source, kept = ReplayLogSource(log, load(), delay=DELAY, chunk=chunk), ListSink()
-        late = {"wait": source.wait, "predicted": mode == "predicted"}
+        late = {"delay_readings": source.delay_readings, "predicted": mode == "predicted"}
         counts = compensate_stream(source, Compensator(load(), source.dt, **options, **late), kept)
         good = [row for row in kept.rows if not row.flags]
         assert counts["gap"] == counts["wrenches"] - len(good) > 0
@@ -155,7 +155,7 @@ def bad_reading(reading: Reading, name: str) -> Reading:
     ],
 )  # fmt: skip
 def test_wrench_is_zero_for_a_bad_reading_only(name: str, flag: ReadingFlag) -> None:
-    compensator = Compensator(load(), DT, largest=np.full(6, 60.0))
+    compensator = Compensator(load(), DT, sensor_range=np.full(6, 60.0))
     stream = readings(40, touched=5.0)
     for reading in stream[:20]:
         before = compensator.step(reading, reading.t)
@@ -188,7 +188,7 @@ def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
 
 
 def test_no_delayed_wrench_is_older_than_a_silence() -> None:
-    compensator = Compensator(load(), DT, wait=3, cutoff_hz=None)
+    compensator = Compensator(load(), DT, delay_readings=3, cutoff_hz=None)
     for reading in readings(20, touched=5.0):
         compensator.step(reading, reading.t)
     for reading in readings(1005, touched=-4.0)[1000:]:
@@ -236,7 +236,7 @@ def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
     at = round(0.2 / DT) + 1
     assert not any(flags[:at]) and flags[at] == ReadingFlag.STALE
     here = flags.index(ReadingFlag.CLOCK_JUMP)
-    assert here * DT == pytest.approx(0.2 + CLOCK_JUMP_S, abs=delay + 5 * DT)
+    assert here * DT == pytest.approx(0.2 + MIN_CLOCK_JUMP_S, abs=delay + 5 * DT)
     assert not any(flags[here + 1 :])
 
 
@@ -288,14 +288,16 @@ def test_wrong_rate_is_flagged() -> None:
 
 
 def test_wrench_is_limited_to_the_range_of_the_sensor() -> None:
-    compensator = Compensator(load(), DT, gamma=30.0, largest=np.full(6, 60.0))
+    compensator = Compensator(load(), DT, gamma=30.0, sensor_range=np.full(6, 60.0))
     out = [compensator.step(each, each.t) for each in readings(20, touched=5.0)][-1]
     assert out.flags == ReadingFlag.CLIPPED and out.scaled[0] == 60.0
     np.testing.assert_allclose(out.contact[0], 5.0)
 
 
 def test_delayed_wrenches_are_clipped() -> None:
-    compensator = Compensator(load(), DT, wait=2, cutoff_hz=None, largest=np.full(6, 60.0))
+    compensator = Compensator(
+        load(), DT, delay_readings=2, cutoff_hz=None, sensor_range=np.full(6, 60.0)
+    )
     compensator.offsets = OFFSETS - 20.0 * (np.arange(6) == 0)
     out = [compensator.step(each, each.t) for each in readings(3, touched=45.0)]
     assert all(row.flags == ReadingFlag.CLIPPED and row.contact[0] == 60.0 for row in out)

@@ -28,7 +28,7 @@ needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C 
 @pytest.fixture(scope="module")
 def units(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("fmu")
-    export_controller(kernel.LOAD, "fmu", out, rate_hz=1024.0, largest=(170.0, 9.0))
+    export_controller(kernel.LOAD, "fmu", out, rate_hz=1024.0, sensor_range=(170.0, 9.0))
     return out
 
 
@@ -100,7 +100,7 @@ def test_each_function_of_the_standard_is_exported(units, version, tmp_path):
 
 def test_without_a_compiler_the_units_contain_sources(monkeypatch, tmp_path):
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    notes = export_controller(kernel.LOAD, "fmu", tmp_path, rate_hz=500.0, largest=(170.0, 9.0))
+    notes = export_controller(kernel.LOAD, "fmu", tmp_path, rate_hz=500.0, sensor_range=(170, 9.0))
     assert notes == ["the FMUs contain sources only: there is no C compiler for linux64"]
     for version in VERSIONS:
         with zipfile.ZipFile(tmp_path / f"wrench_compensator_{version}.fmu") as archive:
@@ -124,6 +124,6 @@ def test_parameters_start_with_the_identified_load(units):
 
 
 def test_the_same_load_gives_the_same_bytes(units, tmp_path):
-    export_controller(kernel.LOAD, "fmu", tmp_path, rate_hz=1024.0, largest=(170.0, 9.0))
+    export_controller(kernel.LOAD, "fmu", tmp_path, rate_hz=1024.0, sensor_range=(170.0, 9.0))
     for path in units.iterdir():
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()

@@ -272,12 +272,16 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
     file.close()
     live.close()
     with path.open("rb") as back:
-        messages = [message for _, _, message in make_reader(back).iter_messages()]
+        schemas, _, messages = zip(*make_reader(back).iter_messages(), strict=True)
     assert [message.log_time for message in messages] == [0, 500_000_000, 1_000_000_000]
     assert messages[2].data == shown[13:]
     wrench = json.loads(messages[2].data)
     assert wrench["contact"]["tau_z"] == 5.0 and wrench["scaled"]["f_y"] == -1.0
     assert wrench["number"] == 2 and wrench["flags"] == ["stale"]
+    described = json.loads(schemas[0].data)["properties"]
+    assert described.keys() == wrench.keys()
+    for name in ("contact", "scaled"):
+        assert described[name]["properties"].keys() == wrench[name].keys()
 
 
 @pytest.mark.parametrize(("real_hz", "named"), [(500.0, True), (1004.0, False)])

@@ -29,7 +29,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def package(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("ros2")
-    export_controller(kernel.LOAD, "ros2_filter", out, rate_hz=RATE, largest=(170.0, 9.0))
+    export_controller(kernel.LOAD, "ros2_filter", out, rate_hz=RATE, sensor_range=(170.0, 9.0))
     strict = ["-Wall", "-Wextra", "-Werror", "-O1", "-ffp-contract=off"]
     source = out / "src"
     subprocess.run(

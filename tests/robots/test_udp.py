@@ -81,7 +81,7 @@ def test_c_header_has_the_same_layout_and_flags() -> None:
             sum(int((re.findall(r"\d+", x) or [1])[0]) for x in n.split(",")) for _, n in fields
         ]
         lengths.append(sum(sizes[kind] * n for (kind, _), n in zip(fields, counts, strict=True)))
-    assert lengths == [udp.READING_FORMAT.size, udp.POSED_FORMAT.size, udp.WRENCH_FORMAT.size]
+    assert lengths == [udp.READING_FORMAT.size, udp.WRENCH_POSE_FORMAT.size, udp.WRENCH_FORMAT.size]
     bits = {name: int(value) for name, value in re.findall(r"DT_(\w+) = (\d+)", HEADER)}
     assert bits == {str(flag.name): flag.value for flag in ReadingFlag}
 
@@ -157,11 +157,11 @@ def test_udp_round_trip_accepts_only_this_machine() -> None:
 def test_wrench_and_pose_in_a_packet() -> None:
     wrench = Reading(4, 0.5, np.arange(6.0), int(ReadingFlag.SATURATED), stream=WRENCH)
     pose = Reading(4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]), stream=POSE)
-    source = udp.PosedSource("posed://:0", DT)
+    source = udp.UdpWrenchPoseSource("posed://:0", DT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for packet in (
             udp.pack_wrench_and_pose(wrench, pose),
-            b"x" * udp.POSED_FORMAT.size,
+            b"x" * udp.WRENCH_POSE_FORMAT.size,
             b"DTP1",
         ):
             sender.sendto(packet, ("127.0.0.1", source.port))

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
-from drake_teleop.common.parquet_sizes import check_parquet
+from drake_teleop.common.parquet_sizes import check_parquet_sizes
 
 if TYPE_CHECKING:
     import polars as pl
@@ -89,7 +89,7 @@ class Store:
         parts = self.part_files()
         for part in parts:
             with wrap_read_errors(part, remedy):
-                check_parquet(part)
+                check_parquet_sizes(part)
         with wrap_read_errors(self.folder, remedy):
             return pl.read_parquet(parts).sort("run")
 
@@ -104,7 +104,7 @@ def _read_run_numbers_if_undamaged(parts: list[Path]) -> set[int]:
     if parts:
         with suppress(DrakeTeleopError), wrap_read_errors(parts[0], ""):
             for part in parts:
-                check_parquet(part)
+                check_parquet_sizes(part)
             return set(pl.read_parquet(parts, columns=["run"])["run"])
     return set()
 

@@ -12,7 +12,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment import design
 from drake_teleop.live.experiment.procedure import IntervalResult
 from drake_teleop.live.inputs import AS_IN_SCENARIO, INPUT_RANGES, Inputs
-from drake_teleop.live.scenarios import adapt_estimate, chosen_scenario, live_scenario
+from drake_teleop.live.scenarios import adapt_estimate, live_scenario, scenario_of_inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -96,7 +96,7 @@ def make_apparatus(
     mass = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
         inputs = Inputs.from_scenario(setup).with_changes({"object": 1})
-        with_object = chosen_scenario(setup, load, inputs)
+        with_object = scenario_of_inputs(setup, load, inputs)
         estimate = adapt_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])

@@ -51,15 +51,15 @@ class GuidedExperiment:
         self,
         procedure: Procedure,
         stations: dict[tuple[int, int], Apparatus],
-        shows: Sequence[SceneFunction],
+        scene_functions: Sequence[SceneFunction],
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
-        self.refused, self.requested_scene = 0, ""
-        self._procedure, self._stations, self._shows, self._link = procedure, stations, shows, link
+        self.refused, self.requested_scene, self._write_error = 0, "", ""
+        self._procedure, self._scene_functions = procedure, scene_functions
+        self._stations, self._link = stations, link
         self._drives = procedure.store.folder / "drives" / f"{procedure.participant:02}"
         self._driver: int | None = None
-        self._write_error = ""
         self._intervals, self._since, self._frame_due = 0, now, now
         self._prepare_interval(now)
 
@@ -67,7 +67,7 @@ class GuidedExperiment:
         procedure = self._procedure
         trial, self._prepared = procedure.trial, procedure.prepared_intervals
         self._apparatus = self._stations[trial.task, trial.condition]
-        self._show = self._shows[trial.task]
+        self._show = self._scene_functions[trial.task]
         insert = self._apparatus.base.operator.task
         insert = insert if isinstance(insert, Insert) else None
         self._rows = IntervalLog(self._apparatus.scenario, insert)
@@ -266,9 +266,9 @@ class ExperimentDrive(LiveDrive):
         compile_slice_functions(first.scenario, first.load, device)
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
-        shows = [view.frame_part for view in self._views.values()]
-        setup = (self._procedure, self._stations, shows)
-        return GuidedExperiment(*setup, time.perf_counter(), self._link)
+        scenes = [view.scene_values for view in self._views.values()]
+        now = time.perf_counter()
+        return GuidedExperiment(self._procedure, self._stations, scenes, now, self._link)
 
     def _page_html(self) -> str:
         panel = resources.files("drake_teleop.live.experiment") / "page.html"

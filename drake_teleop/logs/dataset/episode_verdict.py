@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, narrowest_half_width_and_centre
+from drake_teleop.common.numeric import Array, width_and_centre_of_narrowest_half
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.logs.pose_motion.splines import MIN_POSES_PER_KNOT, PoseSplines
@@ -82,7 +82,7 @@ def hypothesis_without_fault(lag: float) -> WrenchHypothesis:
 
 def ln_half_width_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
     """Return log half widths (6,), at least log `floor`, and centres of half of the residuals."""
-    widths, centres = narrowest_half_width_and_centre(residual)
+    widths, centres = width_and_centre_of_narrowest_half(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common import errors
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.parquet_sizes import check_parquet
+from drake_teleop.common.parquet_sizes import check_parquet_sizes
 from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
 from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
@@ -193,7 +193,7 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
 
     kind = path.suffix.lower()
     if kind == ".parquet":
-        check_parquet(path)
+        check_parquet_sizes(path)
         frame = pl.scan_parquet(path)
     elif kind == ".xlsx":
         frame = pl.read_excel(path).lazy()

@@ -44,10 +44,10 @@ _PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
 _FILTER_NAME = "wrench_compensator_filter"
 _FILTER_TEMPLATE_FOLDER = "ros2_filter"
 
-Files = Mapping[str, str | bytes]
+ExportedFiles = Mapping[str, str | bytes]
 
 
-class ControllerTarget(NamedTuple):
+class ExportedCompensation(NamedTuple):
     """Load, rate, low-pass and sensor of an export.
 
     Attributes:
@@ -63,19 +63,19 @@ class ControllerTarget(NamedTuple):
     sign: int
     notes: list[str]
 
-    def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
+    def settings_initializer(self, **scales: Any) -> str:
         """Return the C initializer of `wrench_compensator_settings`, in the order of its fields."""
-        others = self.make_compensator(largest, **scales).c_settings
+        others = self.make_compensator(**scales).c_settings
         values = {name: others.pop(name) for name in ("phi", "offsets")}
         values |= {"sigma_weight": 0.0, "sigma_inertia": 0.0, "gamma": 1.0, **scales, **others}
         return "".join(f"    {_c_literal(each)}, /* {name} */\n" for name, each in values.items())
 
-    def make_compensator(self, largest: Array | None = None, **scales: Any) -> Compensator:
-        largest = self.sensor_range if largest is None else largest
-        return Compensator(self.load, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
+    def make_compensator(self, **scales: Any) -> Compensator:
+        load, dt, cutoff_hz, sensor_range, *_ = self
+        return Compensator(load, dt, cutoff_hz=cutoff_hz, sensor_range=sensor_range, **scales)
 
 
-def c99_files(target: ControllerTarget) -> Files:
+def c99_files(target: ExportedCompensation) -> ExportedFiles:
     return {
         **kernel_files(target),
         "test_vector.h": _test_vector_header(target),
@@ -91,7 +91,7 @@ def c99_files(target: ControllerTarget) -> Files:
     }
 
 
-def kernel_files(target: ControllerTarget) -> Files:
+def kernel_files(target: ExportedCompensation) -> ExportedFiles:
     settings, dt = target.settings_initializer(), repr(target.dt)
     return {
         "wrench_compensator.h": read_template("wrench_compensator.h"),
@@ -117,23 +117,24 @@ def render_template(name: str, **values: Any) -> str:
     return render_page(TEMPLATE_PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
-def _test_vector_header(target: ControllerTarget) -> str:
-    inputs, largest = _simulated_readings_and_sensor_range(target)
-    python = target.make_compensator(largest, **_TEST_SCALES)
+def _test_vector_header(target: ExportedCompensation) -> str:
+    inputs, sensor_range = _simulated_readings_and_sensor_range(target)
+    target = target._replace(sensor_range=sensor_range)
+    python = target.make_compensator(**_TEST_SCALES)
     outputs = [
         python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
         "test_vector.h",
-        settings=target.settings_initializer(largest, **_TEST_SCALES),
+        settings=target.settings_initializer(**_TEST_SCALES),
         inputs=[_c_literal(row) for row in inputs],
         outputs=[_c_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
         flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
     )
 
 
-def _simulated_readings_and_sensor_range(target: ControllerTarget) -> tuple[Array, Array]:
+def _simulated_readings_and_sensor_range(target: ExportedCompensation) -> tuple[Array, Array]:
     phase = 2.0 * np.pi * np.arange(_NUM_TEST_READINGS)[:, None] / _NUM_TEST_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
@@ -142,11 +143,11 @@ def _simulated_readings_and_sensor_range(target: ControllerTarget) -> tuple[Arra
     contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TEST_WRENCH_AMPLITUDES
     wrench = non_contact_wrench(*motion, target.load.phi) + target.load.offsets + contact
     readings = np.round(np.hstack([wrench, *motion, down]), 6)
-    largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)
+    sensor_range = 0.95 * np.abs(readings[:, :6]).max(axis=0)
     readings[100:103, 7], readings[200, 0], readings[201, 12] = np.nan, np.inf, 1e7
     first = _NUM_TEST_READINGS // 2
     readings[first : first + round(2.0 * STALE_AGE_S / target.dt) + 2, 5] = np.nan
-    return readings, largest
+    return readings, sensor_range
 
 
 def _c_literal(value: Any) -> str:
@@ -156,7 +157,7 @@ def _c_literal(value: Any) -> str:
     return repr(value)
 
 
-def fmu_files(target: ControllerTarget) -> Files:
+def fmu_files(target: ExportedCompensation) -> ExportedFiles:
     """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
     is_linux64 = platform.system() == "Linux" and platform.machine() == "x86_64"
     compiler = shutil.which("cc") if is_linux64 else None
@@ -173,7 +174,7 @@ def fmu_files(target: ControllerTarget) -> Files:
 
 
 def _fmu_archive(
-    target: ControllerTarget, kernel: Files, version: str, token: str, cc: str | None
+    target: ExportedCompensation, kernel: ExportedFiles, version: str, token: str, cc: str | None
 ) -> bytes:
     sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
@@ -191,7 +192,7 @@ def _fmu_archive(
     return content.getvalue()
 
 
-def _compile_library(compiler: str, sources: Files, c_files: list[str]) -> bytes:
+def _compile_library(compiler: str, sources: ExportedFiles, c_files: list[str]) -> bytes:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in sources.items():
@@ -201,7 +202,7 @@ def _compile_library(compiler: str, sources: Files, c_files: list[str]) -> bytes
         return (folder / "library.so").read_bytes()
 
 
-def _model_description(target: ControllerTarget, version: str, token: str) -> str:
+def _model_description(target: ExportedCompensation, version: str, token: str) -> str:
     number, integer = ("Float64", "Int32") if version == "3.0" else ("Real", "Integer")
     variables = []
     for name, causality, unit, start in _model_variables(target):
@@ -215,7 +216,7 @@ def _model_description(target: ControllerTarget, version: str, token: str) -> st
     return render_template(f"modelDescription{version[0]}.xml", **names)
 
 
-def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, float | None]]:
+def _model_variables(target: ExportedCompensation) -> list[tuple[str, str, str, float | None]]:
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_COMPONENT_NAMES]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
@@ -237,7 +238,7 @@ def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, floa
     ]
 
 
-def ros2_filter_files(target: ControllerTarget) -> Files:
+def ros2_filter_files(target: ExportedCompensation) -> ExportedFiles:
     """Return the files of a ROS 2 package with a filter of wrenches."""
     shipped = {
         f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
@@ -257,7 +258,7 @@ def ros2_filter_files(target: ControllerTarget) -> Files:
     }
 
 
-CONTROLLER_FORMATS: dict[str, Callable[[ControllerTarget], Files]] = {
+CONTROLLER_FORMATS: dict[str, Callable[[ExportedCompensation], ExportedFiles]] = {
     "c99": c99_files,
     "fmu": fmu_files,
     "ros2_filter": ros2_filter_files,
@@ -272,7 +273,7 @@ def export_controller(
     *,
     rate_hz: float | None,
     cutoff_hz: float | None = 30.0,
-    largest: tuple[float, float] | None = None,
+    sensor_range: tuple[float, float] | None = None,
     sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> list[str]:
@@ -287,10 +288,10 @@ def export_controller(
         raise unused_sensor_pose_error(to)
     refuse_removed_weight(found, to)
     notes = list(notes_on_undetermined_load(found))
-    if largest is None:
+    if sensor_range is None:
         notes.append("no range of the sensor was given: saturation is not detected; give --range")
-    whole = None if largest is None else np.repeat(np.array(largest, float), 3)
-    target = ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
+    whole = None if sensor_range is None else np.repeat(np.array(sensor_range, float), 3)
+    target = ExportedCompensation(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
     for name, content in CONTROLLER_FORMATS[to](target).items():
         path = out / name
         make_folder(path.parent)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, LeafSystem
 
-from drake_teleop.common.blocks import DoubleOnly
+from drake_teleop.common.blocks import DoubleOnlySystem
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.load import regressor
 from drake_teleop.load.contact.noise_floor import NoiseFloor
@@ -30,7 +30,7 @@ class _SamplePorts:
         return sample
 
 
-class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
+class LoadEstimator(DoubleOnlySystem, load_estimator.LoadEstimator):
     """Block that estimates load and sensor offsets from every sample of the wrist sensor.
 
     .. pydrake_system::
@@ -76,7 +76,7 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
         return _SamplePorts(self)
 
 
-class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
+class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
     """Block that detects contact in the measured wrench without the load's part.
 
     .. pydrake_system::

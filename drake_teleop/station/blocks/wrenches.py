@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import finite_array
 from drake_teleop.load import compensation
@@ -51,7 +51,7 @@ def NonContactWrench_(T: Any) -> Any:
             phi: (10,) inertial parameters of the load about So, in S; a parameter of the context.
         """
 
-        __slots__ = ONE_DICT
+        __slots__ = NO_EXTRA_SLOTS
 
         def _construct(self, phi: ArrayLike | None = None, converter: Any = None) -> None:
             LeafSystem_[T].__init__(self, converter)
@@ -108,7 +108,7 @@ def WrenchScaling_(T: Any) -> Any:
             gravity_W: (3,) [m/s^2].
         """
 
-        __slots__ = ONE_DICT
+        __slots__ = NO_EXTRA_SLOTS
 
         def _construct(
             self,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
@@ -65,7 +65,7 @@ class ContactDetection(LeafSystem):
     `drake_teleop.load.regressor`, in the place of its parts.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel | None, period: float

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -73,7 +73,7 @@ class MasterDevice(LeafSystem):
           unused zeros), the display's memory
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self, period: float, device: HapticDevice | LeaderDevice, q_initial: Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into
@@ -38,7 +38,7 @@ class Encoders(LeafSystem):
         - pose_read: (7,) X_BE of the rounded positions
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, device: HapticDevice, q_start: Array, steps: Array) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class SampleHold(LeafSystem):
         - held: (n,) value at the last sample
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, period: float, start: Array) -> None:
         super().__init__()

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
@@ -144,7 +144,7 @@ class ForceDisplay(LeafSystem):
         - displayed_and_fault: (7,) the last two ports in one vector
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, period: float, device: dynamics.HapticDevice | LeaderDevice) -> None:
         super().__init__()

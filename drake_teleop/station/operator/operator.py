@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -277,7 +277,7 @@ class Operator(LeafSystem):
     slave's arm, and `tip` (6,), the position of the tool's tip in S and at the start in W [m].
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self,

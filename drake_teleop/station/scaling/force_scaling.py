@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -232,7 +232,7 @@ class ForceScaling(LeafSystem):
         oldest: largest valid age of a sample [s].
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self,

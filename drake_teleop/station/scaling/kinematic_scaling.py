@@ -8,7 +8,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, DoubleOnlySystem, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -77,7 +77,7 @@ def _pose_command_into(pose, references, alignment, translation_scale, rotation_
         vectors.copy_into(out, 0, references, 0, 7)
 
 
-class KinematicScaling(DoubleOnly, LeafSystem):
+class KinematicScaling(DoubleOnlySystem, LeafSystem):
     """Block that scales the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
@@ -98,7 +98,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         start: (7,) commanded pose X_WS at the start.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, config: KinematicScalingConfig, period: float, start: Array) -> None:
         super().__init__()
@@ -157,7 +157,7 @@ class JointCoupling(LeafSystem):
     The command is `start` (n,) [rad] when the leader is at `home` (n,) [rad].
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
         super().__init__()

@@ -24,7 +24,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import RandomSource
 from scipy.sparse.csgraph import connected_components
 
-from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, DoubleOnlySystem
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array
@@ -106,7 +106,7 @@ def AddWristSensor(
     return sensor
 
 
-class PlantWristSensor(DoubleOnly, LeafSystem):
+class PlantWristSensor(DoubleOnlySystem, LeafSystem):
     """Sensor of force, torque and motion of S at a weld of a plant, see `AddWristSensor`.
 
     The outputs hold the last sample, which belongs to the instant `sample_time`.
@@ -132,7 +132,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         - sample: the outputs above in one vector, for `ForceScaling`
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -252,7 +252,7 @@ class WristSensor(LeafSystem):
         hold_time: time for which the motors hold a torque, or with `ramps` its rate [s].
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self,

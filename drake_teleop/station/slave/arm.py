@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
@@ -396,7 +396,7 @@ def pose_into(table, q, pose):
 class ForwardKinematics(LeafSystem):
     """Block that outputs the pose X_WS (7,) of the sensor frame from the arm's state [q; v]."""
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, arm: ArmModel) -> None:
         super().__init__()
@@ -423,7 +423,7 @@ class JointFriction(LeafSystem):
     `index` contains the joints' indices in the plant's `num_velocities` velocities.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, coulomb: Array, index: NDArray[np.intp], num_velocities: int) -> None:
         super().__init__()

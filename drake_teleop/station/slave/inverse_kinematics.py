@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
@@ -235,7 +235,7 @@ class InverseKinematics(LeafSystem):
         - ik_status: an `IkStatus`
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     MAX_JOINT_JUMP_RAD = 2.0
     """Largest joint displacement [rad]; joints 4 and 6 may need 90 degrees past q5 = 0."""

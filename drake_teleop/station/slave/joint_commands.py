@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
@@ -57,7 +57,7 @@ class LeaderJointFollower(LeafSystem):
     Invalid input keeps the last command.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, arm: ArmModel, q_start: Array, period: float) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class LeaderJointFollower(LeafSystem):
 class ExcitationCommand(LeafSystem):
     """Block that commands one period of an excitation trajectory from `start` [s], else rest."""
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, trajectory: FourierTrajectory, start: float) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class JointRangeMonitor(LeafSystem):
     Its output `ik_status` is the input at the last sample.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -278,7 +278,7 @@ class JointControl(LeafSystem):
         - joint_torque: (n,) [N m], held between samples
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self, arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
@@ -312,7 +312,7 @@ class HeldTorque(LeafSystem):
     An invalid request keeps the last torque; the first torque holds the posture `q_start`.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, arm: ArmModel, period: float, q_start: Array) -> None:
         super().__init__()

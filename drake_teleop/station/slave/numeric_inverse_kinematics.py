@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import (
@@ -356,7 +356,7 @@ class NumericInverseKinematics(LeafSystem):
     measured position, so that a redundant arm does not drift towards another posture.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     POSTURE_RATE_PER_S = 1.0
     """Rate at which a redundant arm approaches its posture [1/s]."""

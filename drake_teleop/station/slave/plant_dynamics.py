@@ -12,7 +12,7 @@ from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
@@ -141,7 +141,7 @@ class ToolContact(LeafSystem):
     bodies.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, arm: ArmModel, contact: ToolContactModel) -> None:
         super().__init__()
@@ -255,7 +255,7 @@ def contact_wrench_W(
 class DrakeContact(LeafSystem):
     """Block that outputs the contact wrench on the tool from the plant's contact results."""
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, bodies: Container[int], shapes: Container[int]) -> None:
         super().__init__()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import holding_torque
@@ -97,7 +97,7 @@ class SampledServo(LeafSystem):
     [s], `samples` their number per event.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(
         self, slave: SlavePlant, config: JointControlConfig, period: float, samples: int

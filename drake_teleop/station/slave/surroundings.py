@@ -14,7 +14,7 @@ from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, ToolShapes
@@ -175,7 +175,7 @@ def joint_positions_of_pose(joint: tree.Joint, X_FM: RigidTransform) -> Array:
 class MovingBodyPose(LeafSystem):
     """Block that outputs the pose X_WB (7,) of a moving body from the whole plant's [q; v]."""
 
-    __slots__ = ONE_DICT
+    __slots__ = NO_EXTRA_SLOTS
 
     def __init__(self, plant: MultibodyPlant, body: tree.BodyIndex) -> None:
         super().__init__()
