@@ -240,7 +240,7 @@ class Spectra:
         return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
 
     def second_moments_at_delays(self, delays: Array) -> Array:
-        """Return second moments (D, bands, 22, 22) at delays (D,) [s]."""
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows of signals."""
         bands, wrench = self.window.bands, self.window.wrench_spectrum
         if self.window.is_taper_fixed:
             return np.array([self.with_delay(delay).second_moments() for delay in delays])
@@ -328,7 +328,7 @@ _ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 
 
 
 def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
-    """Return what noise of the poses adds to `Spectra.second_moments_with_rates`.
+    """Return the part (bands, 38, 38) of `Spectra.second_moments_with_rates` by noise of the poses.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """

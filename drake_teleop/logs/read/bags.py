@@ -37,8 +37,8 @@ _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
 _CUT_REMEDY = "cut it, or write the topics one by one"
 _VECTOR_OF_MESSAGE_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
 _VECTOR_OF_MESSAGE_FIELD |= dict.fromkeys(("position", "translation"), "position")
-for _name in ("force", "torque", "linear_acceleration", "angular_velocity"):
-    _VECTOR_OF_MESSAGE_FIELD[_name] = _name
+_UNRENAMED_FIELDS = ("force", "torque", "linear_acceleration", "angular_velocity")
+_VECTOR_OF_MESSAGE_FIELD |= {x: x for x in _UNRENAMED_FIELDS}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
