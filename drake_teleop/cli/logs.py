@@ -15,7 +15,7 @@ from drake_teleop.common import files
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
-from drake_teleop.logs import figures, processing
+from drake_teleop.logs import processing, summaries
 from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 
@@ -38,9 +38,9 @@ def identify_command(
     found = processing.identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else load_of_object(result, gripper_load)
-    summary = figures.summarize_log(log, found, cutoff_hz, result.delay_s) | {
+    summary = summaries.summarize_log(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
-        **figures.summarize_load(result),
+        **summaries.summarize_load(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
         "determined": found.base_parameters.text_lines(),
@@ -51,11 +51,11 @@ def identify_command(
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
         "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
         "causes": [asdict(cause) for cause in found.causes],
-        "loads": [figures.summarize_record_part(stretch) for stretch in found.loads],
+        "loads": [summaries.summarize_record_part(part) for part in found.loads],
     }
     if alone is not None:
-        summary |= {"gripper": str(gripper), "object": figures.summarize_object_alone(alone)}
-        summary["notes"] += figures.notes_on_object_alone(alone)
+        summary |= {"gripper": str(gripper), "object": summaries.summarize_grasped_object(alone)}
+        summary["notes"] += summaries.notes_on_grasped_object(alone)
     summary = files.to_json_data(summary)
     from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, stack_pictures
     from drake_teleop.logs.report import write_report
@@ -93,7 +93,7 @@ def eliminate_command(
     found = processing.eliminate_log(log, load_file, tare=tare, cutoff_hz=cutoff_hz, **options)
     scales: dict[str, Any] = {"sigma": 0.0, "sigma_object": None, "gamma": 1.0, "eta": None}
     scales |= {"sigma_weight": None, "sigma_inertia": None}
-    summary = figures.summarize_log(log, found, cutoff_hz, found.delay_s) | {
+    summary = summaries.summarize_log(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": _text_or_none(options.get("gripper")),
         **{name: options.get(name, default) for name, default in scales.items()},
@@ -114,8 +114,8 @@ def eliminate_command(
         summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
     summary = files.to_json_data(
         summary
-        | figures.summarize_wrenches(found)
-        | figures.summarize_detected_contact(found, options.get("causal_tare_s"))
+        | summaries.summarize_wrenches(found)
+        | summaries.summarize_detected_contact(found, options.get("causal_tare_s"))
     )
     from drake_teleop.logs.pictures import draw_elimination
 
@@ -162,7 +162,7 @@ def detect_command(
         log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay
     )
     eliminated = found.eliminated
-    summary = figures.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
+    summary = summaries.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
         "load": _text_or_none(load),
         "free": _text_or_none(free),
         "free_s": found.free_duration_s,
@@ -173,7 +173,7 @@ def detect_command(
         "above_threshold": found.is_above_threshold.mean(),
         "in_contact": found.touched.mean(),
         "force_threshold": found.force_threshold,
-        "above_force_threshold": figures.shares_of_samples_above_force(
+        "above_force_threshold": summaries.shares_of_samples_above_force(
             eliminated, found.force_threshold
         ),
         "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),

@@ -48,7 +48,7 @@ _MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies for spli
 # Fewest kept samples, and largest cut-off of the low-pass over their rate; kept samples per chunk,
 # and neighbours for smoothing.
 _MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
-_CHUNK_SAMPLES, _FILTER_NEIGHBOURS = 2**14, 2**8
+_CHUNK_SAMPLES, _FILTER_MARGIN_SAMPLES = 2**14, 2**8
 _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 
@@ -245,8 +245,8 @@ def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
     few = log.select_rows(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
     for start in range(0, len(few), _CHUNK_SAMPLES):  # in chunks, to save memory
-        before = max(0, start - _FILTER_NEIGHBOURS)
-        stop = start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS
+        before = max(0, start - _FILTER_MARGIN_SAMPLES)
+        stop = start + _CHUNK_SAMPLES + _FILTER_MARGIN_SAMPLES
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
     bridged = None

@@ -246,31 +246,31 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
     return float(np.sqrt(np.trapezoid(density * share * (2.0 * np.pi * f) ** 4, f)))
 
 
-def explained_load(load: Identification, why: MisfitExplanation) -> Identification:
+def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> Identification:
     """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
     if why.causes or why.always_fitted:
-        load = _load_with_causes(load, why)
+        load = _load_fitted_with_causes(load, why)
     elif not why.explained and load.identifiable.any():
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_WIDENING_STD_RATIO:
             factors = np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
-            load = _less_certain_load(load, load.covariance * factors)
+            load = _load_with_covariance(load, load.covariance * factors)
     if why.state.data.gravity_W is not None:
         return load
     extra = load_bias_by_alpha_noise(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
-    return _less_certain_load(load, load.covariance + np.diag(extra**2))
+    return _load_with_covariance(load, load.covariance + np.diag(extra**2))
 
 
-def _less_certain_load(load: Identification, covariance: Array) -> Identification:
+def _load_with_covariance(load: Identification, covariance: Array) -> Identification:
     known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _load_with_causes(load: Identification, why: MisfitExplanation) -> Identification:
+def _load_fitted_with_causes(load: Identification, why: MisfitExplanation) -> Identification:
     identifiable = is_precise_enough(np.sqrt(np.diag(why.covariance)), why.theta[6:])
     no_load = bool(why.causes) and why.causes[0].name == "no load"
     if no_load or has_negative_mass(why.state):
@@ -300,7 +300,7 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Find
     return why.causes
 
 
-def unexplained_finding(why: MisfitExplanation) -> Finding:
+def unexplained_misfit_finding(why: MisfitExplanation) -> Finding:
     ratio = why.state.residual_ratio
     text = (
         f"the residual is up to {ratio:.0f} times the sensor's noise, and no known cause explains"

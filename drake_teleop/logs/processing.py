@@ -194,7 +194,7 @@ def identify_log(
         why, result = None, result.with_unidentified_load()
     note = fitted.fit.note
     if why is not None:
-        result = explained_log.explained_load(result, why)
+        result = explained_log.apply_explanation_to_load(result, why)
         causes = explained_log.replace_frame_causes(why, other[0]) if other else why.causes
         note = "" if causes and not why.has_several_gains else note
         note = explained_log.removed_weight_note(why) if raw.estimated else note
@@ -206,7 +206,7 @@ def identify_log(
         findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
         findings = findings or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
-            findings = (explained_log.unexplained_finding(why),)
+            findings = (explained_log.unexplained_misfit_finding(why),)
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))

@@ -77,7 +77,7 @@ FINGERTIP_PUSHES = (
 )
 """A tap, a push and a light tap, smaller than the wrench of weight and inertia."""
 
-_DESCRIPTION = """\
+_DESCRIPTION_TEMPLATE = """\
 # A gripper on a lab arm, {what}: made by drake-teleop sample-log.
 wrench:
   file: {name}_wrench.csv  # 500 Hz
@@ -109,13 +109,13 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     files = []
     with output_folder(out):
         for row, (name, (touches, what)) in enumerate(records.items()):
-            text = _DESCRIPTION.format(name=name, what=what, offset=-CLOCK_START_S)
+            text = _DESCRIPTION_TEMPLATE.format(name=name, what=what, offset=-CLOCK_START_S)
             write_text(out / f"{name}.yaml", text)
             _write_record(out, name, row, touches, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
         offsets = {"offsets": TRUE_OFFSETS[0], "offsets_touched": TRUE_OFFSETS[1]}
-        contacts = [_true_contact(touch) for touch in FINGERTIP_PUSHES]
+        contacts = [_summarize_true_contact(touch) for touch in FINGERTIP_PUSHES]
         truth = {**load, "phi": TRUE_PHI, **offsets, "delay_s": POSE_DELAY_S, "contacts": contacts}
         write_json(out / "truth.json", truth)
         duration_s = MOTION_PERIOD_S + 2 * REST_AT_ENDS_S
@@ -127,7 +127,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     return summary
 
 
-def _true_contact(touch: FingertipPush) -> dict[str, Any]:
+def _summarize_true_contact(touch: FingertipPush) -> dict[str, Any]:
     R_WS = _motion_of_record(1)(np.array([(touch.start_s + touch.stop_s) / 2]))[3][0]
     peak = np.linalg.norm(touch.push_W)
     push = R_WS.T @ touch.push_W / peak

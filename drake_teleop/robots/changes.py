@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Finding, causes_of_fit
+from drake_teleop.logs.causes.cause import SUDDEN_CHANGES, Finding, name_misfit_causes
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
@@ -121,8 +121,8 @@ def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     state = explain_misfit(block_means_of_record(t, wrench, tuple(motion), None, lost)).state
     return [
         (cause.start_s, _text_of_zero_or_load_change(cause))
-        for cause in causes_of_fit(state)
-        if cause.name in CHANGE_CAUSES
+        for cause in name_misfit_causes(state)
+        if cause.name in SUDDEN_CHANGES
         and cause.start_s is not None
         and _is_change_kind_certain(state, cause.start_s)
     ]

@@ -12,17 +12,17 @@ from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import fit_candidates
-from drake_teleop.logs.causes.cause import causes_of_fit, loads_between_changes
+from drake_teleop.logs.causes.cause import loads_between_changes, name_misfit_causes
 from drake_teleop.logs.causes.changes import find_contact_spans, fit_steps_at_middle_of_ramps
 from drake_teleop.logs.causes.explain import _apply_fitted_delay
 from drake_teleop.logs.causes.instants import block_means_of_record
-from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
+from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
 from drake_teleop.logs.causes.state import FittedModel, score_statistic
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
 
-def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleNamespace:
+def state_of(model: LoadModel, values: list[float], spans: tuple = ()) -> SimpleNamespace:
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
     data = record(np.zeros((len(T), 6)))
@@ -34,40 +34,41 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
 @pytest.mark.parametrize(
     ("model", "values", "name", "figures", "words"),
     [
-        (Model(axes=SWAPPED), [], "axes", {"axes": ["-y", "z", "x"]}, "are -y, z, x of the motion"),
-        (Model(("gravity",)), [0.4, -0.3, 0.21], "gravity direction",
+        (LoadModel(axes=SWAPPED), [], "axes", {"axes": ["-y", "z", "x"]},
+         "are -y, z, x of the motion"),
+        (LoadModel(("gravity",)), [0.4, -0.3, 0.21], "gravity direction",
          {"gravity": [0.0, 0.0, -10.0], "angle_deg": 2.924}, "gravity is 2.92 deg (+- 0.049)"),
-        (Model(("weight",)), [1.72, 0.01, 0.02, 0.03], "weight removed",
+        (LoadModel(("weight",)), [1.72, 0.01, 0.02, 0.03], "weight removed",
          {"removed_mass": 1.72, "removed_moment": [0.01, 0.02, 0.03]}, "1.7 kg (+- 0.0052)"),
-        (Model(("weight",)), [1.6, 0.016, 0.032, -0.048], "payload configured",
+        (LoadModel(("weight",)), [1.6, 0.016, 0.032, -0.048], "payload configured",
          {"removed_mass": 1.6}, "1.6 kg (+- 0.0083) at [10, 20, -30] mm in S"),
-        (Model(("frame",)), [0.01, -0.02, 0.03], "pose frame",
+        (LoadModel(("frame",)), [0.01, -0.02, 0.03], "pose frame",
          {"position_in_sensor": [-0.01, 0.02, -0.03]}, "[-10, 20, -30] mm in S (+- 8.8 mm)"),
-        (Model(("rotation",)), [0.0, 0.3, -0.4], "sensor rotation",
+        (LoadModel(("rotation",)), [0.0, 0.3, -0.4], "sensor rotation",
          {"rotation_vector": [0.0, 0.3, -0.4]}, "rotated by 28.65 deg (+- 0.5) against"),
-        (Model(gain_channels=(4,)), [0.2], "gain",
+        (LoadModel(gain_channels=(4,)), [0.2], "gain",
          {"gain": 1.2}, "tau_y reads 20.00 % (+- 0.83) more"),
-        (Model(("linear drift",)), [1.0, -2.0, 0.5, 0.1, 0.3, -0.2], "drift",
+        (LoadModel(("linear drift",)), [1.0, -2.0, 0.5, 0.1, 0.3, -0.2], "drift",
          {"range": [2.0, 4.0, 1.0, 0.2, 0.6, 0.4]}, "4 N and 0.6 N m"),
-        (Model(("drift",)), [*np.zeros(15), 0.1, -0.2, 0.3], "drift",
+        (LoadModel(("drift",)), [*np.zeros(15), 0.1, -0.2, 0.3], "drift",
          {"range": [0, 0, 0, 0, 0, 1.2]}, "0 N and 1.2 N m"),
-        (Model(("cable",)), [*np.zeros(3), 3.0, 0.0, 0.0, -7.0, 0.0, 5.0, *np.zeros(3)], "cable",
-         {"stiffness": 7.0}, "about 7 N/m"),
-        (Model(steps=(StepChange("offsets", 102.5),)), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3],
+        (LoadModel(("cable",)), [*np.zeros(3), 3.0, 0.0, 0.0, -7.0, 0.0, 5.0, *np.zeros(3)],
+         "cable", {"stiffness": 7.0}, "about 7 N/m"),
+        (LoadModel(steps=(StepChange("offsets", 102.5),)), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3],
          "zero change", {"change": [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]}, "from t = 102.50 s on"),
-        (Model(steps=(StepChange("load", 103.0),)), LOAD.tolist(), "load change",
+        (LoadModel(steps=(StepChange("load", 103.0),)), LOAD.tolist(), "load change",
          {"mass_change": 0.5, "com_of_change": [0.02, -0.04, 0.06]}, "[20, -40, 60] mm in S"),
-        (Model(steps=(StepChange("load", 103.0),)), (-LOAD).tolist(), "load change",
+        (LoadModel(steps=(StepChange("load", 103.0),)), (-LOAD).tolist(), "load change",
          {"mass_change": -0.5}, "0.5 kg (+- 0.0083) at [20, -40, 60] mm in S are removed"),
     ],
 )  # fmt: skip
 def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, name, figures, words):
-    (cause,) = causes_of_fit(state_of(model, values))
+    (cause,) = name_misfit_causes(state_of(model, values))
     assert cause.name == name and words in cause.message
     for key, value in figures.items():
         found = cause.values[key]
         assert found == (value if key == "axes" else pytest.approx(value, abs=1e-3))
-    given = causes_of_fit(state_of(model, values), always_fitted=model.extensions)
+    given = name_misfit_causes(state_of(model, values), always_fitted=model.extensions)
     assert bool(given) != bool(model.extensions)
 
 
@@ -78,8 +79,8 @@ def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, nam
 def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
     steps = (StepChange("load", 103.0), StepChange("offsets", 105.0))
     values = [*LOAD, 1.0, *np.zeros(5)]
-    state = state_of(Model(steps=steps), values, (span,))
-    found = causes_of_fit(state)
+    state = state_of(LoadModel(steps=steps), values, (span,))
+    found = name_misfit_causes(state)
     contacts = [(x.start_s, x.stop_s) for x in found if x.name == "contact"]
     margin = state.data.dt
     assert contacts == ([(span[0] + margin, span[1] - margin)] if shown else [])
@@ -90,7 +91,7 @@ def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
 def test_load_of_each_part_includes_the_uncertainty_of_earlier_changes():
     steps = (StepChange("load", 104.0), StepChange("offsets", 101.0), StepChange("load", 102.0))
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
-    state = state_of(Model(steps=steps), values)
+    state = state_of(LoadModel(steps=steps), values)
     covariance = 4.0 * state.covariance[:16, :16]
     parts = loads_between_changes(state, covariance)
     assert [(x.start_s, x.stop_s) for x in parts] == [
@@ -105,7 +106,7 @@ def test_load_of_each_part_includes_the_uncertainty_of_earlier_changes():
         np.diag(parts[2].covariance)[6:],
         variance + 4e-6 * (np.arange(18.0, 28) + np.arange(34.0, 44)),
     )
-    assert loads_between_changes(state_of(Model(steps=steps[1:2]), [1.0] * 6), covariance) == []
+    assert loads_between_changes(state_of(LoadModel(steps=steps[1:2]), [1.0] * 6), covariance) == []
 
 
 @pytest.mark.parametrize(
@@ -120,7 +121,7 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
     def with_delay(delay: float):
         return block_means_of_record(T, wrench, moving(T + delay - before - late), GRAVITY_W)
 
-    state = FittedModel.fit_record(with_delay(before), Model())
+    state = FittedModel.fit_record(with_delay(before), LoadModel())
     assert state.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
     after, delay = _apply_fitted_delay(state, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
@@ -153,7 +154,9 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += share * ("load" in kinds) * non_contact_wrench(s, omega, alpha, load)
     wrench += share * ("offsets" in kinds) * step
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
-    state = FittedModel.fit_record(record(wrench), Model(steps=(StepChange("offsets", 100.99),)))
+    state = FittedModel.fit_record(
+        record(wrench), LoadModel(steps=(StepChange("offsets", 100.99),))
+    )
     found = fit_steps_at_middle_of_ramps(state, [kinds], [guess], ((100.5, 100.6),))
     assert found.contact_spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
@@ -176,13 +179,13 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
     touched = ((start < T) & (stop > T))[:, None]
     wrench += touched * [8.0, 0.0, 5.0, 0.3, 0.0, 0.0] * (1.0 + np.sin(3.0 * T[:, None]))
-    state = FittedModel.fit_record(record(wrench), Model())
+    state = FittedModel.fit_record(record(wrench), LoadModel())
     ((found_start, found_stop),) = find_contact_spans(state)
     assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
     assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
     for name in ("_fit_extension", "_torque_factor_candidates", "_axis_permutation_candidates"):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
-    monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step_change", lambda *_: None)
     monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_CHANNEL_GAIN_ERROR", 1.0)
     (contact,) = fit_candidates(state, True)
     price = (6 + 2 * ends) * np.log(state.data.used.sum())
@@ -204,7 +207,7 @@ def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) ->
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
     assert (
         find_contact_spans(
-            FittedModel.fit_record(block_means_of_record(t, wrench, motion, GRAVITY_W), Model())
+            FittedModel.fit_record(block_means_of_record(t, wrench, motion, GRAVITY_W), LoadModel())
         )
         == ()
     )

@@ -16,13 +16,13 @@ from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
     BlockMeans,
     block_means_of_record,
-    delay_of_free_fit,
+    delay_of_linear_fit,
 )
 from drake_teleop.logs.causes.intervals import (
     _load_variances_by_rejected_causes,
     widening_factor_by_misfit,
 )
-from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
+from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
 from drake_teleop.logs.causes.state import (
     UsedRows,
     fit_model,
@@ -90,7 +90,7 @@ def read(name: str, values: np.ndarray) -> np.ndarray:
 def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, size):
     values = np.random.default_rng(size).uniform(0.1, 0.5, size)
     gains = (int(name[-1]),) if "gain" in name else ()
-    model = Model(() if gains else (name,), gains)
+    model = LoadModel(() if gains else (name,), gains)
     data = record(read(name, values) + OFFSETS)
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     y = data.append_step_signals(())
@@ -103,10 +103,10 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     change = model.residual_coefficients(x + move) - model.residual_coefficients(x - move)
     expected = -2.0 * np.tensordot(move, model.wrench_derivative(x), 1)
     np.testing.assert_allclose(change, expected, atol=1e-9)
-    assert model.start_parameters(x, Model())[: DELAY_INDEX + 1] == pytest.approx(
+    assert model.start_parameters(x, LoadModel())[: DELAY_INDEX + 1] == pytest.approx(
         x[: DELAY_INDEX + 1]
     )
-    assert not model.start_parameters(x, Model())[DELAY_INDEX + 1 :].any()
+    assert not model.start_parameters(x, LoadModel())[DELAY_INDEX + 1 :].any()
     other = model.with_extension("torque factor")
     np.testing.assert_array_equal(
         other.start_parameters(x, model)[other.parameter_slices[name]], values
@@ -117,7 +117,7 @@ def test_axes_factor_and_steps_change_the_wrench_as_stated():
     """A step in the middle of a block has half its effect there."""
     load, offsets = np.arange(10.0) * 0.1, np.arange(1.0, 7.0)
     steps = StepChange("load", 102.0), StepChange("offsets", 103.01)
-    model = Model(steps=steps, axes=SWAPPED, torque_factor=10.0)
+    model = LoadModel(steps=steps, axes=SWAPPED, torque_factor=10.0)
     x = np.concatenate([OFFSETS, PHI, [0.02], load, offsets])
     s, omega, alpha, *_ = moving(T)
     before, more = (non_contact_wrench(s, omega, alpha, phi) for phi in (PHI, load))
@@ -138,7 +138,7 @@ def test_whitened_sums_are_those_of_rows_with_four_predecessors(gaps):
     data = record(rng.normal(size=(len(T), 6)))
     used = data.used.copy()
     used[list(gaps)] = False
-    model = Model()
+    model = LoadModel()
     rows = UsedRows(data, used, (), model.columns)
     whole = [n for n in range(4, len(T)) if used[n - 4 : n + 1].all()]
     np.testing.assert_array_equal(rows.rows_with_predecessors, whole)
@@ -175,7 +175,7 @@ def test_fit_gives_the_cause_within_its_deviations(name, values):
         noise[n] += 0.7 * noise[n - 1]
     data = record(read(name, np.array(values)) + OFFSETS + noise)
     gains = (int(name[-1]),) if "gain" in name else ()
-    model = Model(() if gains else (name,), gains)
+    model = LoadModel(() if gains else (name,), gains)
     found = fit_model(model, UsedRows(data, data.used, (), model.columns))
     error = found.x - np.concatenate([OFFSETS, PHI, [0.0], values])
     deviations = np.sqrt(np.diag(found.covariance))
@@ -199,7 +199,7 @@ def test_inverse_has_large_values_only_for_undetermined_parameters():
 def test_free_delay_is_that_of_the_motion(delay):
     s, omega, alpha, *_ = moving(T + delay)
     data = record(non_contact_wrench(s, omega, alpha, PHI) + OFFSETS)
-    assert delay_of_free_fit(data) == pytest.approx(delay, abs=2e-3)
+    assert delay_of_linear_fit(data) == pytest.approx(delay, abs=2e-3)
 
 
 @pytest.mark.parametrize("size", [1, 4, 10])
@@ -234,7 +234,7 @@ def test_acceleration_of_the_origin_is_compared_with_its_noise(size, enough):
     s = np.einsum("nji,nj->ni", R_WS, a - GRAVITY_W)
     motion = s, omega, alpha, R_WS
     data = block_means_of_record(T, np.zeros((len(T), 6)), motion, GRAVITY_W, None, 0.05)
-    assert data.accelerates_enough is enough
+    assert data.has_enough_acceleration is enough
 
 
 def test_rejected_causes_widen_the_load_by_their_score_or_smaller_residual():

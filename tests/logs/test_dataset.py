@@ -20,7 +20,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
 from drake_teleop.logs.dataset.dataset_files import open_dataset
-from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
+from drake_teleop.logs.dataset.episode_faults import list_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     find_offset_step,
@@ -52,7 +52,7 @@ def verdict(x: SampleEpisode) -> set[str]:
     found, residual = find_simplest_hypothesis_and_residual(
         signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD
     )
-    names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
+    names = {f.name for f in list_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
     step = find_offset_step(residual, found.spread)
     return names | ({"tared"} if step is not None else set())
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from test_dataset import log_of
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
+from drake_teleop.logs.dataset.episode_faults import list_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     WrenchHypothesis,
@@ -54,7 +54,7 @@ FLIP = np.diag([1.0, -1.0, 1.0])
     ],
 )  # fmt: skip
 def test_findings_contain_figures_and_units(change, expected):
-    found = name_faults(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
+    found = list_faults(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
     assert len(found) == len(expected)
     for finding, words in zip(found, expected, strict=True):
         assert words in finding.message

@@ -20,7 +20,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import conventions
-from drake_teleop.logs.check.edits import LogData
+from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log
@@ -312,7 +312,7 @@ def test_log_is_thinned_to_means_for_any_form_of_time(
     if time is None:
         streams = {"static": wrench | {"gravity": {"columns": ["s"]}}}
     description = Description.model_validate(streams)
-    log = LogData(description, "log.yaml", {Path("w"): table}).read_thinned_log(description)
+    log = LogTables(description, "log.yaml", {Path("w"): table}).read_thinned_log(description)
     if time is None:  # poses are few and independent
         assert log.static and len(log) == 900
     else:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.edits import LogData, edit_field
+from drake_teleop.logs.check.edits import LogTables, edit_field
 from drake_teleop.logs.check.motion_checks import (
     _correct_imu_clock,
     check_imu_against_pose,
@@ -166,7 +166,7 @@ def test_unit_of_the_wrong_rate_is_named(omega: float, alpha: float, unit: str, 
     assert corrected != description
 
 
-def imu_and_pose(frame: np.ndarray, **changed: np.ndarray) -> tuple[Description, LogData]:
+def imu_and_pose(frame: np.ndarray, **changed: np.ndarray) -> tuple[Description, LogTables]:
     """Return a log of 12 s with an IMU in S, a description of its frame, and other columns."""
     t = np.arange(0.0, 12.0, 0.01)
     at = motion_at(t)
@@ -188,7 +188,9 @@ def imu_and_pose(frame: np.ndarray, **changed: np.ndarray) -> tuple[Description,
     imu["frame"] = frame.tolist()
     document = {"gravity": GRAVITY_W.tolist(), "wrench": wrench, "imu": imu, "pose": pose}
     description = Description.model_validate(document)
-    return description, LogData(description, "log.yaml", {Path("log"): Table(Path("log"), columns)})
+    return description, LogTables(
+        description, "log.yaml", {Path("log"): Table(Path("log"), columns)}
+    )
 
 
 def test_mounting_in_the_description_is_corrected_from_the_left() -> None:

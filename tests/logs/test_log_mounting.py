@@ -117,7 +117,7 @@ def mounting(
     imu = read_described_log(description, "log.yaml", tables=tables)
     alone = description.model_copy(update={"imu": None})
     pose = read_described_log(alone, "log.yaml", tables=tables)
-    found = find_mounting(imu, pose, position=streams.get("positioned", True))
+    found = find_mounting(imu, pose, has_position=streams.get("positioned", True))
     assert found is not None
     return found
 

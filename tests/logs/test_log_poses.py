@@ -135,7 +135,7 @@ LIMITS = {
     "pose_motion.splines._MAX_ROWS_PER_BLOCK": 260,
     "aligned_log._MIN_SAMPLES_AT_REDUCED_RATE": 300,
     "aligned_log._CHUNK_SAMPLES": 70,
-    "aligned_log._FILTER_NEIGHBOURS": 30,
+    "aligned_log._FILTER_MARGIN_SAMPLES": 30,
 }
 """Limits so low that a record of 10 s is read in parts, as an hour at 1 kHz."""
 

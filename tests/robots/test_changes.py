@@ -15,7 +15,7 @@ from test_watch import DT, LOAD, OFFSETS, PHI
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.instants import NUM_SIGNALS, SPECIFIC_FORCE_SIGNALS
-from drake_teleop.logs.causes.model import Model, StepChange
+from drake_teleop.logs.causes.model import LoadModel, StepChange
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots import changes
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
@@ -189,7 +189,7 @@ def test_kind_of_a_change_needs_rotations_after_it(
     y[moves, SPECIFIC_FORCE_SIGNALS] = np.sin(3.0 * t[moves, None] + np.arange(3))
     for other, expected in ((-25.0, certain), (-15.0, False)):
         state = SimpleNamespace(
-            model=Model(steps=(StepChange("load", 5.0),)),
+            model=LoadModel(steps=(StepChange("load", 5.0),)),
             data=SimpleNamespace(t=t, y=y, used=np.ones(len(t), bool)),
             x=np.zeros(27),
             likelihood=0.0,

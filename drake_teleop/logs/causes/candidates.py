@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import signed_permutations
 from drake_teleop.load.identification import natural_scales
-from drake_teleop.logs.causes.changes import add_step, find_contact_spans
+from drake_teleop.logs.causes.changes import add_step_change, find_contact_spans
 from drake_teleop.logs.causes.instants import (
     CONSTANT_COLUMN,
     GRAVITY_SIGNALS,
@@ -18,7 +18,7 @@ from drake_teleop.logs.causes.instants import (
     SPECIFIC_FORCE_SIGNALS,
     WRENCH_SIGNALS,
 )
-from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, Model
+from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, LoadModel
 from drake_teleop.logs.causes.state import FittedModel
 
 EXTENSIONS_BY_PLAUSIBILITY = (
@@ -66,20 +66,20 @@ def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candida
     drifts = bool({"linear drift", "drift"} & set(model.extensions))
     possible = {
         "gravity": data.gravity_W is not None,
-        "weight": data.gravity_W is not None and data.accelerates_enough,
+        "weight": data.gravity_W is not None and data.has_enough_acceleration,
         "linear drift": not drifts,
-        "frame": data.accelerates_enough,
+        "frame": data.has_enough_acceleration,
         "rotation": is_first_round and not model.extensions,
-        "cable": data.has_positions and data.accelerates_enough,
+        "cable": data.has_positions and data.has_enough_acceleration,
         "drift": not drifts,
     }
     for name, is_possible in possible.items():
         if is_possible and name not in model.extensions:
             yield from _fit_extension(state, name)
-    if data.accelerates_enough:
+    if data.has_enough_acceleration:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
-        found = add_step(state, kind)
+        found = add_step_change(state, kind)
         if found is not None:
             yield _scored_candidate(kind, state, found, num_times=1)
     for c in range(6):
@@ -266,7 +266,7 @@ def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
     sums = y.T @ y
     sums = sums - np.outer(sums[:, CONSTANT_COLUMN], sums[CONSTANT_COLUMN]) / sums[0, 0]
     # m s + alpha x h + omega x (omega x h) for the three axes of S, and a removed weight
-    model = Model(extensions=state.model.extensions)
+    model = LoadModel(extensions=state.model.extensions)
     used = [6, 7, 8, 9]
     if "weight" in model.extensions:
         used.append(model.parameter_slices["weight"].start)

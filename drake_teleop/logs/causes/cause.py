@@ -19,8 +19,8 @@ from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
 from drake_teleop.logs.causes.state import FittedModel
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
-CHANGE_CAUSES = ("zero change", "load change")  # they divide a record into parts
-CAUSES_WITHOUT_CORRECTION = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
+SUDDEN_CHANGES = ("zero change", "load change")  # they divide a record into parts
+CAUSES_WITHOUT_CORRECTION = (*SUDDEN_CHANGES, "drift", "contact", "cable", "no load")
 """Causes that no line of a description corrects."""
 
 
@@ -58,7 +58,7 @@ class RecordPartWithLoad:
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
-def causes_of_fit(state: FittedModel, always_fitted: tuple[str, ...] = ()) -> list[Finding]:
+def name_misfit_causes(state: FittedModel, always_fitted: tuple[str, ...] = ()) -> list[Finding]:
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_wrong_axes_cause(model.axes))

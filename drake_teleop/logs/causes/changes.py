@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
-from drake_teleop.logs.causes.model import Model, StepChange
+from drake_teleop.logs.causes.model import LoadModel, StepChange
 from drake_teleop.logs.causes.state import (
     FittedModel,
     TimeSpans,
@@ -21,14 +21,14 @@ from drake_teleop.logs.causes.state import (
 )
 
 _MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
-_STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
+_STEP_TIME_REFINEMENT_ROWS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
 MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
 _NUM_TRIED_STEP_TIMES, _MIN_STEP_OVER_DEVIATION, _MIN_OFFSET_STEP_OVER_NOISE = 2, 5.0, 2.0
 _MIN_MASS_STEP_OVER_MASS, _MIN_MOMENT_STEP_OVER_MASS_M = 0.01, 0.002
 
 
-def add_step(state: FittedModel, kind: str) -> FittedModel | None:
+def add_step_change(state: FittedModel, kind: str) -> FittedModel | None:
     """Return the model with one more change of "offsets" or "load" (`kind`), at its likeliest time.
 
     Return None if no change is significant.
@@ -46,7 +46,7 @@ def add_step(state: FittedModel, kind: str) -> FittedModel | None:
 
 def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
     data, rows = state.data, state.data.rows_per_search_block
-    scan = _StepScan(state, kind)
+    scan = _StepTimeScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
     gains = np.array([scan.likelihood_gain_of_step_at(int(n)) for n in starts])
     for time in state.model.step_times:
@@ -65,7 +65,7 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
     return out
 
 
-class _StepScan:
+class _StepTimeScan:
     def __init__(self, state: FittedModel, kind: str) -> None:
         scale = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
         self._y, self._rows = state.rows.y, state.data.rows_per_search_block
@@ -73,7 +73,7 @@ class _StepScan:
         self._residual = state.residual / scale[:, None]
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
         sums = state.data.lagged_block_sums(self._y, rows=self._rows, lags=1)[:, 0]
-        gram, right = _weighted_equations(self._J, self._residual, sums)
+        gram, right = _weighted_normal_equations(self._J, self._residual, sums)
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
@@ -81,7 +81,7 @@ class _StepScan:
     def likelihood_gain_of_step_at(self, n: int) -> float:
         j = -(-n // self._rows)
         y = self._y[n : j * self._rows]
-        gram, right = _weighted_equations(self._J, self._residual, y.T @ y)
+        gram, right = _weighted_normal_equations(self._J, self._residual, y.T @ y)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
         which = self._which
@@ -91,7 +91,7 @@ class _StepScan:
         return score_statistic(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
-def _weighted_equations(J: Array, residual: Array, sums: Array) -> tuple[Array, Array]:
+def _weighted_normal_equations(J: Array, residual: Array, sums: Array) -> tuple[Array, Array]:
     """Return the normal equations of p parameters for sums (..., W, W) of products of W signals.
 
     J (p, 6, W) are derivatives of the wrench and `residual` (6, W) coefficients, over the weights.
@@ -143,7 +143,7 @@ def _refit_without_steps(
 ) -> FittedModel:
     kept = tuple(x for i, x in enumerate(state.model.steps) if i not in removed)
     model = replace(state.model, steps=kept)
-    x = model.start_parameters(state.x, Model())
+    x = model.start_parameters(state.x, LoadModel())
     return FittedModel.fit_record(state.data, model, x, spans)
 
 
@@ -176,7 +176,7 @@ def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> F
         return state.refit(model, start)
 
     best = fit_with_step_at(time)
-    for share in _STEP_TIME_MOVES_INSTANTS:
+    for share in _STEP_TIME_REFINEMENT_ROWS:
         for _ in range(_MAX_STEP_TIME_MOVES):
             now = best.model.steps[-1].time
             move = share * state.data.dt
@@ -273,7 +273,7 @@ class _NormalEquationsOfBlocks:
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
         scale = np.maximum(data.wrench_noise, least)
         J, left = state.model.wrench_derivative(state.x), state.residual / scale[:, None]
-        self._gram, self._right = _weighted_equations(J / scale[:, None], left, sums)
+        self._gram, self._right = _weighted_normal_equations(J / scale[:, None], left, sums)
         self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

@@ -18,14 +18,14 @@ from drake_teleop.logs.causes.candidates import (
 )
 from drake_teleop.logs.causes.cause import Finding, RecordPartWithLoad
 from drake_teleop.logs.causes.changes import remove_small_steps
-from drake_teleop.logs.causes.instants import BlockMeans, delay_of_free_fit
+from drake_teleop.logs.causes.instants import BlockMeans, delay_of_linear_fit
 from drake_teleop.logs.causes.intervals import (
     GOOD_SMOOTH_MISFIT,
     load_covariance_by_gain_errors,
     load_covariance_by_torque_unit,
     load_deviations_if_unexplained,
 )
-from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, Model
+from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, LoadModel
 from drake_teleop.logs.causes.state import FittedModel
 
 MAX_SEARCH_ROUNDS = 4
@@ -63,27 +63,27 @@ SearchResult = tuple[FittedModel, float, list[Candidate]]
 
 
 def search_causes(
-    data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
+    data: BlockMeans, means_at: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
     """Return the fitted model that explains a record, additional delay [s], and rejected causes."""
-    plain = Model(extensions=always_fitted)
-    found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
+    plain = LoadModel(extensions=always_fitted)
+    found = _search_causes_from(_initial_state(data, plain), 0.0, means_at)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
         mirrored = _initial_state(data, replace(plain, axes=-np.eye(3)))
-        opposite = _search_causes_from(mirrored, 0.0, with_delay)
+        opposite = _search_causes_from(mirrored, 0.0, means_at)
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
         is_wrench = opposite[0].model.torque_factor > 0.0
         # An equal residual is sufficient for a positive mass, because a negative one is impossible.
         share = _MUCH_SMALLER_RESIDUAL if has_negative_mass(opposite[0]) else _EQUAL_RESIDUAL
         if is_wrench and opposite[0].residual_ratio < share * found[0].residual_ratio:
             found = opposite
-    if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
+    if means_at is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
         return found
-    delay_s = delay_of_free_fit(data)
+    delay_s = delay_of_linear_fit(data)
     if abs(delay_s - found[1]) < _EQUAL_DELAY_TOLERANCE_S:
         return found
-    repeated = _search_causes_from(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
+    repeated = _search_causes_from(_initial_state(means_at(delay_s), plain), delay_s, means_at)
     likelier = repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
     better = likelier or _is_residual_much_smaller(repeated[0], found[0])
     return repeated if better or residual_is_noise(repeated[0]) else found
@@ -99,16 +99,16 @@ def may_be_coloured_noise(state: FittedModel) -> bool:
     return small and state.smooth_misfit < GOOD_SMOOTH_MISFIT
 
 
-def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
+def _initial_state(data: BlockMeans, model: LoadModel) -> FittedModel:
     state = FittedModel.fit_record(data, model)
     start = start_parameters_of_tilt_fit(state) if "gravity" in model.extensions else None
     return state if start is None else FittedModel.fit_record(data, state.model, start)
 
 
 def _search_causes_from(
-    state: FittedModel, delay_s: float, with_delay: MeansAtDelay | None
+    state: FittedModel, delay_s: float, means_at: MeansAtDelay | None
 ) -> SearchResult:
-    state, delay_s = _apply_fitted_delay(state, delay_s, with_delay)
+    state, delay_s = _apply_fitted_delay(state, delay_s, means_at)
     rejected: list[Candidate] = []
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
@@ -132,7 +132,7 @@ def _search_causes_from(
             explained = None if calm is None else changes.replace_contacts_by_steps(calm)
             if explained is None:
                 break
-            state, delay_s = _apply_fitted_delay(explained, delay_s, with_delay)
+            state, delay_s = _apply_fitted_delay(explained, delay_s, means_at)
             continue
         larger = changes.replace_steps_by_contact(winner.state)
         if winner.name == "contact":
@@ -140,7 +140,7 @@ def _search_causes_from(
         elif larger.contact_spans != winner.state.contact_spans:
             larger = changes.replace_contacts_by_steps(larger) or larger
         # A contact can take all the samples before or after an earlier step.
-        state, delay_s = _apply_fitted_delay(remove_small_steps(larger), delay_s, with_delay)
+        state, delay_s = _apply_fitted_delay(remove_small_steps(larger), delay_s, means_at)
         rejected = [x for x in rejected if x is not winner]
         if winner.name == "cable":
             return state, delay_s, []
@@ -154,17 +154,17 @@ def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Can
 
 
 def _apply_fitted_delay(
-    state: FittedModel, delay_s: float, with_delay: MeansAtDelay | None
+    state: FittedModel, delay_s: float, means_at: MeansAtDelay | None
 ) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
         more = float(state.x[DELAY_INDEX])
         large = abs(delay_s) > _MAX_CORRECTED_DELAY_S
-        if with_delay is None or abs(more) < _MIN_CORRECTED_DELAY_S or large:
+        if means_at is None or abs(more) < _MIN_CORRECTED_DELAY_S or large:
             break
         delay_s += more
         x = state.x.copy()
         x[DELAY_INDEX] = 0.0
-        state = FittedModel.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
+        state = FittedModel.fit_record(means_at(delay_s), state.model, x, state.contact_spans)
     return state, delay_s
 
 
@@ -245,19 +245,19 @@ class MisfitExplanation:
 
 
 def explain_misfit(
-    data: BlockMeans, with_delay: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
+    data: BlockMeans, means_at: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> MisfitExplanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
     The model contains the extensions `always_fitted`, such as "weight", from the start.
-    `with_delay` returns the record with an additional delay [s].
+    `means_at` returns the record with an additional delay [s].
     """
     with one_blas_thread():
-        state, delay_s, rejected = search_causes(data, with_delay, always_fitted)
+        state, delay_s, rejected = search_causes(data, means_at, always_fitted)
         blocks = intervals.jackknife_load_deviations(state)
         gains = load_covariance_by_gain_errors(state) + load_covariance_by_torque_unit(state)
         covariance = intervals.load_covariance(state, rejected, blocks, gains)
-        causes = cause.causes_of_fit(state, always_fitted)
+        causes = cause.name_misfit_causes(state, always_fitted)
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _no_load_cause(state, covariance)

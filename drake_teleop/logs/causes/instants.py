@@ -65,7 +65,7 @@ class BlockMeans:
     alpha_noise_share: float = 0.0
 
     @cached_property
-    def accelerates_enough(self) -> bool:
+    def has_enough_acceleration(self) -> bool:
         """Whether the accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_ALPHA_NOISE_SHARE
@@ -210,7 +210,7 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
     return np.hstack(parts)
 
 
-def delay_of_free_fit(data: BlockMeans) -> float:
+def delay_of_linear_fit(data: BlockMeans) -> float:
     """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
 
     The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.

@@ -45,7 +45,7 @@ class StepChange:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class LoadModel:
     """Rigid load with a selection of extensions, such as drift or a rotated sensor.
 
     Attributes:
@@ -62,7 +62,7 @@ class Model:
     axes: Array = field(default_factory=lambda: np.eye(3))
     torque_factor: float = 1.0
 
-    def with_extension(self, name: str) -> Model:
+    def with_extension(self, name: str) -> LoadModel:
         known = name in self.extensions
         return self if known else replace(self, extensions=(*self.extensions, name))
 
@@ -107,7 +107,7 @@ class Model:
     def step_times(self) -> tuple[float, ...]:
         return tuple(step.time for step in self.steps)
 
-    def start_parameters(self, x: Array, other_model: Model) -> Array:
+    def start_parameters(self, x: Array, other_model: LoadModel) -> Array:
         """Return parameters (size,) from those of `other_model`, x; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes import instants
 from drake_teleop.logs.causes.instants import BlockMeans
-from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, Model
+from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, LoadModel
 
 _MIN_ROWS_FOR_AUTOREGRESSION = 50
 TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
@@ -109,7 +109,7 @@ class FittedModel:
         contact_spans: (start, stop) of contacts, whose rows are not used [s].
     """
 
-    model: Model
+    model: LoadModel
     rows: UsedRows
     x: Array
     covariance: Array
@@ -120,17 +120,17 @@ class FittedModel:
 
     @classmethod
     def fit_record(
-        cls, data: BlockMeans, model: Model, start: Array | None = None, spans: TimeSpans = ()
+        cls, data: BlockMeans, model: LoadModel, start: Array | None = None, spans: TimeSpans = ()
     ) -> FittedModel:
         used = data.used & ~is_in_time_spans(data, spans)
         return fit_model(model, UsedRows(data, used, model.step_times, model.columns), start, spans)
 
-    def refit(self, model: Model, start: Array | None = None, **options: int) -> FittedModel:
+    def refit(self, model: LoadModel, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
             start = model.start_parameters(self.x, self.model)
         return fit_model(model, self._rows_for_model(model), start, self.contact_spans, **options)
 
-    def _rows_for_model(self, model: Model) -> UsedRows:
+    def _rows_for_model(self, model: LoadModel) -> UsedRows:
         rows = self.rows
         if rows.step_times == model.step_times and np.array_equal(rows.columns, model.columns):
             return rows
@@ -145,7 +145,7 @@ class FittedModel:
         where = self.model.parameter_slices[name]
         return self.x[where], self.covariance[where, where]
 
-    def normal_equations(self, model: Model, x: Array) -> tuple[Array, Array]:
+    def normal_equations(self, model: LoadModel, x: Array) -> tuple[Array, Array]:
         """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
         whitened = self.rows.whitened_products(self.noise_filters) / self.noise_power[:, None, None]
         J = model.wrench_derivative(x).transpose(1, 0, 2)
@@ -203,7 +203,7 @@ class FittedModel:
             gain, freedom = gain + solved / self.noise_power[c], freedom + rank
         return gain, freedom
 
-    def score_of_larger_model(self, model: Model) -> float:
+    def score_of_larger_model(self, model: LoadModel) -> float:
         """Return the first-order gain of twice the log likelihood by fitting a larger model."""
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
@@ -213,7 +213,7 @@ class FittedModel:
 
 
 def fit_model(
-    model: Model,
+    model: LoadModel,
     rows: UsedRows,
     start: Array | None = None,
     spans: TimeSpans = (),

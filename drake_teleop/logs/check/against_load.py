@@ -18,7 +18,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import edits
-from drake_teleop.logs.check.edits import LogData
+from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.read.alignment import (
     MAX_SEARCHED_DELAY_S,
     estimate_delay,
@@ -35,7 +35,7 @@ GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
 VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
-MIN_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
+MIN_MISFIT_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
 """Findings with the sign; mirrored axes are a cause that `identify` names."""
@@ -60,7 +60,7 @@ class LoadFitQuality:
 
     def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
         """Return the largest accepted `unexplained`: that of the noise plus the given share."""
-        return min(share_beside_noise + self.noise_share, UNDETERMINED_UNEXPLAINED_SHARE)
+        return min(share_beside_noise + self.noise_share, MIN_UNDETERMINED_UNEXPLAINED)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
@@ -114,16 +114,16 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-UNDETERMINED_UNEXPLAINED_SHARE = 0.9  # of the variance; above it a load is undetermined
+MIN_UNDETERMINED_UNEXPLAINED = 0.9  # of the variance; above it a load is undetermined
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_MAX_UNEXPLAINED_AFTER_OVER_BEFORE = 0.5
+_MAX_UNEXPLAINED_RATIO_BY_CLOCK_DRIFT = 0.5
 
 
 def check_wrench_and_estimate_delay(
-    description: Description, data: LogData
+    description: Description, data: LogTables
 ) -> tuple[list[Finding], float | None]:
     """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
     log = data.read_whole_log(description)
@@ -188,7 +188,7 @@ def _edits_with_far_better_fit(
     valid = given.max_unexplained_including_noise(VALID_UNEXPLAINED)
     n = max(1.0, given.independent_samples)
     least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
-    decisive = given.unexplained / max(MIN_REDUCTION_BY_EDIT, least_factor)
+    decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_BY_EDIT, least_factor)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -245,7 +245,7 @@ def _findings_without_remedy(
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
     """Return a finding if a record does not determine the mass of a load."""
-    if load.verdicts[6] != "not" and unexplained < UNDETERMINED_UNEXPLAINED_SHARE:
+    if load.verdicts[6] != "not" and unexplained < MIN_UNDETERMINED_UNEXPLAINED:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = "no signal of the record depends on its mass"
@@ -295,7 +295,7 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
 
 
 def clock_drift_finding_and_correction(
-    description: Description, data: LogData
+    description: Description, data: LogTables
 ) -> tuple[list[Finding], Description]:
     """Return a finding for a steadily growing delay, and the corrected description."""
     name = "imu" if description.pose is None else "pose"
@@ -308,7 +308,7 @@ def clock_drift_finding_and_correction(
         return [], description
     late, slope = line
     _, lines, edited = data.start_lag_and_clock_drift_correction(name, description, late, slope)
-    limit = _MAX_UNEXPLAINED_AFTER_OVER_BEFORE * _unexplained_after_delay_removal(log)
+    limit = _MAX_UNEXPLAINED_RATIO_BY_CLOCK_DRIFT * _unexplained_after_delay_removal(log)
     if _unexplained_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
     text = f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against the wrench's"

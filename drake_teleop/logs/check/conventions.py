@@ -18,7 +18,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import against_load, edits
 from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, LoadFitQuality
-from drake_teleop.logs.check.edits import LogData
+from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.check.motion_checks import (
     check_imu_against_pose,
     check_imu_signals,
@@ -140,7 +140,7 @@ def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> ConventionCheckResult:
     with one_blas_thread():
-        found = _check_description(LogData(description, source, dict(tables or {})), description)
+        found = _check_description(LogTables(description, source, dict(tables or {})), description)
     note = table_files.note_that_table_needs_description(source)
     findings = tuple(replace(f, message=f"{f.message}{note}") for f in found.findings)
     return replace(found, findings=findings)
@@ -151,7 +151,7 @@ def _is_wrench_constant(log: Log) -> bool:
     return bool((np.ptp(log.wrench, axis=0) <= limit).all())
 
 
-def _check_description(data: LogData, description: Description) -> ConventionCheckResult:
+def _check_description(data: LogTables, description: Description) -> ConventionCheckResult:
     log = data.read_whole_log(description)
     if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"

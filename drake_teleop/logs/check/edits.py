@@ -165,7 +165,7 @@ _THINNED_RATE_HZ = 100.0
 _THIN_TIME_PREFIX = "thinned time stamps of"
 
 
-class LogData:
+class LogTables:
     """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:

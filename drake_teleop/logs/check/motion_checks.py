@@ -11,13 +11,13 @@ from drake_teleop.common.rotations import axis_names_of_rows, rotation_matrices,
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
-    MIN_REDUCTION_BY_EDIT,
+    MIN_MISFIT_REDUCTION_BY_EDIT,
     VALID_UNEXPLAINED,
 )
 from drake_teleop.logs.check.edits import (
     MIN_LAG_OF_WRONG_CLOCK_S,
     Edit,
-    LogData,
+    LogTables,
     call_or_none_if_unreadable,
     edit_field,
     orientation_and_gravity_sign_edits,
@@ -36,7 +36,7 @@ from drake_teleop.logs.read.mounting import (
     rotation_angle_deg,
 )
 
-RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
+SPEED_RATIO_RANGE_OF_DEGREES = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
 MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION, _ALPHA_COMPARISON_CUTOFF_HZ = 5.0, 5.0
@@ -71,7 +71,7 @@ def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | Non
     correlation = float(np.sum(given_alpha * derived_alpha))
     if min(sizes) == 0.0 or correlation < _MIN_ALPHA_CORRELATION * sizes[0] * sizes[1]:
         return None
-    ratio, (least, most) = sizes[0] / sizes[1], RANGE_OF_DEGREES_PER_RADIAN
+    ratio, (least, most) = sizes[0] / sizes[1], SPEED_RATIO_RANGE_OF_DEGREES
     for wrong, quantity, unit, other in (
         (ratio, "angular_acceleration", "rad/s^2", "deg/s^2"),
         (1.0 / ratio, "angular_acceleration", "deg/s^2", "rad/s^2"),
@@ -187,7 +187,7 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
 
 
 def check_imu_against_pose(
-    description: Description, data: LogData
+    description: Description, data: LogTables
 ) -> tuple[list[Finding], Mounting | None, Description]:
     """Return contradictions of IMU and pose, the IMU's mounting, and the corrected description."""
 
@@ -205,7 +205,7 @@ def check_imu_against_pose(
             for finding, edited in orientation_and_gravity_sign_edits(description)
             if (found := call_or_none_if_unreadable(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_REDUCTION_BY_EDIT)
+        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_MISFIT_REDUCTION_BY_EDIT)
         if given.is_mirrored:
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
         elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED:
@@ -222,7 +222,7 @@ def check_imu_against_pose(
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
-    least, most = RANGE_OF_DEGREES_PER_RADIAN
+    least, most = SPEED_RATIO_RANGE_OF_DEGREES
     if given.speed_ratio is not None and least < given.speed_ratio < most:
         text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
         findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
@@ -247,7 +247,7 @@ def check_imu_against_pose(
     return findings, given, description
 
 
-def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
+def _correct_imu_clock(description: Description, found: Mounting, data: LogTables) -> Edit:
     assert description.imu is not None
     drift = found.clock_drift
     if not drift:
@@ -278,7 +278,7 @@ _COM_TOLERANCE_OF_WRONG_TORQUE_UNIT = 0.03
 
 
 def position_unit_or_origin_findings(
-    description: Description, data: LogData, lag: float
+    description: Description, data: LogTables, lag: float
 ) -> list[Finding]:
     """Return findings for positions in a wrong unit, or of a point other than So.
 
@@ -327,17 +327,18 @@ def position_unit_or_origin_findings(
     return [Finding("pose frame", text)]
 
 
-def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding | None:
-    if not abs(kappa) > _MIN_ERROR_OVER_DEVIATION * deviation:
+def _position_unit_finding(described: str, scale: float, deviation: float) -> Finding | None:
+    if not abs(scale) > _MIN_ERROR_OVER_DEVIATION * deviation:
         return None
-    text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
+    text = f"the acceleration of the positions is {1.0 / scale:.3g} times the measured one:"
     for unit in POSITION_UNITS:
-        ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[now]
-        if unit != now and _UNIT_MATCH_RANGE[0] < kappa / ratio < _UNIT_MATCH_RANGE[1]:
-            return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
-    if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(kappa) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
+        ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[described]
+        if unit != described and _UNIT_MATCH_RANGE[0] < scale / ratio < _UNIT_MATCH_RANGE[1]:
+            what = f"they are not in {described}; set pose.position.unit: {unit}"
+            return Finding("units", f"{text} {what}")
+    if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(scale) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
-    remedy = f"multiply pose.position.scale (1 by default) by {kappa:.4g}"
+    remedy = f"multiply pose.position.scale (1 by default) by {scale:.4g}"
     return Finding("units", f"{text} their unit is not known; {remedy}")
 
 

@@ -29,15 +29,15 @@ from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
 from drake_teleop.logs.dataset import dataset_files, episode_verdict, shared_load
 from drake_teleop.logs.dataset.dataset_files import ContactColumns, Dataset, Episode
-from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturation_faults
+from drake_teleop.logs.dataset.episode_faults import EpisodeFault, list_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import EpisodeSignals, WrenchHypothesis
 from drake_teleop.logs.dataset.shared_load import SharedLoad
-from drake_teleop.logs.figures import summarize_load
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_described_log
+from drake_teleop.logs.summaries import summarize_load
 
 # Episodes that determine load, lag and noise: fewer if they are long.
 _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
@@ -49,7 +49,7 @@ _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
 
-class SharedJudgingData(NamedTuple):
+class DatasetAndLoad(NamedTuple):
     dataset: Dataset
     streams: dict[str, Any]
     shared_load: SharedLoad
@@ -88,11 +88,11 @@ def dataset_command(
         streams = _described_or_drafted_streams(dataset, description)
         work = _open_work_folder(out, dataset, [str(load), known, streams])
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
-        task = SharedJudgingData(dataset, streams, shared)
+        task = DatasetAndLoad(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
         judged = [np.load(work / f"{k}.npy", allow_pickle=False) for k in range(len(rows))]
         columns = [ContactColumns(x[:, :6], x[:, 6] > 0.5) for x in judged]
-        dataset_files.write_copy(dataset, copied, columns)
+        dataset_files.write_dataset_copy(dataset, copied, columns)
         files.write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = files.to_json_data(_dataset_summary(dataset, copied, shared, rows))
@@ -257,7 +257,7 @@ def _estimate_shared_load(
 
 
 def _judge_all_episodes(
-    task: SharedJudgingData, work: Path, jobs: int, progress: Any
+    task: DatasetAndLoad, work: Path, jobs: int, progress: Any
 ) -> list[dict[str, Any]]:
     from joblib import Parallel, delayed
 
@@ -271,7 +271,7 @@ def _judge_all_episodes(
     return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
 
 
-def _judge_episode(task: SharedJudgingData, work: Path, number: int) -> None:
+def _judge_episode(task: DatasetAndLoad, work: Path, number: int) -> None:
     episode = task.dataset.episodes[number]
     try:
         with one_blas_thread():
@@ -286,7 +286,7 @@ def _judge_episode(task: SharedJudgingData, work: Path, number: int) -> None:
 
 
 def _verdict_on_episode(
-    task: SharedJudgingData, episode: Episode
+    task: DatasetAndLoad, episode: Episode
 ) -> tuple[dict[str, Any], ContactColumns]:
     shared, usual = task.shared_load, task.shared_load.usual_half_widths
     usual_lag = shared.lag_frames
@@ -296,7 +296,7 @@ def _verdict_on_episode(
         signals, shared.phi, usual_lag, usual
     )
     faults = saturation_faults(log.wrench)
-    faults += name_faults(found, usual_lag, shared.phi, 1.0 / log.dt)
+    faults += list_faults(found, usual_lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = episode_verdict.find_offset_step(residual, found.spread)
     if step is not None:
@@ -361,7 +361,7 @@ def _dataset_summary(
         "ok": names["ok"],
         "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
         "lag_frames": shared.lag_frames,
-        "noise": shared.usual_half_widths / episode_verdict.HALF_WIDTH_OF_NORMAL,
+        "noise": shared.usual_half_widths / episode_verdict.STANDARD_NORMAL_QUARTILE,
         "contact_threshold": shared.threshold,
         **summarize_load(shared.identification),
     }

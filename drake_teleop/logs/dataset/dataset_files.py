@@ -144,7 +144,7 @@ def _open_zarr(path: Path) -> Dataset:
     return Dataset(path, "zarr", episodes, float("nan"))
 
 
-def write_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
+def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
     """Write the dataset with the columns of each episode to `out`; the dataset stays unchanged."""
     if dataset.kind == "hdf5":
         _write_hdf5(dataset, out, columns)

@@ -25,7 +25,7 @@ class EpisodeFault(NamedTuple):
     value: Any
 
 
-def name_faults(
+def list_faults(
     x: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
     """Return the faults of an episode that a hypothesis contains.

@@ -28,7 +28,7 @@ LAG_STEPS_PER_FRAME = 8
 MAX_LAG_FRAMES = 8
 HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 """Wrenches of the load: in S; without its weight; in the axes of the base."""
-HALF_WIDTH_OF_NORMAL = 0.674
+STANDARD_NORMAL_QUARTILE = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
 _FORCE_AND_TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
@@ -288,8 +288,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
-    noise = change / (np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL)
-    by_spread = np.exp(spread) / HALF_WIDTH_OF_NORMAL
+    noise = change / (np.sqrt(2.0) * STANDARD_NORMAL_QUARTILE)
+    by_spread = np.exp(spread) / STANDARD_NORMAL_QUARTILE
     deviation = np.minimum(by_spread, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 

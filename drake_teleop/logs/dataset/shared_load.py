@@ -56,7 +56,7 @@ class SharedLoad:
 def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """Return the load that most episodes of a dataset share, or the given load."""
     signals = map(EpisodeSignals, logs)
-    episodes = [_Episode(x, fit_own_load_of_episode(x)) for x in signals]
+    episodes = [_FittedEpisode(x, fit_own_load_of_episode(x)) for x in signals]
     if load is None:
         candidates = [x.own.phi for x in episodes if x.own.phi is not None and x.own.phi[0] > 0.0]
         if not candidates:
@@ -69,18 +69,18 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
         phi = min(candidates, key=counted_excess)
         for _ in range(2):
-            load = _fit_load(_episodes_with_load(episodes, phi), phi)
+            load = _fit_shared_load(_episodes_sharing_load(episodes, phi), phi)
             phi = load.phi
     assert load is not None
     # Uncertain inertias are nearer to the truth than those of a point mass.
     determined = np.isfinite(load.standard_deviations).all()
     phi = load.phi if determined else phi_with_inertia_replaced(load)[0]
-    chosen = _episodes_with_load(episodes, phi)
+    chosen = _episodes_sharing_load(episodes, phi)
     usual = [x.faultless_hypothesis_and_residual(phi) for x in chosen]
     steps = float(np.median([x.lag for x, _ in usual])) * LAG_STEPS_PER_FRAME
     lag = round(steps) / LAG_STEPS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
-    limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.HALF_WIDTH_OF_NORMAL, []
+    limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.STANDARD_NORMAL_QUARTILE, []
     for episode, (x, residual) in zip(chosen, usual, strict=True):
         contact = residual - x.offsets
         frames_from_touch = samples_to_nearest_flag((np.abs(contact) > limit).any(axis=1))
@@ -104,7 +104,7 @@ def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
     return min(found, key=lambda x: x.spread.sum())
 
 
-class _Episode(NamedTuple):
+class _FittedEpisode(NamedTuple):
     signals: EpisodeSignals
     own: WrenchHypothesis
 
@@ -128,17 +128,17 @@ class _Episode(NamedTuple):
         return float(usual.spread.sum() - self.own.spread.sum())
 
 
-def _episodes_with_load(episodes: list[_Episode], phi: Array) -> list[_Episode]:
+def _episodes_sharing_load(episodes: list[_FittedEpisode], phi: Array) -> list[_FittedEpisode]:
     found = [x for x in episodes if x.excess_spread(phi) < _MAX_MEMBER_EXCESS_SPREAD]
     return found or episodes
 
 
-def _fit_load(episodes: Sequence[_Episode], phi: Array) -> Identification:
+def _fit_shared_load(episodes: Sequence[_FittedEpisode], phi: Array) -> Identification:
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
     for episode in episodes:
         x, r = episode.faultless_hypothesis_and_residual(phi)
-        sigma = np.exp(x.spread) / episode_verdict.HALF_WIDTH_OF_NORMAL
+        sigma = np.exp(x.spread) / episode_verdict.STANDARD_NORMAL_QUARTILE
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episode.signals.regressor_at_lag(x.lag)[rows], episode.signals.log.wrench[rows]
         A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)

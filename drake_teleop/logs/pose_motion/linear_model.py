@@ -96,11 +96,8 @@ def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -
     C = C * scale[..., None, :]
     if load is not None:
         C = np.concatenate([C, np.broadcast_to(load[:, 1:], (*C.shape[:-1], len(load[0]) - 1))], -1)
-    covariance, costs = (
-        0.5 * inverse * both[..., None, :, :],
-        levels.negative_log_likelihoods(power),
-    )
-    return LinearFit(C, covariance, power, costs)
+    covariance = 0.5 * inverse * both[..., None, :, :]
+    return LinearFit(C, covariance, power, levels.negative_log_likelihoods(power))
 
 
 def _wrench_powers(Z: Array) -> Array:

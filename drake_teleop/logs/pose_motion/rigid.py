@@ -369,7 +369,6 @@ def _position_unit_ratio(a: Array, g: Array, v_a: Array, v_g: Array) -> tuple[fl
     known = (v_a > 0.0) & (v_g > 0.0)
     a, g, v_a, v_g = (x[known] for x in (a, g, v_a, v_g))
     kappa = 0.0
-    kappa = 0.0
     for _ in range(_UNIT_RATIO_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
         information = float(weight @ np.maximum(g * g - v_g, 0.0))

@@ -31,7 +31,7 @@ DELAY_SEARCH_HALF_RANGE_S = 0.25
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
 _MIN_NOISE_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
-_NARROW_BANDS_TO_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
+_MAX_NARROW_BAND_FREQUENCY_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
 NUM_MOMENT_SIGNALS = 2 * NUM_MOTION_SIGNALS + 6
 # Columns of the wrench and of the signals' derivatives in `second_moments`.
 WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
@@ -147,7 +147,7 @@ class FitWindow:
         last = group == group[-1]
         if weight[last].sum() < _MIN_NOISE_GROUP_SIZE and not last.all():
             group[last] = group[~last][-1]
-        low = np.clip(frequency, frequency[1], _NARROW_BANDS_TO_HZ) / frequency[1]
+        low = np.clip(frequency, frequency[1], _MAX_NARROW_BAND_FREQUENCY_HZ) / frequency[1]
         narrow = np.log(low) // np.log(_MAX_NARROW_BAND_EDGE_RATIO)
         first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
         group = np.unique(group[first], return_inverse=True)[1]
@@ -240,7 +240,7 @@ class Spectra:
         return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
 
     def second_moments_at_delays(self, delays: Array) -> Array:
-        """Return second moments (D, bands, 22, 22) at delays (D,) [s]."""
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows of signals."""
         bands, wrench = self.window.bands, self.window.wrench_spectrum
         if self.window.is_taper_fixed:
             return np.array([self.with_delay(delay).second_moments() for delay in delays])
@@ -328,7 +328,7 @@ _ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 
 
 
 def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
-    """Return what noise of the poses adds to `Spectra.second_moments_with_rates`.
+    """Return the part (bands, 38, 38) of `Spectra.second_moments_with_rates` by noise of the poses.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """

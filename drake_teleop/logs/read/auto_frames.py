@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.cause import direction_std_deg
 from drake_teleop.logs.causes.explain import explain_misfit
-from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record, delay_of_free_fit
+from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record, delay_of_linear_fit
 from drake_teleop.logs.read.alignment import remove_delay, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
@@ -40,7 +40,7 @@ def estimate_auto_imu_mounting(description: Description, source: str, read: Read
     if description.pose is not None:
         alone = read(description.model_copy(update={"imu": None}))
         at_Io = read(replace_imu_fields(frame=start, position=(0.0, 0.0, 0.0)))
-        mounting = find_mounting(at_Io, alone, position=description.pose.position is not None)
+        mounting = find_mounting(at_Io, alone, has_position=description.pose.position is not None)
     if frame == "auto":
         mounting = _require_imu_rotation(mounting, f"{source}:imu.frame")
         frame = tuple(map(tuple, mounting.R_SI.tolist()))
@@ -50,7 +50,7 @@ def estimate_auto_imu_mounting(description: Description, source: str, read: Read
         lever = _lever_arm_from_pose_or_wrench(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         found = f": {_format_arm_mm(lever)} mm, from the {lever.source}"
-        notes.append(_found_note("imu.position", found, lever.p_SoIo_S))
+        notes.append(_estimate_note("imu.position", found, lever.p_SoIo_S))
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
 
@@ -83,7 +83,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     nearest = found.nearest_right_angled_rotation.astype(int).tolist()
     oblique = f"{found.angle_to_right_angled_deg:.1f} deg from the right-angled mounting {nearest}"
     std = f"{float(found.deviations_deg.max()):.2g} deg"
-    notes = [_found_note("imu.frame", f": {oblique}, standard deviation {std}", found.R_SI)]
+    notes = [_estimate_note("imu.frame", f": {oblique}, standard deviation {std}", found.R_SI)]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
     if abs(found.lag_s) > MIN_WARNED_IMU_LAG_S:
@@ -116,7 +116,7 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
     return lever
 
 
-def _found_note(field: str, found: str, value: Array) -> str:
+def _estimate_note(field: str, found: str, value: Array) -> str:
     written = f"{field}: {round_for_yaml(value)}"
     return f"{field} found{found}; write it into the description as {written}"
 
@@ -159,7 +159,7 @@ def estimate_auto_pose_frame(description: Description, source: str, read: ReadLo
             remedy = "turn the sensor faster, about more axes, without contact; or give the values"
             raise DrakeTeleopError(what, where=f"{source}:pose.{field}", remedy=remedy)
         changes[field] = tuple(map(tuple, value.tolist()) if value.ndim == 2 else value.tolist())
-        notes.append(_found_note(f"pose.{field}", f", standard deviation {deviation}", value))
+        notes.append(_estimate_note(f"pose.{field}", f", standard deviation {deviation}", value))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 
 
@@ -186,7 +186,7 @@ def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     The delay of `motion_log`, the same log with motion, is estimated and taken into account.
     """
     assert motion_log.gravity is not None
-    at = log.t + delay_of_free_fit(block_means_of_log(motion_log))
+    at = log.t + delay_of_linear_fit(block_means_of_log(motion_log))
     gravity = resample(at.clip(*motion_log.t[[0, -1]]), motion_log.t, motion_log.gravity)
     return replace(log, wrench=log.wrench + wrench_of_weight(weight, gravity))
 
@@ -212,5 +212,5 @@ def estimate_auto_gravity(description: Description, source: str, read: ReadLog) 
         what = "the data do not determine the direction of gravity"
         remedy = "record the load in more orientations, without contact; or give the vector"
         raise DrakeTeleopError(what, where=f"{source}:gravity", remedy=remedy)
-    note = _found_note("gravity", f", standard deviation {deviation:.2g} deg", estimated)
+    note = _estimate_note("gravity", f", standard deviation {deviation:.2g} deg", estimated)
     return description.model_copy(update={"gravity": tuple(round_for_yaml(estimated))}), (note,)

@@ -31,14 +31,14 @@ BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 _MAX_MESSAGE_ARRAY_LENGTH = 64
 _MESSAGES_PER_BLOCK, _RECEPTION_TIME_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
-_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
+_MCAP_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
-_CUT_REMEDY = "cut it, or write the topics one by one"
+_SPLIT_REMEDY = "cut it, or write the topics one by one"
 _VECTOR_OF_MESSAGE_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
 _VECTOR_OF_MESSAGE_FIELD |= dict.fromkeys(("position", "translation"), "position")
-for _name in ("force", "torque", "linear_acceleration", "angular_velocity"):
-    _VECTOR_OF_MESSAGE_FIELD[_name] = _name
+_UNRENAMED_FIELDS = ("force", "torque", "linear_acceleration", "angular_velocity")
+_VECTOR_OF_MESSAGE_FIELD |= {x: x for x in _UNRENAMED_FIELDS}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -175,7 +175,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     except DrakeTeleopError:
         raise
     except MemoryError:
-        raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_CUT_REMEDY) from None
+        raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_SPLIT_REMEDY) from None
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -190,10 +190,10 @@ def _check_unpacked_size(path: Path) -> None:
         file.seek(8)
         while len(head := file.read(33)) == 33:  # head of a record
             length = int.from_bytes(head[1:9], "little")
-            total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK_OPCODE else 0
+            total += int.from_bytes(head[25:33], "little") if head[0] == _MCAP_CHUNK_OPCODE else 0
             file.seek(min(length - 24, limit), 1)
             if total > limit:
-                raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_CUT_REMEDY)
+                raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_SPLIT_REMEDY)
 
 
 @contextmanager

@@ -172,9 +172,8 @@ class LeverArm:
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     """Return the accelerometer's position, Eq. (T21); None for a poor fit or few samples."""
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_pass_log(
-        alignment.remove_delay(log, alignment.estimate_delay(log, None) or 0.0), cutoff
-    )
+    delay_s = alignment.estimate_delay(log, None) or 0.0
+    smooth = low_pass_log(alignment.remove_delay(log, delay_s), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
     if len(t) < NUM_COMPARED_SAMPLES // 10:
@@ -219,10 +218,8 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) True for axes along which the motion K determines a lever arm."""
     alpha = log.angular_acceleration
-    above = alignment.low_pass(alpha, log.dt, 2 * cutoff) - alignment.low_pass(
-        alpha, log.dt, cutoff
-    )
-    noise = above.var(axis=0) / 7
+    wide, narrow = (alignment.low_pass(alpha, log.dt, x) for x in (2 * cutoff, cutoff))
+    noise = (wide - narrow).var(axis=0) / 7
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)
     alone = 1 / np.diag(np.linalg.pinv(information, rcond=1e-12, hermitian=True))
@@ -300,8 +297,8 @@ class Mounting:
         return self.fits_pose and bool((self.deviations_deg < MAX_ROTATION_DEVIATION_DEG).all())
 
 
-def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Estimate rotation, clock and (with `position`) accelerometer position of an IMU.
+def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mounting | None:
+    """Estimate rotation, clock and (with `has_position`) accelerometer position of an IMU.
 
     `pose` is the same log as `imu`, read without the IMU. Lags are within +-1 s. Return None if
     the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
@@ -341,7 +338,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
 
     x, deviations, left = _refine_mounting(t, drift * (t - centre), imu.t, pairs, K, R, middle)
     lever = None
-    if position:
+    if has_position:
         observable = are_lever_arm_axes_observable(K, pose, cutoff)
         lever = LeverArm(x[4:7], np.where(observable, deviations[4:7], np.inf), "pose")
     powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)

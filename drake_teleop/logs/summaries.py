@@ -36,13 +36,13 @@ def summarize_log(
     }
 
 
-def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
-    mass, com, _ = mass_com_inertia(stretch.phi)
-    deviations = np.sqrt(np.diag(stretch.covariance))[6:]
-    com_std = identification.com_standard_deviations(stretch.phi, stretch.covariance)
+def summarize_record_part(part: RecordPartWithLoad) -> dict[str, Any]:
+    mass, com, _ = mass_com_inertia(part.phi)
+    deviations = np.sqrt(np.diag(part.covariance))[6:]
+    com_std = identification.com_standard_deviations(part.phi, part.covariance)
     load = {"mass": mass, "mass_std": deviations[0], "com": com, "com_std": com_std}
-    load |= {"phi": stretch.phi, "phi_std": deviations}
-    return {"start_s": stretch.start_s, "stop_s": stretch.stop_s, **load}
+    load |= {"phi": part.phi, "phi_std": deviations}
+    return {"start_s": part.start_s, "stop_s": part.stop_s, **load}
 
 
 def summarize_load(load: Identification) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def summarize_load(load: Identification) -> dict[str, Any]:
     }
 
 
-def summarize_object_alone(alone: Identification) -> dict[str, Any]:
+def summarize_grasped_object(alone: Identification) -> dict[str, Any]:
     margin, deviation = identification.consistency_margin(alone)
     figures = summarize_load(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -71,7 +71,7 @@ def summarize_object_alone(alone: Identification) -> dict[str, Any]:
     return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
 
 
-def notes_on_object_alone(alone: Identification) -> list[str]:
+def notes_on_grasped_object(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
     if alone.mass < identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
