@@ -89,7 +89,7 @@ class SimulationResult:
     ) -> None:
         self._t = _read_only_view(float_array("t", t))
         self._specs = {spec.name: spec for spec in specs}
-        self._columns = {c: (spec.name, i) for spec in specs for i, c in enumerate(spec.columns)}
+        self._columns = {c: (s.name, i) for s in self.specs for i, c in enumerate(s.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             what = f"only one of `signals` and `specs` contains {', '.join(odd)}"
