@@ -270,7 +270,7 @@ class SimulationResult:
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(*_curve_extremes(self._t, values[:, index]), label=components[index])
+                    axes.plot(*_block_extremes(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -329,7 +329,7 @@ class _SignalsOnDisk(dict[str, Any]):
             return _read_only_view(_read_columns(self._path, columns))
 
 
-def _curve_extremes(t: Array, values: Array) -> tuple[Array, Array]:
+def _block_extremes(t: Array, values: Array) -> tuple[Array, Array]:
     length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values

@@ -117,7 +117,7 @@ class LogOnDisk:
     Args:
         folder: folder of the log; an old log is replaced.
         start: simulation time that becomes t = 0 [s].
-        form: function that converts each part before it is written.
+        convert: function that converts each part before it is written.
     """
 
     def __init__(
@@ -125,10 +125,10 @@ class LogOnDisk:
         folder: Path,
         simulator: Simulator,
         start: float,
-        form: Callable[[SimulationResult], SimulationResult] = lambda rows: rows,
+        convert: Callable[[SimulationResult], SimulationResult] = lambda rows: rows,
     ) -> None:
         remove_log(folder)
-        self._folder, self._start, self._rows, self._form = folder, start, 0, form
+        self._folder, self._start, self._rows, self._convert = folder, start, 0, convert
         self.switch_simulator(simulator)
 
     def switch_simulator(self, simulator: Simulator) -> None:
@@ -147,7 +147,7 @@ class LogOnDisk:
 
     def write_and_keep_rows(self) -> int:
         """Write the rows in memory; a later part replaces them; return their number."""
-        part = self._form(read_recorded_signals(self._simulator, self._start))
+        part = self._convert(read_recorded_signals(self._simulator, self._start))
         self._write_part(part)
         return len(part.t)
 

@@ -289,14 +289,14 @@ def receive_packet(p, state, k, packet):
 
 
 @njit(cache=True)
-def _apply_silence_policy(policy, silent, packet):
+def _apply_silence_policy(policy, silence_s, packet):
     velocity, pose = packet[fields.VELOCITY], packet[fields.POSE]
     if policy == _SILENCE_POLICY_ZERO:
         velocity[:] = 0.0
         packet[fields.WRENCH] = packet[fields.PACKET_LOAD_WRENCH] = 0.0
     elif policy == _SILENCE_POLICY_EXTRAPOLATE and has_packet_arrived(packet):
-        move_pose_into(pose, velocity * min(silent, MAX_POSE_EXTRAPOLATION_S), pose)
-        if silent > MAX_POSE_EXTRAPOLATION_S:
+        move_pose_into(pose, velocity * min(silence_s, MAX_POSE_EXTRAPOLATION_S), pose)
+        if silence_s > MAX_POSE_EXTRAPOLATION_S:
             velocity[:] = 0.0
 
 

@@ -167,7 +167,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _store_hand_step_beyond_deadband(dx, p, memory):
-    """Write the hand's displacement beyond the lost motion into memory (docs/theory.md, M2)."""
+    """Write the hand's displacement beyond the dead band into memory (docs/theory.md, M2)."""
     lost, steady = memory[_HAND_MOTION_IN_DEADBAND], memory[_HAND_STEP_BEYOND_DEADBAND]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
