@@ -174,7 +174,7 @@ def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             burst=case["burst"],
         )
         p = network.network_parameters(line, case["seed"], way, PERIOD)
-        travel = network.packet_delays(p, STEPS)[:, 0]
+        travel = network.packet_delay_steps(p, STEPS)[:, 0]
         lost = travel < 0
         turns = TIME / case["delay_pace"]
         later = {

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +19,15 @@ pytestmark = pytest.mark.checks
 @pytest.mark.parametrize("name", drake_teleop.__all__)
 def test_every_name_is_there(name):
     assert getattr(drake_teleop, name) is not None
+
+
+def test_names_with_their_module_in_the_docs_exist():
+    root = Path(__file__).parents[1]
+    texts = [path.read_text() for path in (root / "README.md", *root.glob("docs/*.md"))]
+    names = set(re.findall(r"\bdrake_teleop(?:\.[A-Za-z_]\w*)+", "\n".join(texts)))
+    assert len(names) > 40
+    for name in names:
+        pkgutil.resolve_name(name)
 
 
 def test_dir_is_the_curated_list():

@@ -58,6 +58,13 @@ def test_a_column_of_the_data_frame_is_found_by_its_name(tmp_path):
         result["measured_wrench_S.taux"]
 
 
+def test_column_of_a_replaced_spec_is_not_found():
+    specs = [Signal("force", ("x",), "N"), Signal("force", ("y",), "N")]
+    result = SimulationResult([0.0], {"force": [[1.0]]}, specs)
+    assert result["force.y"] == [1.0]
+    assert "force.x" not in result
+
+
 def test_a_notebook_completes_signals_and_columns():
     offered = make_result()._ipython_key_completions_()
     assert {"t", "sigma", "measured_wrench_S", "measured_wrench_S.tau_x"} <= set(offered)

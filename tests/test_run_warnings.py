@@ -23,7 +23,7 @@ from drake_teleop.station.master.phantom import (
 )
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.oscillation import (
-    find_chatter,
+    find_contact_chatter,
     flag_unexplained_oscillation,
     reversal_indices,
 )
@@ -351,7 +351,7 @@ def touching(rate_hz, start, stop, peak=20.0, rest=0.0):
 @pytest.mark.parametrize("rest", [0.0, 1.5])
 def test_chatter_is_reported_with_rate_force_and_time(rate_hz, rest):
     stop = 0.5 + max(9 / rate_hz, 0.4)
-    (found,) = find_chatter(T, touching(rate_hz, 0.5, stop, rest=rest), np.empty(0))
+    (found,) = find_contact_chatter(T, touching(rate_hz, 0.5, stop, rest=rest), np.empty(0))
     assert found.rate_hz == pytest.approx(rate_hz, rel=0.02)
     assert found.peak_force == pytest.approx(20.0, rel=0.02)
     assert found.num_touches == pytest.approx((stop - 0.5) * rate_hz, abs=1.1)
@@ -372,7 +372,7 @@ def test_chatter_is_reported_with_rate_force_and_time(rate_hz, rest):
     ],
 )
 def test_slow_short_shallow_or_weak_touches_are_no_chatter(force):
-    assert find_chatter(T, force, np.empty(0)) == []
+    assert find_contact_chatter(T, force, np.empty(0)) == []
 
 
 def test_touches_that_the_operator_intends_are_no_chatter():

@@ -39,7 +39,7 @@ from drake_teleop.live.station_swap import copy_station_state
 from drake_teleop.station import simulation
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.signals import LOG_BLOCK_NAME, SIGNALS, signal_of
+from drake_teleop.station.signals import LOG_BLOCK_NAME, SIGNALS, signal_with_size
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 #: Rows in a part of a log on disk, two seconds. Copying a longer part would delay a slice; each
@@ -94,7 +94,7 @@ def add_missing_signals(log: SimulationResult) -> SimulationResult:
     values = missing | {name: log[name] for name in log.signals}
     order = [name for name in SIGNALS if name in values]
     order += [name for name in values if name not in SIGNALS]
-    specs = [signal_of(name, values[name].shape[-1]) for name in order]
+    specs = [signal_with_size(name, values[name].shape[-1]) for name in order]
     return SimulationResult(log.t, {name: values[name] for name in order}, specs)
 
 

@@ -52,8 +52,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         return builder.Build()
     scaling = scenario.kinematic_scaling
     R_WB, scales = scaling.R_WB, scaling.scales
-    passivity, start = _passivity_with_arm_and_device(scenario), start_pose(scenario.slave)
-    gain, period = _rendered_over_contact_force(scenario), 1 / scenario.rates.hand_hz
+    passivity, start = _passivity_config_for_arm_and_device(scenario), start_pose(scenario.slave)
+    gain, period = _rendered_force_per_contact_force(scenario), 1 / scenario.rates.hand_hz
     seed = scenario.simulation.seed
     block = TeleopChannel(scenario.channel, passivity, R_WB, scales, gain, start, period, seed)
     channel = builder.AddNamedSystem("channel", block)
@@ -68,8 +68,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _passivity_with_arm_and_device(scenario: Scenario) -> PassivityConfig:
-    passivity, device = passivity_with_arm_mass(scenario), scenario.master.device(0.0, 0.0)
+def _passivity_config_for_arm_and_device(scenario: Scenario) -> PassivityConfig:
+    passivity, device = passivity_config_with_arm_mass(scenario), scenario.master.device(0.0, 0.0)
     ledger = passivity.ledger
     if ledger.encoder_step is None:
         steps = scenario.master.encoder_steps()
@@ -82,7 +82,7 @@ def _passivity_with_arm_and_device(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
+def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     """Return the scenario's passivity settings, with mass and servo of the arm if needed.
 
     An arm with fewer than six joints, whose mass is then unbounded, raises a DrakeTeleopError.
@@ -107,10 +107,10 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def slave_wrench_power_scale(scenario: Scenario) -> Array:
     """Return factors (2,) from the slave's wrench to the master's power units: force, torque."""
     scales = scenario.kinematic_scaling.scales
-    return _rendered_over_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
+    return _rendered_force_per_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
-def _rendered_over_contact_force(scenario: Scenario) -> float:
+def _rendered_force_per_contact_force(scenario: Scenario) -> float:
     """Return force scale times gamma, the rendered share of contact; gamma 0 counts as 1."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

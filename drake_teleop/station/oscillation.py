@@ -24,7 +24,7 @@ MAX_FORCE_RIPPLE_RMS_AT_REST_N = 0.05
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_OSCILLATION_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 # A touch begins where the force exceeds this share of the largest force within the time around it.
-_TOUCH_SHARE_OF_PEAK_FORCE, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
+_MIN_TOUCH_FORCE_SHARE_OF_PEAK, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
 # Smallest time between two touches [s]; closer ones are bounces of one touch-down.
 _MIN_TOUCH_INTERVAL_S = 0.005
 # Largest time between two touches of a series [s]: 5 Hz.
@@ -35,8 +35,8 @@ _MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.
 _MAX_TOUCH_TO_REVERSAL_S = 0.1
 
 
-def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
-    """Return indices of maxima and minima of x (N,); successive ones differ by > `swing`."""
+def reversal_indices(x: Array, min_swing: float) -> NDArray[np.intp]:
+    """Return indices of maxima and minima of x (N,); successive ones differ by > `min_swing`."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
@@ -44,10 +44,10 @@ def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
     rising = 0  # 0: unknown
     for k in [*near, len(x) - 1]:
         high, low = (k if x[k] > x[high] else high), (k if x[k] < x[low] else low)
-        if rising >= 0 and x[high] - x[k] > swing:
+        if rising >= 0 and x[high] - x[k] > min_swing:
             found += [high] if rising else []
             rising, high, low = -1, k, k
-        elif rising <= 0 and x[k] - x[low] > swing:
+        elif rising <= 0 and x[k] - x[low] > min_swing:
             found += [low] if rising else []
             rising, high, low = 1, k, k
     return np.array(found, dtype=np.intp)
@@ -68,7 +68,7 @@ def flag_unexplained_oscillation(
     commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_explained_times(t[reversal_indices(x, swing)], commanded, window)
+        times = remove_times_near_causes(t[reversal_indices(x, swing)], commanded, window)
         for series in split_times_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_OSCILLATION_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
@@ -103,7 +103,7 @@ def doubled_quaternions(pose: Array, reference: Array) -> Array:
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_explained_times(times: Array, causes: Array, window: float) -> Array:
+def remove_times_near_causes(times: Array, causes: Array, window: float) -> Array:
     """Remove, for each cause, the nearest event within `window` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
@@ -112,9 +112,9 @@ def remove_explained_times(times: Array, causes: Array, window: float) -> Array:
     return times
 
 
-def split_times_at_gaps(times: Array, longest: float) -> list[Array]:
-    """Split sorted times [s] where two are more than `longest` [s] apart."""
-    return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
+def split_times_at_gaps(times: Array, max_gap: float) -> list[Array]:
+    """Split sorted times [s] where two are more than `max_gap` [s] apart."""
+    return np.split(times, np.flatnonzero(np.diff(times) > max_gap) + 1)
 
 
 def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
@@ -135,7 +135,7 @@ def dominant_frequency(t: Array, signal: Array) -> tuple[float, float]:
     return frequency, float(power[near].sum() / power.sum())
 
 
-class Chatter(NamedTuple):
+class ContactChatter(NamedTuple):
     """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
 
     num_touches: int
@@ -145,7 +145,7 @@ class Chatter(NamedTuple):
     stop: float
 
 
-def find_chatter(t: Array, force: Array, command_reversals: Array) -> list[Chatter]:
+def find_contact_chatter(t: Array, force: Array, command_reversals: Array) -> list[ContactChatter]:
     """Return each long series of touches, without touches explained by reversals of the command.
 
     A series has 8 or more touches, at most 0.2 s apart, lasts 0.3 s or longer and reaches 0.5 N.
@@ -156,7 +156,7 @@ def find_chatter(t: Array, force: Array, command_reversals: Array) -> list[Chatt
         command_reversals: times of the command's reversals [s].
     """
     touches = _find_touches(t, force)
-    touches = remove_explained_times(touches, command_reversals, _MAX_TOUCH_TO_REVERSAL_S)
+    touches = remove_times_near_causes(touches, command_reversals, _MAX_TOUCH_TO_REVERSAL_S)
     found = []
     for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:
@@ -165,7 +165,7 @@ def find_chatter(t: Array, force: Array, command_reversals: Array) -> list[Chatt
         peak = float(force[(t >= start) & (t <= stop)].max())
         if peak >= _MIN_CHATTER_FORCE_N:
             rate = (len(series) - 1) / (stop - start)
-            found.append(Chatter(len(series), rate, peak, start, stop))
+            found.append(ContactChatter(len(series), rate, peak, start, stop))
     return found
 
 
@@ -173,6 +173,6 @@ def _find_touches(t: Array, force: Array) -> Array:
     if len(t) < 2:
         return np.empty(0)
     rows = 2 * round(_PEAK_FORCE_WINDOW_S / (t[1] - t[0])) + 1
-    least = _TOUCH_SHARE_OF_PEAK_FORCE * maximum_filter1d(force, rows)[1:]
+    least = _MIN_TOUCH_FORCE_SHARE_OF_PEAK * maximum_filter1d(force, rows)[1:]
     starts = t[1:][(force[1:] > least) & (force[:-1] <= least)]
     return starts[np.diff(starts, prepend=-np.inf) >= _MIN_TOUCH_INTERVAL_S]

@@ -35,7 +35,7 @@ from drake_teleop.station.slave.plant import (
 )
 
 Signals = Mapping[str, Array]
-_Device = tuple[ModelInstanceIndex, Callable[[Array], Array], Frame, Array]
+_ReplayDevice = tuple[ModelInstanceIndex, Callable[[Array], Array], Frame, Array]
 """Haptic device in the plant: instance, function from logged joint positions to the plant's, frame
 of the stylus, and the point (3,) [m] in it that the hand holds."""
 
@@ -267,7 +267,7 @@ class ReplayScene:
         self.plant.SetPositions(self.context, q)
 
 
-def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _Device:
+def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if (leader := scenario.master.leader) is not None:
         order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
         on_table = RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M])

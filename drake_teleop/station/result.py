@@ -89,7 +89,7 @@ class SimulationResult:
     ) -> None:
         self._t = _read_only_view(float_array("t", t))
         self._specs = {spec.name: spec for spec in specs}
-        self._columns = {c: (spec.name, i) for spec in specs for i, c in enumerate(spec.columns)}
+        self._columns = {c: (s.name, i) for s in self.specs for i, c in enumerate(s.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             what = f"only one of `signals` and `specs` contains {', '.join(odd)}"
@@ -270,7 +270,7 @@ class SimulationResult:
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(*_curve_extremes(self._t, values[:, index]), label=components[index])
+                    axes.plot(*_block_extremes(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -329,7 +329,7 @@ class _SignalsOnDisk(dict[str, Any]):
             return _read_only_view(_read_columns(self._path, columns))
 
 
-def _curve_extremes(t: Array, values: Array) -> tuple[Array, Array]:
+def _block_extremes(t: Array, values: Array) -> tuple[Array, Array]:
     length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values

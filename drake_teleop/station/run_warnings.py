@@ -12,9 +12,8 @@ from scipy.ndimage import uniform_filter1d
 from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
-from drake_teleop.station import oscillation
+from drake_teleop.station import channel_side, oscillation
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import doubled_quaternions, flag_pose_oscillation
@@ -46,7 +45,7 @@ _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude of a joint.
 _MIN_JOINT_OSCILLATION_RAD = np.deg2rad(0.1)
 # Number of time constants of the position loop until the error is 0.3 %.
-_NUM_POSITION_LOOP_TIME_CONSTANTS = 6.0
+_SETTLING_TIME_CONSTANTS_OF_POSITION_LOOP = 6.0
 # Time in which an intent at rest moves by less than a distance.
 _MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
@@ -77,13 +76,13 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     return [*overlaps, *texts]
 
 
-def find_spans(t: Array, happened: Flags, min_duration: float = 0.0) -> Spans:
-    """Return the time spans (start, stop) [s] during which `happened` (N,) is true.
+def find_spans(t: Array, flags: Flags, min_duration: float = 0.0) -> Spans:
+    """Return the time spans (start, stop) [s] during which `flags` (N,) is true.
 
     Gaps below 50 ms are closed; then spans shorter than `min_duration` [s] are dropped.
     """
     spans: Spans = []
-    for start, stop in contact_spans(t, happened):
+    for start, stop in contact_spans(t, flags):
         if spans and start - spans[-1][1] < _MAX_CLOSED_SPAN_GAP_S:
             start = spans.pop()[0]
         spans.append((start, stop))
@@ -97,8 +96,8 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
     times [s], `command` and `actual` are (N, k).
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
-    above = actual - _maximum_of_last_rows(command, rows)
-    below = -_maximum_of_last_rows(-command, rows) - actual
+    above = actual - _trailing_maximum(command, rows)
+    below = -_trailing_maximum(-command, rows) - actual
     return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
 
 
@@ -194,8 +193,8 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
-    limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
+    mass = np.array(channel_side.passivity_config_with_arm_mass(scenario).slave_mass)
+    limit = speed_limit(config, mass * channel_side.slave_wrench_power_scale(scenario))
     forward, period = scenario.channel.networks_of_directions()[0], 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     newest = newest_packets(forward, scenario.simulation.seed, FORWARD, step[-1] + 1, period)
@@ -206,7 +205,7 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
         far = lag_beyond_delay(t, asked, actual, _LEDGER_COMMAND_SETTLING_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
-        speed = _maximum_of_last_rows(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
+        speed = _trailing_maximum(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
         if held.sum() * row < _MIN_WARNING_SPAN_S:
             continue
@@ -243,7 +242,7 @@ def _check_joints(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = _NUM_POSITION_LOOP_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+    window = _SETTLING_TIME_CONSTANTS_OF_POSITION_LOOP * scenario.joint_control.tracking_delay_s
     window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
@@ -275,7 +274,7 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
     reversals = np.empty(0)
     if command := next((name for name in ("intent", "pose_command") if name in result), ""):
         reversals = oscillation.pose_reversal_times(result.t, result[command])
-    if found := oscillation.find_chatter(result.t, force, reversals):
+    if found := oscillation.find_contact_chatter(result.t, force, reversals):
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
             f"contact chatter of the tool: {sum(each.num_touches for each in found)} touches at"
@@ -292,7 +291,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     t, intent = result.t, result["intent"][:, 4:]
     force = oscillation.high_pass_above_5_hz(t, result["force_to_master"][:, :3])
     rows = round(_MIN_INTENT_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
-    largest, least = _maximum_of_last_rows(intent, rows), -_maximum_of_last_rows(-intent, rows)
+    largest, least = _trailing_maximum(intent, rows), -_trailing_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
@@ -328,10 +327,10 @@ def _is_torque_at_limit(torque: Array, master_state: Array, device: HapticDevice
     return full
 
 
-def _maximum_of_last_rows(x: Array, rows: int) -> Array:
+def _trailing_maximum(x: Array, num_rows: int) -> Array:
     largest, done = x.copy(), 1
-    while done < min(rows, len(x)):
-        step = min(done, rows - done)
+    while done < min(num_rows, len(x)):
+        step = min(done, num_rows - done)
         largest[step:] = np.maximum(largest[step:], largest[:-step])
         done += step
     return largest

@@ -29,12 +29,12 @@ _CHANNEL_PORT_COMPONENTS = (
 )
 
 
-def _signals_of_arm(joints: int) -> dict[str, Signal]:
-    numbers = range(1, joints + 1)
+def _signals_for_joints(num_joints: int) -> dict[str, Signal]:
+    numbers = range(1, num_joints + 1)
     names = " ".join(f"joint_{i}" for i in numbers)
     angles, torques = (names, "rad"), (names, "N m")
     state_names = " ".join(f"{letter}_{i}" for letter in "qv" for i in numbers)
-    state = (state_names, ",".join(joints * ["rad"] + joints * ["rad/s"]))
+    state = (state_names, ",".join(num_joints * ["rad"] + num_joints * ["rad/s"]))
     rows = (
         ("measured_wrench_S", _WRENCH_COMPONENTS, "sensor's wrench, Eq. (1), at sample_time"),
         ("specific_force_S", ("s_x s_y s_z", "m/s^2"), "a - g at So, at sample_time"),
@@ -82,14 +82,14 @@ def _signals_of_arm(joints: int) -> dict[str, Signal]:
 
 
 #: All signals in the order of the log, for an arm with six joints.
-SIGNALS = _signals_of_arm(6)
+SIGNALS = _signals_for_joints(6)
 
 
-def signal_of(name: str, size: int) -> Signal:
+def signal_with_size(name: str, size: int) -> Signal:
     """Return the description of a signal with `size` components, for any number of joints."""
     if name.startswith(MOVING_BODY_POSE_PREFIX):
         body = name.removeprefix(MOVING_BODY_POSE_PREFIX)
         return _signal(name, *_POSE_COMPONENTS, f"where the body {body} is, in W, at t")
     if size == len(SIGNALS[name].components):
         return SIGNALS[name]
-    return _signals_of_arm(size // 2 if name in ("slave_state", "master_state") else size)[name]
+    return _signals_for_joints(size // 2 if name in ("slave_state", "master_state") else size)[name]

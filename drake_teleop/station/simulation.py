@@ -19,7 +19,7 @@ from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.station.operator.decision import OUTCOME_INDEX
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
-from drake_teleop.station.signals import LOG_BLOCK_NAME, signal_of
+from drake_teleop.station.signals import LOG_BLOCK_NAME, signal_with_size
 
 # Interval of progress updates [ms].
 _PROGRESS_INTERVAL_MS = 20
@@ -90,13 +90,13 @@ def simulate(
     return read_recorded_signals(simulator, simulation.settle)
 
 
-def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
+def _raise_recorded_fault(simulator: Simulator, start: float, num_checked_rows: int) -> int:
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     for name, column in log_slices_of_signals(station).items():
         if name not in ("fault", "fault_at_hand"):
             continue
-        for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
+        for k in np.flatnonzero(log.data()[column][0, num_checked_rows:])[:1] + num_checked_rows:
             what = FAULT_WARNINGS[Fault(int(log.data()[column][0, k]))]
             what = f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}"
             remedy = "set it to continue, and the run goes on in its safe state"
@@ -117,7 +117,7 @@ class LogOnDisk:
     Args:
         folder: folder of the log; an old log is replaced.
         start: simulation time that becomes t = 0 [s].
-        form: function that converts each part before it is written.
+        convert: function that converts each part before it is written.
     """
 
     def __init__(
@@ -125,10 +125,10 @@ class LogOnDisk:
         folder: Path,
         simulator: Simulator,
         start: float,
-        form: Callable[[SimulationResult], SimulationResult] = lambda rows: rows,
+        convert: Callable[[SimulationResult], SimulationResult] = lambda rows: rows,
     ) -> None:
         remove_log(folder)
-        self._folder, self._start, self._rows, self._form = folder, start, 0, form
+        self._folder, self._start, self._rows, self._convert = folder, start, 0, convert
         self.switch_simulator(simulator)
 
     def switch_simulator(self, simulator: Simulator) -> None:
@@ -147,7 +147,7 @@ class LogOnDisk:
 
     def write_and_keep_rows(self) -> int:
         """Write the rows in memory; a later part replaces them; return their number."""
-        part = self._form(read_recorded_signals(self._simulator, self._start))
+        part = self._convert(read_recorded_signals(self._simulator, self._start))
         self._write_part(part)
         return len(part.t)
 
@@ -187,5 +187,5 @@ def read_recorded_signals(simulator: Simulator, start: float) -> SimulationResul
     signals = {name: data[:, column] for name, column in log_slices_of_signals(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
-    specs = [signal_of(name, values.shape[1]) for name, values in signals.items()]
+    specs = [signal_with_size(name, values.shape[1]) for name, values in signals.items()]
     return SimulationResult(t[kept], signals, specs)

@@ -129,20 +129,20 @@ def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.boo
     return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
 
 
-def _contact_forces_during_hold(t: Array, force: Array, task: Press, ended: int) -> Array:
-    return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
+def _contact_forces_during_hold(t: Array, force: Array, task: Press, row: int) -> Array:
+    return force[: row + 1][t[: row + 1] >= t[row] - task.hold]
 
 
-def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
+def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, row: int) -> str:
     force = true_contact_force_magnitudes(result)
     if isinstance(task, Press):
-        held = float(_contact_forces_during_hold(result.t, force, task, ended).mean())
+        held = float(_contact_forces_during_hold(result.t, force, task, row).mean())
         if abs(held - task.force) <= task.tolerance:
             return ""
         return f"the tool pressed with {held:.2f} N, not {task.force:g} ± {task.tolerance:g} N"
-    if isinstance(task, Touch) and force[ended] > 0.0:
+    if isinstance(task, Touch) and force[row] > 0.0:
         return ""
-    off = _tip_from_target(result, scenario, task, ended)
+    off = _tip_error_W(result, scenario, task, row)
     if isinstance(task, Insert):
         above = off[2] + task.depth
         wrong = f"the tip is {1e3 * above:.1f} mm above the floor"
@@ -156,21 +156,21 @@ def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, 
 
 
 def _force_and_position_text(
-    result: SimulationResult, scenario: Scenario, task: Task, ended: int
+    result: SimulationResult, scenario: Scenario, task: Task, row: int
 ) -> str:
-    away = 1e3 * np.linalg.norm(_tip_from_target(result, scenario, task, ended))
+    away = 1e3 * np.linalg.norm(_tip_error_W(result, scenario, task, row))
     place = f"the tip {away:.1f} mm from the target"
     if isinstance(task, Reach):
         return place
-    required, force = _required_contact_force(task), true_contact_force_magnitudes(result)[ended]
+    required, force = _required_contact_force(task), true_contact_force_magnitudes(result)[row]
     instead = f" instead of {required:g} N" if required else ""
     return f"{place}, {force:.1f} N at the tool{instead}"
 
 
-def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
+def _tip_error_W(result: SimulationResult, scenario: Scenario, task: Task, row: int) -> Array:
     slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-    joints = result["slave_state"][ended, : slave.arm.num_joints]
+    joints = result["slave_state"][row, : slave.arm.num_joints]
     forward_kinematics(slave.arm.table, joints, R_WS, p_WS)
     off: Array = p_WS + R_WS @ slave.tip - slave.start_tip - np.array(task.translation)
     return off

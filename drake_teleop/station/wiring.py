@@ -26,25 +26,25 @@ def export_outputs(builder: DiagramBuilder, block: System, *names: str, **rename
 
 
 def connect_ports(
-    builder: DiagramBuilder, source: System, name: str, target: System, entry: str
+    builder: DiagramBuilder, source: System, output_name: str, target: System, input_name: str
 ) -> None:
-    """Connect output port `name` of the source to input port `entry` of the target.
+    """Connect output port `output_name` of the source to input port `input_name` of the target.
 
     A DrakeTeleopError is raised if a port is missing or the sizes differ.
     """
     remedy = "docs/station.md lists the ports that each side has"
     for has_port, port_text, block in (
-        (source.HasOutputPort(name), f"output port '{name}'", source),
-        (target.HasInputPort(entry), f"input port '{entry}'", target),
+        (source.HasOutputPort(output_name), f"output port '{output_name}'", source),
+        (target.HasInputPort(input_name), f"input port '{input_name}'", target),
     ):
         if not has_port:
             what = f"the block has no {port_text}"
             raise DrakeTeleopError(what, where=block.get_name(), remedy=remedy)
-    output, port = source.GetOutputPort(name), target.GetInputPort(entry)
+    output, port = source.GetOutputPort(output_name), target.GetInputPort(input_name)
     if output.size() != port.size():
         raise DrakeTeleopError(
-            f"its output port '{name}' has {output.size()} numbers, but input port '{entry}' of "
-            f"{target.get_name()} expects {port.size()}",
+            f"its output port '{output_name}' has {output.size()} numbers, but input port"
+            f" '{input_name}' of {target.get_name()} expects {port.size()}",
             where=source.get_name(),
             remedy=remedy,
         )

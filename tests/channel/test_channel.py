@@ -13,7 +13,7 @@ from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, s
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.channel_side import (
     MakeChannel,
-    _passivity_with_arm_and_device,
+    _passivity_config_for_arm_and_device,
     slave_wrench_power_scale,
 )
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
@@ -44,7 +44,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.parameters.peak_force, min(device.parameters.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _passivity_with_arm_and_device(replace(scenario, passivity=own))
+    limited = _passivity_config_for_arm_and_device(replace(scenario, passivity=own))
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
@@ -56,12 +56,12 @@ def test_ledger_has_the_encoder_steps_of_the_device():
     steps = {}
     for model in ("phantom_premium_15", "omega_6", "geomagic_touch"):
         scenario.master.model = model
-        steps[model] = _passivity_with_arm_and_device(scenario).ledger.encoder_step
+        steps[model] = _passivity_config_for_arm_and_device(scenario).ledger.encoder_step
     assert steps["phantom_premium_15"] == [0.0, 0.0]
     np.testing.assert_allclose(steps["omega_6"], [1e-5, np.radians(0.09)])
     assert steps["geomagic_touch"][0] == pytest.approx(5.5e-5, rel=0.02)
     scenario.passivity = PassivityConfig(ledger=LedgerConfig(encoder_step=[2e-4, 1e-3]))
-    assert _passivity_with_arm_and_device(scenario).ledger.encoder_step == [2e-4, 1e-3]
+    assert _passivity_config_for_arm_and_device(scenario).ledger.encoder_step == [2e-4, 1e-3]
 
 
 @pytest.mark.parametrize(("gamma", "rendered"), [(0.5, 0.05), (0.0, 0.1)])

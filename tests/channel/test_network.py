@@ -46,7 +46,7 @@ ROUGH = NetworkConfig(
 
 
 def packet_delays(config, seed, direction, steps, period):
-    return network.packet_delays(network_parameters(config, seed, direction, period), steps)
+    return network.packet_delay_steps(network_parameters(config, seed, direction, period), steps)
 
 
 def share(high: float = 1.0) -> st.SearchStrategy[float]:

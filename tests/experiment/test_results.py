@@ -26,7 +26,7 @@ from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.signals import signal_of
+from drake_teleop.station.signals import signal_with_size
 
 CONTACT = "threshold of contact [N at the tool]"
 
@@ -64,7 +64,7 @@ def test_simulated_insertion_averages_the_contact_force_over_20_ms_as_for_people
     base, contact = LoadScenario("insert"), np.zeros((200, 6))
     contact[100, 2], contact[:, 1] = 90.0, 3.0
     signals = {"true_contact_wrench_W": contact, "force_to_master": np.zeros((200, 6))}
-    specs = [signal_of(name, 6) for name in signals]
+    specs = [signal_with_size(name, 6) for name in signals]
     result = SimulationResult(1e-3 * np.arange(200), signals, specs)
     for name, value in (
         ("MakeTeleopStation", None),

@@ -24,10 +24,10 @@ from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_DIRECTION,
     ENCODER_STEP,
     FILTERED_OWN_VELOCITY,
-    IN_CONTACT,
+    IN_CONTACT_FLAG,
     PACKET_CONTACT_STIFFNESS,
     PACKET_LEDGER_LEVEL,
-    ROUND_TRIP,
+    PACKET_ROUND_TRIP,
     _is_wall_removed,
     update_contact_direction,
     wrench_component_along,
@@ -73,7 +73,7 @@ class Hand:
         self.memory[STORED_ENERGY] = 0.2  # more than it uses, and below its limit in contact
         self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
         self.packet[POSE], self.packet[WRENCH] = START, wrench
-        self.packet[PACKET_CONTACT_STIFFNESS], self.packet[ROUND_TRIP] = stiffness / 1.1, 0.1
+        self.packet[PACKET_CONTACT_STIFFNESS], self.packet[PACKET_ROUND_TRIP] = stiffness / 1.1, 0.1
 
     def step(self, dx: np.ndarray | None = None) -> np.ndarray:
         """Move by dx (6,), translation and small rotation; return the rendered wrench."""
@@ -131,7 +131,7 @@ def test_friction_follows_the_hand_and_equals_the_measurement_at_rest():
 def test_friction_under_a_resting_hand_follows_the_measured_one_with_its_lag():
     """The model of the hand's stick acts at once; a constant packet replaces it within 2 s."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[ROUND_TRIP] = 0.6
+    hand.packet[PACKET_ROUND_TRIP] = 0.6
     hand.rest(1500)
     hand.packet[WRENCH][1] = -0.6
     for _ in range(20):
@@ -146,7 +146,7 @@ def test_friction_under_a_resting_hand_follows_the_measured_one_with_its_lag():
 def test_rendered_wrench_is_the_measured_one_after_a_rotation_of_the_direction(way):
     """Friction tilts the first contact by 22 degrees, then it is gone."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[ROUND_TRIP] = 0.6
+    hand.packet[PACKET_ROUND_TRIP] = 0.6
     hand.rest(1500)
     hand.packet[WRENCH][1] = 0.0
     for _ in range(20):
@@ -177,7 +177,7 @@ def test_brake_of_an_accelerated_hand_fades_with_its_speed():
 def test_friction_force_along_the_contact_is_removed(turns):
     """Contact 40 mm off, then on the other side; without it 2.6 and 3.4 N of 3 were rendered."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.12, 0.0, 0.0]), 200.0)
-    hand.packet[ROUND_TRIP] = 0.6
+    hand.packet[PACKET_ROUND_TRIP] = 0.6
     hand.rest(1500)
     hand.packet[WRENCH][:4] = [0.0, 0.0, 3.0, -0.12]
     for _ in range(20):
@@ -236,7 +236,7 @@ def test_friction_stays_across_the_direction_as_it_turns():
 def test_torque_across_the_contact_is_a_stiffer_spring_with_a_longer_lag(round_trip, lag):
     """A tip 0.2 m from So: 2500 N/m there are 100 N m/rad. The direction rotates within 3 s."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[ROUND_TRIP] = round_trip
+    hand.packet[PACKET_ROUND_TRIP] = round_trip
     hand.rest(1500)
     hand.packet[WRENCH][5] = 0.05
     rendered = hand.rest(300)[5]
@@ -480,7 +480,8 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
             step_addresses("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory,
             command, packet,
         )  # fmt: skip
-        hand.packet[WRENCH], hand.packet[ROUND_TRIP] = packet[WRENCH], packet[ROUND_TRIP]
+        for part in (WRENCH, PACKET_ROUND_TRIP):
+            hand.packet[part] = packet[part]
         felt.append(hand.step()[2])
     assert felt[1999] == pytest.approx(4.0, abs=0.05)
     assert np.ptp(felt[1990:2500]) < 0.06
@@ -498,7 +499,7 @@ def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
         wrench = contact / 17.5 / np.repeat(motion, 3)
         size = update_contact_direction(wrench, 0.01, 1e-3, p, memory)
         sizes.append(size * motion[0])
-        memory[IN_CONTACT] = 1.0
+        memory[IN_CONTACT_FLAG] = 1.0
         turned = wrench * np.repeat([-1.0, 0.5], 3)
         assert update_contact_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
         assert wrench_component_along(memory[CONTACT_DIRECTION], wrench, p) < 0.0
@@ -528,7 +529,7 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
         )  # fmt: skip
         np.testing.assert_allclose(packet[WRENCH], contact, atol=1e-15)
         np.testing.assert_allclose(packet[PACKET_LOAD_WRENCH], load, atol=0.15)
-        assert k > 400 or not memory[IN_CONTACT], "nothing is touched yet"
+        assert k > 400 or not memory[IN_CONTACT_FLAG], "nothing is touched yet"
     np.testing.assert_allclose(
         memory[CONTACT_DIRECTION], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12
     )

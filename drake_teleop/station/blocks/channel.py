@@ -17,7 +17,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_LOAD_WRENCH, PACKET_SIZE
 from drake_teleop.station.stepped_block import SteppedBlock
 
-_OPTIONAL_PORTS = ("hand_wrench_E", "load_wrench_B", "saturated", "contact")
+_OPTIONAL_INPUT_PORTS = ("hand_wrench_E", "load_wrench_B", "saturated", "contact")
 
 
 class NetworkChannel(SteppedBlock):
@@ -119,7 +119,7 @@ class _PassivityEndBlock(SteppedBlock):
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
         self._ports = [
-            (self.DeclareVectorInputPort(name, size), name in _OPTIONAL_PORTS)
+            (self.DeclareVectorInputPort(name, size), name in _OPTIONAL_INPUT_PORTS)
             for name, size in self._INPUT_PORTS
         ]
         self._declare_step(results, 3, period)

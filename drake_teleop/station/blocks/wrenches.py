@@ -136,7 +136,7 @@ def WrenchScaling_(T: Any) -> Any:
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
             Impl._construct(self, other._config, other._R_WB, other._gravity_W, converter=converter)
 
-        def _scaled(self, context: Any, scales: Scales) -> Any:
+        def _scaled_wrench(self, context: Any, scales: Scales) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
             given, wrench = self._config.gripper_phi, _zero_vector_of_type(T, 6)
             gripper = estimate[6:] if given is None else np.asarray(given)
@@ -157,10 +157,10 @@ def WrenchScaling_(T: Any) -> Any:
             return np.ascontiguousarray(self._orientation.Eval(context)).reshape(3, 3)
 
         def _calc_contact(self, context: Any, output: Any) -> None:
-            output.SetFromVector(self._scaled(context, Scales(0.0, 0.0, 1.0, 0.0, 0.0)))
+            output.SetFromVector(self._scaled_wrench(context, Scales(0.0, 0.0, 1.0, 0.0, 0.0)))
 
         def _calc_scaled(self, context: Any, output: Any) -> None:
-            output.SetFromVector(self._scaled(context, self._scales))
+            output.SetFromVector(self._scaled_wrench(context, self._scales))
 
         def _calc_to_master(self, context: Any, output: Any) -> None:
             if not self._orientation.HasValue(context):
@@ -168,7 +168,7 @@ def WrenchScaling_(T: Any) -> Any:
                 remedy = "connect a rotation matrix, by rows"
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
-            scaled, R_WS = self._scaled(context, self._scales), self._R_WS(context)
+            scaled, R_WS = self._scaled_wrench(context, self._scales), self._R_WS(context)
             to_master_into = _compiled_or_python(force_scaling.wrench_to_master_into, T)
             to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)

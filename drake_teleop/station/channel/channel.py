@@ -165,7 +165,7 @@ def step_master_end(
     before, held = ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG], ends[_RENDERED_HAND_WRENCH]
     watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
-    valid = _update_pose(pose_command, before, T, dx, twist)
+    valid = _update_pose_and_twist(pose_command, before, T, dx, twist)
     for g in range(2):
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
@@ -175,7 +175,7 @@ def step_master_end(
         valid = False
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
-    safe_state.master_limits_into(
+    safe_state.master_wrench_limits_into(
         healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, watch, limits
     )
     methods.master_step(
@@ -199,7 +199,7 @@ def step_slave_end(
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
-    valid = _update_pose(slave_pose, before, T, dx, twist)
+    valid = _update_pose_and_twist(slave_pose, before, T, dx, twist)
     for g in range(2):
         work[g] += dot_of_group(held, dx, g)
     load = memory[slots.LOAD_WRENCH]
@@ -236,7 +236,7 @@ def step_slave_end(
 
 
 @njit(cache=True)
-def _update_pose(pose, before, T, dx, twist):
+def _update_pose_and_twist(pose, before, T, dx, twist):
     """Write change (6,) and twist (6,), 0 unless both poses are valid; return whether `pose` is."""
     valid = are_finite_and_in_range(pose)
     if valid:

@@ -18,7 +18,7 @@ from drake_teleop.common.noise import random_bits
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import packet as fields
-from drake_teleop.station.passivity.packet import has_arrived, move_pose_into
+from drake_teleop.station.passivity.packet import has_packet_arrived, move_pose_into
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 MAX_DELAY_S = 10.0  # [s], bounds the memory
@@ -236,15 +236,15 @@ def _draw_loss_and_delays(p, k, bad):
     return bad, first, second
 
 
-def initial_network_state(p: Array, neutral: Array) -> tuple[Array, Array]:
+def initial_network_state(p: Array, initial_packet: Array) -> tuple[Array, Array]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
-    `p` contains the network's parameters, `neutral` (N,) the values at the receiver before the
-    first packet.
+    `p` contains the network's parameters, `initial_packet` (N,) the values at the receiver before
+    the first packet.
     """
     slots = int(p[_NUM_TRANSIT_SLOTS])
-    receiver = np.concatenate([[p[_BAD_STATE_SHARE], -1.0, -1.0, 0.0], neutral])
-    return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(neutral))])
+    receiver = np.concatenate([[p[_BAD_STATE_SHARE], -1.0, -1.0, 0.0], initial_packet])
+    return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(initial_packet))])
 
 
 @njit(cache=True)
@@ -289,22 +289,22 @@ def receive_packet(p, state, k, packet):
 
 
 @njit(cache=True)
-def _apply_silence_policy(policy, silent, packet):
+def _apply_silence_policy(policy, silence_s, packet):
     velocity, pose = packet[fields.VELOCITY], packet[fields.POSE]
     if policy == _SILENCE_POLICY_ZERO:
         velocity[:] = 0.0
         packet[fields.WRENCH] = packet[fields.PACKET_LOAD_WRENCH] = 0.0
-    elif policy == _SILENCE_POLICY_EXTRAPOLATE and has_arrived(packet):
-        move_pose_into(pose, velocity * min(silent, MAX_POSE_EXTRAPOLATION_S), pose)
-        if silent > MAX_POSE_EXTRAPOLATION_S:
+    elif policy == _SILENCE_POLICY_EXTRAPOLATE and has_packet_arrived(packet):
+        move_pose_into(pose, velocity * min(silence_s, MAX_POSE_EXTRAPOLATION_S), pose)
+        if silence_s > MAX_POSE_EXTRAPOLATION_S:
             velocity[:] = 0.0
 
 
 @njit(cache=True)
-def packet_delays(p, steps):
-    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
-    delays, bad = np.empty((steps, 2), np.int64), p[_BAD_STATE_SHARE]
-    for k in range(steps):
+def packet_delay_steps(p, num_steps):
+    """Return the delays (num_steps, 2) of packets and their copies [steps]; -1: does not arrive."""
+    delays, bad = np.empty((num_steps, 2), np.int64), p[_BAD_STATE_SHARE]
+    for k in range(num_steps):
         bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
     return delays
 
@@ -315,7 +315,7 @@ def newest_packets(
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
     p = network_parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_STEPS])
-    for travel in packet_delays(p, steps).T:
+    for travel in packet_delay_steps(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])

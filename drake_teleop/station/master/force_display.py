@@ -20,8 +20,8 @@ from drake_teleop.station.passivity.packet import limit_group
 
 # Vector from the device: joint positions, and memory of the last period: last valid positions,
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
-# of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
-# new memory.
+# of `master_wrench_limits_into`. Vector to the device: motor torques in place of the positions, and
+# the new memory.
 _layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + safe_state.MASTER_MONITOR_SIZE)
 _JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
 DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
@@ -112,7 +112,7 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
     share = 0.0 if fault else period / max(left, period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
-    safe_state.master_limits_into(
+    safe_state.master_wrench_limits_into(
         not fault, fault, period, 0.0, device_limits, last, drive[_SAFE_STATE_MONITOR_SLOTS], limits
     )
     drive[_IS_WRENCH_REDUCED_SLOT] = 0.0

@@ -14,13 +14,13 @@ _DAMPING_RIDGE_SHARE = 0.05
 
 
 @njit(cache=True)
-def update_contact_fit(sums, force_change, displacement, speed_change, keep):
+def update_contact_fit(sums, force_change, displacement, speed_change, kept_weight):
     """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m], >= 0.
 
-    `sums` (NUM_CONTACT_FIT_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
+    `sums` (NUM_CONTACT_FIT_SUMS,) is updated; `kept_weight`, 0 to 1, is that of its old values.
     """
     for i in range(NUM_CONTACT_FIT_SUMS):
-        sums[i] *= keep
+        sums[i] *= kept_weight
     sums[0] += displacement * displacement
     sums[1] += displacement * speed_change
     sums[2] += speed_change * speed_change

@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity import packet as fields
-from drake_teleop.station.passivity.packet import fill_packet, has_arrived, pose_difference_into
+from drake_teleop.station.passivity.packet import fill_packet, pose_difference_into
 
 # Parameters; pairs are for translation and rotation.
 _layout = slots.own_parameters()
@@ -50,7 +50,7 @@ class FourChannelConfig:
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     difference = memory[_POSE_DIFFERENCE]
     difference[:] = 0.0
-    connected = has_arrived(received)
+    connected = fields.has_packet_arrived(received)
     if connected:
         pose_difference_into(received[fields.POSE], pose, difference)
     for i in range(6):
@@ -66,7 +66,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    if has_arrived(received):
+    if fields.has_packet_arrived(received):
         shift = memory[_POSE_DIFFERENCE]
         for i in range(6):
             g, gain = i // 3, p[_SLAVE_FEEDBACK_GAIN]

@@ -34,15 +34,15 @@ _MAX_WALL_FORCE_N = 10.0
 _MAX_SAME_WALL_DISTANCE_M, _MIN_SAME_WALL_COSINE = 5e-3, 0.7
 _MAX_FORGET_WALL_DEPTH_M, _FORGET_WALL_FORCE_N, _MIN_FORGET_WALL_DEPTH_M = 3e-3, 1.0, 1e-3
 _MIN_WALL_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
-_HAND_INPUT_SENDING_LEVEL = 0.5  # of the master's reserve
-_NEVER_USED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
+_HAND_INPUT_SENDING_RESERVE_SHARE = 0.5  # of the master's reserve
+_UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_RATE = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
 _WITHHELD_WRENCH_RECOVERY_S = 0.1
 _MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED = 0.02  # m/s
 _FADE_TIME_AT_HAND_REST_S = 0.1
-_LOST_HAND_MOTION_ENCODER_STEPS = 1.1
+_HAND_DEADBAND_ENCODER_STEPS = 1.1
 _DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - shared.RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
@@ -61,7 +61,7 @@ _LAST_SLAVE_POSE, _SLAVE_DISPLACEMENT = _layout.vector(7), _layout.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
 _WORK_ON_HAND_SINCE_REST, _WITHHELD_WRENCH_SHARE = _layout.vector(2), _layout.vector(2)
 _IS_DRAG_ACTIVE = _layout.vector(2)
-_LOST_HAND_MOTION, _HAND_STEP_WITHOUT_FLICKER = _layout.vector(6), _layout.vector(6)
+_HAND_MOTION_IN_DEADBAND, _HAND_STEP_BEYOND_DEADBAND = _layout.vector(6), _layout.vector(6)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
 _LAST_RECEIVED_PACKET_NUMBER, _IS_WRENCH_CROSS_FADING = _layout.number(), _layout.vector(2)
 _LAST_UNLIMITED_WRENCH = _layout.vector(6)
@@ -122,21 +122,21 @@ def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     velocity, offset_to_slave = memory[shared.FILTERED_OWN_VELOCITY], wrench  # overwritten below
-    _store_hand_step_without_flicker(dx, p, memory)
-    steady = memory[_HAND_STEP_WITHOUT_FLICKER]
+    _store_hand_step_beyond_deadband(dx, p, memory)
+    steady = memory[_HAND_STEP_BEYOND_DEADBAND]
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
     shared.filter_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
     memory[_HAND_WALL_DEPTH] += work_along(memory[_DIRECTION_INTO_WALL], steady)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
-        _update_hand_ledger(g, dx, inside or memory[shared.IN_CONTACT] > 0.0, p, memory)
+        _update_hand_ledger(g, dx, inside or memory[shared.IN_CONTACT_FLAG] > 0.0, p, memory)
         memory[slots.STORED_ENERGY][g] += fields.count_newly_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
-    if fields.has_arrived(received):
+    if fields.has_packet_arrived(received):
         fields.pose_difference_into(pose, received[fields.POSE], offset_to_slave)
         for i in range(6):
-            offset_to_slave[i] -= memory[_LOST_HAND_MOTION][i]
+            offset_to_slave[i] -= memory[_HAND_MOTION_IN_DEADBAND][i]
     _predict_contact(received, steady, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
         wrench[i] += received[fields.PACKET_LOAD_WRENCH][i]
@@ -149,7 +149,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
         level = p[shared.MASTER_RESERVE][g]
-        if memory[shared.IN_CONTACT] > 0.0:
+        if memory[shared.IN_CONTACT_FLAG] > 0.0:
             level += shared.RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
         surplus = max(memory[slots.STORED_ENERGY][g] - level, 0.0)
         memory[slots.SENT_ENERGY][g] += surplus
@@ -160,20 +160,20 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         packet[shared.PACKET_LEDGER_LEVEL][g] = memory[slots.STORED_ENERGY][g]
     fields.fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
-        steady[i] = -memory[_LOST_HAND_MOTION][i]
+        steady[i] = -memory[_HAND_MOTION_IN_DEADBAND][i]
     fields.move_pose_into(packet[fields.POSE], steady, packet[fields.POSE])
     packet[shared.NEWEST_SLAVE_PACKET] = received[fields.PACKET_NUMBER]
 
 
 @njit(cache=True)
-def _store_hand_step_without_flicker(dx, p, memory):
-    """Write the hand's displacement beyond the lost motion into memory (docs/theory.md, M2)."""
-    lost, steady = memory[_LOST_HAND_MOTION], memory[_HAND_STEP_WITHOUT_FLICKER]
+def _store_hand_step_beyond_deadband(dx, p, memory):
+    """Write the hand's displacement beyond the dead band into memory (docs/theory.md, M2)."""
+    lost, steady = memory[_HAND_MOTION_IN_DEADBAND], memory[_HAND_STEP_BEYOND_DEADBAND]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             lost[i] += dx[i]
         size = length_of_group(lost, g)
-        width = _LOST_HAND_MOTION_ENCODER_STEPS * p[shared.ENCODER_STEP][g]
+        width = _HAND_DEADBAND_ENCODER_STEPS * p[shared.ENCODER_STEP][g]
         share = 1.0 - width / size if size > width else 0.0
         for i in range(3 * g, 3 * g + 3):
             steady[i] = share * lost[i]
@@ -184,7 +184,7 @@ def _store_hand_step_without_flicker(dx, p, memory):
 def _update_hand_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g), memory[slots.STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
-    sending_level = _HAND_INPUT_SENDING_LEVEL * p[shared.MASTER_RESERVE][g]
+    sending_level = _HAND_INPUT_SENDING_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     if work < 0.0 and in_contact and ledger[g] > sending_level:
         memory[slots.SENT_ENERGY][g] -= work
     else:
@@ -202,9 +202,9 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     stiffness = received[shared.PACKET_CONTACT_STIFFNESS]
     k = min(_CONTACT_STIFFNESS_FACTOR * stiffness, _MAX_WALL_STIFFNESS)
     if not shared.is_in_contact(contact_wrench, p):
-        if memory[shared.IN_CONTACT] > 0.0:
+        if memory[shared.IN_CONTACT_FLAG] > 0.0:
             memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
-        memory[shared.IN_CONTACT] = 0.0
+        memory[shared.IN_CONTACT_FLAG] = 0.0
         removal_depth = _FORGET_WALL_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
         removal_depth = min(_MAX_FORGET_WALL_DEPTH_M, max(removal_depth, _MIN_FORGET_WALL_DEPTH_M))
         slave_depth = memory[_HAND_WALL_DEPTH] - work_along(inward, offset_to_slave)
@@ -222,11 +222,11 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             wrench[i] = -min(force, _MAX_WALL_FORCE_N) * inward[i]
         return
     memory[_MISSING_WALL_IMPULSE] = 0.0
-    offset, onset = memory[_HAND_OFFSET_AT_CONTACT_ONSET], memory[shared.IN_CONTACT] == 0.0
+    offset, onset = memory[_HAND_OFFSET_AT_CONTACT_ONSET], memory[shared.IN_CONTACT_FLAG] == 0.0
     mean_wrench = memory[shared.MEAN_CONTACT_WRENCH]
     if onset or not wrench_component_along(contact_wrench, mean_wrench, p) > 0.0:
         memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
-    round_trip, damper = received[shared.ROUND_TRIP], received[shared.PACKET_CONTACT_DAMPING]
+    round_trip, damper = received[shared.PACKET_ROUND_TRIP], received[shared.PACKET_CONTACT_DAMPING]
     size = shared.update_contact_direction(contact_wrench, round_trip, T, p, memory)
     speed = work_along(normal, received[fields.VELOCITY])
     depth = max(size + damper * speed, 0.0) / max(k, _MIN_WALL_STIFFNESS)
@@ -239,7 +239,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             offset[:] = 0.0
         else:
             copy_into(offset, 0, offset_to_slave, 0, 6)
-        memory[shared.IN_CONTACT] = 1.0
+        memory[shared.IN_CONTACT_FLAG] = 1.0
         memory[_FRICTION_COEFFICIENT] = memory[_HAND_RETREAT_DISTANCE] = 0.0
         for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _UNMODELLED_FRICTION):
             memory[friction] = 0.0
@@ -284,7 +284,8 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
     copy_into(wrench, 0, received, fields.WRENCH.start, 6)
     _remove_normal_component(wrench, p, memory)
-    decay = min(T / max(_FRICTION_COEFFICIENT_DECAY_S, 3.0 * received[shared.ROUND_TRIP]), 1.0)
+    round_trip = received[shared.PACKET_ROUND_TRIP]
+    decay = min(T / max(_FRICTION_COEFFICIENT_DECAY_S, 3.0 * round_trip), 1.0)
     for g in range(2):
         metric = max(p[shared.WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
@@ -293,7 +294,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
         lag = cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED)
         if g == 1:
             least = _FRICTION_TORQUE_RELAXATION_S
-            lag = _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * received[shared.ROUND_TRIP]
+            lag = _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * round_trip
         share = T / max(lag, least)
         for i in range(3 * g, 3 * g + 3):
             inward = metric * normal[i]
@@ -352,7 +353,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _MAX_HAND_ACCELERATION * shared.ANGLE_PER_LENGTH[g] * T * T
-    unused = _NEVER_USED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
+    unused = _UNUSED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)
     if share * cost > most:
@@ -365,7 +366,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _permitted_braking_share(g, dx, T, p, memory):
-    unused = _NEVER_USED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
+    unused = _UNUSED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     if memory[slots.STORED_ENERGY][g] >= unused:
         return 1.0
     velocity = memory[shared.FILTERED_OWN_VELOCITY]
@@ -381,7 +382,7 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
     # Sent energy counts as arrived: its confirmation takes a round trip.
     slave_energy = received[shared.PACKET_LEDGER_LEVEL][g] + memory[slots.SENT_ENERGY][g]
     lowest = min(own_level, slave_energy / p[shared.SLAVE_RESERVE][g])
-    in_contact = memory[shared.IN_CONTACT] > 0.0
+    in_contact = memory[shared.IN_CONTACT_FLAG] > 0.0
     if (in_contact and own_level < _DRAG_OFF_LEVEL) or (not in_contact and lowest < _DRAG_ON_LEVEL):
         active[g] = 1.0
     elif in_contact or lowest >= _DRAG_OFF_LEVEL:

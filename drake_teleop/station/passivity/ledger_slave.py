@@ -47,9 +47,9 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-_numbers = range(fields.METHOD_INTEGRAL.start, fields.METHOD_INTEGRAL.stop)
-PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, ROUND_TRIP, *_, NEWEST_SLAVE_PACKET = _numbers
-PACKET_LEDGER_LEVEL = fields.SECOND_ENERGY_COUNTER
+_indices = range(fields.METHOD_INTEGRAL.start, fields.METHOD_INTEGRAL.stop)
+PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _indices[:3]
+NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _indices[-1], fields.SECOND_ENERGY_COUNTER
 
 # Parameters, in the master's power units.
 _layout = slots.own_parameters()
@@ -58,14 +58,14 @@ DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _layout = slots.own_memory()
-FILTERED_OWN_VELOCITY, IN_CONTACT = _layout.vector(6), _layout.number()
+FILTERED_OWN_VELOCITY, IN_CONTACT_FLAG = _layout.vector(6), _layout.number()
 MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
 SERVO_MODEL_POSE, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
 _MOTOR_WRENCH = _layout.vector(6)
 _AVAILABLE_MOTOR_ENERGY, _ENERGY_IN_CONTACT = _layout.vector(2), _layout.vector(2)  # A, Q
 # k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
 _CONTACT_STIFFNESS, _CONTACT_DAMPING = _layout.number(), _layout.number()
-_STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
+_STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _STIFFNESS_GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
     _layout.number() for _ in range(4)
 )
 # Fit of k and b: filtered force; force and speed at the start of the sample; its length and the
@@ -114,7 +114,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
     """
     mean, normal = memory[MEAN_CONTACT_WRENCH], memory[CONTACT_DIRECTION]
     rate = 1.0
-    if memory[IN_CONTACT] > 0.0:
+    if memory[IN_CONTACT_FLAG] > 0.0:
         # A wrench far above the mean, which may be noise, replaces it at once.
         square = max(wrench_component_along(wrench, wrench, p), 1e-300)
         jump = 1.0 - 3.0 * math.sqrt(wrench_component_along(mean, mean, p) / square)
@@ -132,7 +132,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[slots.COMMAND_POSE], memory[slots.COMMAND_TWIST]
-    connected = fields.has_arrived(received)
+    connected = fields.has_packet_arrived(received)
     memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
@@ -166,7 +166,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _step_servo_model(received, connected, T, p, memory, error)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fields.fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
-    if memory[IN_CONTACT] > 0.0:
+    if memory[IN_CONTACT_FLAG] > 0.0:
         normal = memory[CONTACT_DIRECTION]
         correction = memory[_RENDERED_FORCE] - wrench_component_along(contact, normal, p)
         for i in range(6):
@@ -180,7 +180,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         level = memory[slots.STORED_ENERGY][g] - memory[slots.RECEIVED_ENERGY][g]
         packet[PACKET_LEDGER_LEVEL][g] = level
     packet[PACKET_CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
-    packet[ROUND_TRIP] = memory[_LONGEST_ROUND_TRIP]
+    packet[PACKET_ROUND_TRIP] = memory[_LONGEST_ROUND_TRIP]
     packet[PACKET_CONTACT_STIFFNESS] = memory[_STIFFNESS_SHARE] * k / (1.0 + k * compliance)
 
 
@@ -233,13 +233,13 @@ def _max_displayed_stiffness(received, T, p, memory):
     goal = _MAX_STIFFNESS_GAIN * fill_level - 1.0
     if memory[_LONGEST_SILENCE] >= max_silence:
         goal = min(goal, 0.0)
-    if memory[IN_CONTACT] == 0.0:
-        memory[_GAIN_MINUS_ONE] = 0.0
+    if memory[IN_CONTACT_FLAG] == 0.0:
+        memory[_STIFFNESS_GAIN_MINUS_ONE] = 0.0
     else:
-        change = max(goal, _MIN_STIFFNESS_GAIN - 1.0) - memory[_GAIN_MINUS_ONE]
+        change = max(goal, _MIN_STIFFNESS_GAIN - 1.0) - memory[_STIFFNESS_GAIN_MINUS_ONE]
         time_constant = _STIFFNESS_GAIN_RISE_S if change > 0.0 else _STIFFNESS_GAIN_FALL_S
-        memory[_GAIN_MINUS_ONE] += T / time_constant * change
-    gain = 1.0 + memory[_GAIN_MINUS_ONE]
+        memory[_STIFFNESS_GAIN_MINUS_ONE] += T / time_constant * change
+    gain = 1.0 + memory[_STIFFNESS_GAIN_MINUS_ONE]
     least = max(_MIN_DISPLAYED_STIFFNESS, base) * min(gain, 1.0)
     return max(least, min(gain * base, _MAX_DISPLAYED_STIFFNESS))
 
@@ -249,9 +249,9 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     normal, velocity = memory[CONTACT_DIRECTION], memory[FILTERED_OWN_VELOCITY]
     k = memory[_CONTACT_STIFFNESS]
     if not in_contact:
-        if memory[IN_CONTACT] > 0.0 and _is_wall_removed(dx, memory):
+        if memory[IN_CONTACT_FLAG] > 0.0 and _is_wall_removed(dx, memory):
             memory[_STIFFNESS_SHARE] = 0.0
-        memory[IN_CONTACT] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION_FORCE] = 0.0
+        memory[IN_CONTACT_FLAG] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION_FORCE] = 0.0
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _max_displayed_stiffness(received, T, p, memory)
@@ -291,10 +291,10 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
             goal = memory[_STIFFNESS_SHARE_GOAL] = k_d / max(k, k_d)
         memory[_STIFFNESS_SHARE] += rate * (goal - memory[_STIFFNESS_SHARE])
         depth = max(size - memory[_CONTACT_DAMPING] * speed, 0.0) / k
-        if memory[IN_CONTACT] == 0.0:
+        if memory[IN_CONTACT_FLAG] == 0.0:
             memory[_SLAVE_WALL_DEPTH] = depth
         memory[_SLAVE_WALL_DEPTH] += inward + rate * (depth - memory[_SLAVE_WALL_DEPTH] - inward)
-        memory[IN_CONTACT] = 1.0
+        memory[IN_CONTACT_FLAG] = 1.0
     explained = memory[_CONTACT_STIFFNESS] * inward
     explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED_INTO_WALL])
     rate = T / _SLIP_FORCE_FADE_S + abs(inward) / _MIN_FIT_SPAN_M
@@ -326,7 +326,7 @@ def _max_force_change_by_slip(wrench, normal_force, T, p, memory):
 def _generate_command(received, connected, T, p, memory, error):
     velocity, feed = memory[slots.COMMAND_TWIST], received[fields.VELOCITY]
     normal, compliance, beyond_wall, inward_speed = memory[CONTACT_DIRECTION], 0.0, 0.0, 0.0
-    if memory[IN_CONTACT] > 0.0:
+    if memory[IN_CONTACT_FLAG] > 0.0:
         beyond_wall = memory[_SLAVE_WALL_DEPTH] - work_along(normal, error)
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
         if beyond_wall > 0.0:
@@ -391,7 +391,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
         free = _WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
-        spring = (1.0 + memory[_GAIN_MINUS_ONE]) * free * free
+        spring = (1.0 + memory[_STIFFNESS_GAIN_MINUS_ONE]) * free * free
         spring /= 2.0 * max(memory[_CONTACT_STIFFNESS], 1.0)
         available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_ENERGY_IN_CONTACT][g])
         if stands or not pushes:

@@ -73,8 +73,8 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _functions_of(method: Any) -> tuple[Any, Any, Any, Any]:
-    return method.master_step, method.slave_step, method.record_command, method.initialize
+def _method_functions(module: Any) -> tuple[Any, Any, Any, Any]:
+    return module.master_step, module.slave_step, module.record_command, module.initialize
 
 
 _TDPA_METHOD = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
@@ -85,8 +85,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(*_functions_of(two_layer), balance_at_motors=True),
-        "pspm": PassivityMethod(*_functions_of(pspm), balance_at_motors=True),
+        "two_layer": PassivityMethod(*_method_functions(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_method_functions(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -216,11 +216,11 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     return memory
 
 
-_VECTOR = types.Array(types.float64, 1, "C")
+_VECTOR_TYPE = types.Array(types.float64, 1, "C")
 _STEP_ARGUMENT_TYPES = (
-    (_VECTOR, types.boolean, *[_VECTOR] * 5, types.float64, *[_VECTOR] * 4),
-    (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4),
-    (_VECTOR,) * 6,
+    (_VECTOR_TYPE, types.boolean, *[_VECTOR_TYPE] * 5, types.float64, *[_VECTOR_TYPE] * 4),
+    (_VECTOR_TYPE, types.boolean, *[_VECTOR_TYPE] * 4, types.float64, *[_VECTOR_TYPE] * 4),
+    (_VECTOR_TYPE,) * 6,
 )
 _call_master, _call_slave, _call_record = map(make_call_at_address, _STEP_ARGUMENT_TYPES)
 

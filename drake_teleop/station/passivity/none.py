@@ -6,7 +6,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity import packet as fields
-from drake_teleop.station.passivity.packet import fill_packet, has_arrived, limit_group
+from drake_teleop.station.passivity.packet import fill_packet, has_packet_arrived, limit_group
 
 
 @njit(cache=True)
@@ -19,7 +19,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    if has_arrived(received):
+    if has_packet_arrived(received):
         copy_into(memory, slots.COMMAND_POSE.start, received, fields.POSE.start, 7)
         copy_into(memory, slots.COMMAND_TWIST.start, received, fields.VELOCITY.start, 6)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)

@@ -33,7 +33,7 @@ MAX_HAND_WRENCH_RATE = (450.0, 4.5)
 
 
 @njit(cache=True)
-def has_arrived(received):
+def has_packet_arrived(received):
     """Return whether a packet has arrived: before the first, `received` contains zeros."""
     pose = received[POSE]
     return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
@@ -61,23 +61,23 @@ def dot_of_group(a, b, g):
 
 
 @njit(cache=True)
-def length_of_group(a, g):
+def length_of_group(vector, g):
     i = 3 * g
-    return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
+    return math.hypot(math.hypot(vector[i], vector[i + 1]), vector[i + 2])
 
 
 @njit(cache=True)
-def scale_group(a, g, s):
+def scale_group(vector, g, factor):
     for i in range(3 * g, 3 * g + 3):
-        a[i] *= s
+        vector[i] *= factor
 
 
 @njit(cache=True)
-def limit_group(a, g, max_length):
-    """Shorten group `g` of the vector `a` (6,) to at most `max_length`."""
-    size = length_of_group(a, g)
+def limit_group(vector, g, max_length):
+    """Shorten group `g` of a vector (6,) to at most `max_length`."""
+    size = length_of_group(vector, g)
     if size > max_length:
-        scale_group(a, g, max_length / size)
+        scale_group(vector, g, max_length / size)
 
 
 @njit(cache=True)
@@ -90,23 +90,23 @@ def are_vectors_finite(vectors):
 
 
 @njit(cache=True)
-def pose_difference_into(a, b, e):
-    """Write the difference of two poses [quaternion wxyz; p] (7,) in W to `e` (6,) [m, rad].
+def pose_difference_into(pose, reference, difference):
+    """Write the difference (6,) [m, rad] of two poses (7,), [quaternion wxyz; p] in W.
 
-    It is [p_a - p_b; log(R_a R_b^T)].
+    It is [p - p_reference; log(R R_reference^T)].
     """
-    inverse = vectors.conjugate_quaternion((b[0], b[1], b[2], b[3]))
-    turn = vectors.quaternion_logarithm(quaternion_product((a[0], a[1], a[2], a[3]), inverse))
+    inverse = vectors.conjugate_quaternion(vectors.quaternion_at(reference, 0))
+    turn = vectors.quaternion_logarithm(quaternion_product(vectors.quaternion_at(pose, 0), inverse))
     for i in range(3):
-        e[i] = a[4 + i] - b[4 + i]
-        e[3 + i] = turn[i]
+        difference[i] = pose[4 + i] - reference[4 + i]
+        difference[3 + i] = turn[i]
 
 
 @njit(cache=True)
-def move_pose_into(pose, e, out):
-    """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
-    turn = vectors.quaternion_exponential((e[3], e[4], e[5]))
+def move_pose_into(pose, displacement, out):
+    """Write the pose moved by a displacement (6,) e, [exp(e_r) R; p + e_p], into `out` (7,)."""
+    turn = vectors.quaternion_exponential((displacement[3], displacement[4], displacement[5]))
     q = normalized_quaternion(quaternion_product(turn, (pose[0], pose[1], pose[2], pose[3])))
     out[0], out[1], out[2], out[3] = q
     for i in range(3):
-        out[4 + i] = pose[4 + i] + e[i]
+        out[4 + i] = pose[4 + i] + displacement[i]

@@ -102,7 +102,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
-    if fields.has_arrived(received):
+    if fields.has_packet_arrived(received):
         pose_difference_into(received[fields.POSE], pose, requested)
         copy_into(memory, slots.COMMAND_TWIST.start, received, fields.VELOCITY.start, 6)
     for g in range(2):

@@ -59,22 +59,22 @@ def initial_slave_monitor(pose: Array) -> Array:
 
 
 @njit(cache=True)
-def _update_silence_time(alive, fault, T, watch):
+def _update_silence_time(healthy, fault, T, watch):
     if fault:
         watch[SILENCE_TIME] = np.inf
     else:
-        watch[SILENCE_TIME] = 0.0 if alive else watch[SILENCE_TIME] + T
+        watch[SILENCE_TIME] = 0.0 if healthy else watch[SILENCE_TIME] + T
 
 
 @njit(cache=True)
-def master_limits_into(alive, fault, T, timeout, device_limits, displayed, watch, limits):
+def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, displayed, watch, limits):
     """Write the limits (2,) of the rendered wrench [N, N m]; they fall to zero during silence.
 
-    `alive` means that a new packet of a healthy sender came; `fault` that data of either end are
+    `healthy`: a new packet of a healthy sender came; `fault`: data of either end are
     not finite. `timeout` [s] is the time without packets until the end is silent,
     `displayed` (6,) the displayed wrench. `watch` is the silence monitor, updated.
     """
-    _update_silence_time(alive, fault, T, watch)
+    _update_silence_time(healthy, fault, T, watch)
     connected = watch[SILENCE_TIME] <= timeout
     watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
     present, fall = watch[_PRESENT_HAND_WRENCH_LIMITS], watch[_WRENCH_LIMIT_FALL_RATE]
@@ -93,13 +93,13 @@ def master_limits_into(alive, fault, T, timeout, device_limits, displayed, watch
 
 
 @njit(cache=True)
-def slave_command_into(alive, fault, T, timeout, requested, watch, command):
+def slave_command_into(healthy, fault, T, timeout, requested, watch, command):
     """Write the command X_WS (7,) that is sent to the slave; during silence the slave brakes.
 
     `requested` (7,) is the pose from the passivity method, `watch` from `initial_slave_monitor`.
-    Alive, fault, T and timeout: as for `master_limits_into`.
+    Healthy, fault, T and timeout: as for `master_wrench_limits_into`.
     """
-    _update_silence_time(alive, fault, T, watch)
+    _update_silence_time(healthy, fault, T, watch)
     last, before = watch[_LAST_COMMAND], watch[_COMMAND_BEFORE_LAST]
     start, velocity = watch[_COMMAND_AT_STOP_START], watch[_COMMAND_VELOCITY_AT_STOP_START]
     step = np.empty(6)

@@ -46,7 +46,7 @@ _layout = slots.own_memory()
 _SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
-_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET = _layout.vector(2), _layout.vector(2)
+_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET_NUMBER = _layout.vector(2), _layout.vector(2)
 _LAST_COMMAND = _layout.vector(7)  # the command of the last step
 
 
@@ -158,7 +158,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         work = dot_of_group(wrench, dx, g)
         memory[_SLAVE_WORK_IN][g] += max(work, 0.0)
         memory[_SLAVE_WORK_OUT][g] += max(-work, 0.0)
-    if fields.has_arrived(received):
+    if fields.has_packet_arrived(received):
         _advance_command(received, wrench, T, p, memory)
     for g in range(2):
         available = _energy_available_to_slave(memory, g)
@@ -191,8 +191,8 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
         else:
             if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
-                memory[_QUICK_ONSET_PACKET][g] = memory[slots.STEP_COUNT]
-            awaited = received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET][g]
+                memory[_QUICK_ONSET_PACKET_NUMBER][g] = memory[slots.STEP_COUNT]
+            awaited = received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET_NUMBER][g]
             if lag > _SLOW_WRENCH_ONSET_S and awaited:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):

@@ -111,7 +111,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     spring, brake = memory[_SERVO_SPRING_WRENCH], memory[_SERVO_DAMPER_WRENCH]
     _exchange_tank_energy(received, dx, T, p, memory, packet)
     target = memory[slots.COMMAND_POSE]
-    if fields.has_arrived(received):
+    if fields.has_packet_arrived(received):
         target = received[fields.POSE]
     fields.pose_difference_into(target, pose, spring)
     motor_wrench, K, D = memory[slots.LAST_PORT_WRENCH], p[slots.SERVO_K], p[slots.SERVO_D]

@@ -130,7 +130,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         _reflect_wave_while_channel_fills(received, wrench, T, p, memory)
     elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE_BEFORE_HOLD]:
         _reflect_wave(received, wrench, T, p, memory)
-        if fields.has_arrived(received):
+        if fields.has_packet_arrived(received):
             _correct_pose_drift(received, wrench, T, p, memory)
         fields.move_pose_into(now, step, now)
         for i in range(6):

@@ -165,8 +165,8 @@ def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, ou
 
 
 @njit(cache=True)
-def _contact_wrench_into(sample, estimate, gripper, change, time, arm, elimination, out):
-    _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out)
+def _contact_wrench_into(sample, estimate, gripper, change, time, arm, contact_scales, out):
+    _scaled_wrench_into(sample, estimate, gripper, arm, contact_scales, out)
 
 
 @njit(cache=True)
@@ -176,16 +176,16 @@ def _non_contact_wrench_into(sample, estimate, gripper, change, time, out):
 
 
 @njit(cache=True)
-def _fault_into(sample, estimate, gripper, change, time, valid_range, out):
+def _sample_fault_into(sample, estimate, gripper, change, time, valid_range, out):
     out[0] = find_sample_fault(sample, estimate, time, valid_range)
 
 
 @njit(cache=True, omits_reference_counting=True)
 def _scaled_contact_and_fault_into(
-    sample, estimate, gripper, change, time, arm, elimination, valid_range, out
+    sample, estimate, gripper, change, time, arm, contact_scales, valid_range, out
 ):
     _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out[:6])
-    _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out[6:12])
+    _scaled_wrench_into(sample, estimate, gripper, arm, contact_scales, out[6:12])
     out[12] = find_sample_fault(sample, estimate, time, valid_range)
 
 
@@ -261,7 +261,7 @@ class ForceScaling(LeafSystem):
             ("non_contact_wrench_S", 6, _non_contact_wrench_into, ()),
             ("wrench_B", 6, rendered, (*frames, 1.0)),
             ("load_wrench_B", 6, rendered, (*frames, 0.0)),
-            ("fault", 1, _fault_into, (valid_range,)),
+            ("fault", 1, _sample_fault_into, (valid_range,)),
             ("scaled_contact_and_fault", 13, _scaled_contact_and_fault_into,
              (*contact, valid_range)),
         ):  # fmt: skip
