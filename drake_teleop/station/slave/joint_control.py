@@ -1,6 +1,6 @@
-"""Joint control of the slave: computed torque with position and velocity loop (paper, VI-A), or
-the position interface of a commercial arm (docs/station.md):
+"""Joint control of the slave: computed torque (paper, VI-A), or the position interface of an arm.
 
+Position interface (docs/station.md):
 command --[dead time, held]--> target --[generator]--> reference r --[drives]--> torque
 
 d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))

@@ -41,7 +41,7 @@ _NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> tuple[list[ModelInstanceIndex], ModelRepair]:
-    """Repair the text of a model file, and parse it into a plant; return the added instances."""
+    """Repair a model file and parse it into a plant; return the added instances and the repair."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
