@@ -25,7 +25,7 @@ from drake_teleop.station.slave.joint_commands import (
     ExcitationCommand,
     JointRangeMonitor,
     LeaderJointFollower,
-    ik_method_name,
+    used_ik_method,
 )
 from drake_teleop.station.slave.joint_control import HeldTorque, JointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
@@ -159,7 +159,7 @@ def _add_inverse_kinematics(
     builder: DiagramBuilder, scenario: Scenario, body: _SlaveBlocks, follows_leader_joints: bool
 ) -> LeafSystem:
     arm = body.slave.arm
-    name = ik_method_name(scenario.slave.inverse_kinematics, arm)
+    name = used_ik_method(scenario.slave.inverse_kinematics, arm)
     make_ik = LeaderJointFollower if follows_leader_joints else IK_METHODS[name]
     ik = make_ik(arm, body.slave.start, body.command_period_s)
     builder.AddNamedSystem("inverse_kinematics", ik)

@@ -114,17 +114,17 @@ class CollisionScene:
     """Plant and scene graph of the arm with its heaviest load.
 
     Args:
-        reserve: (10,) parameters phi of an additional load on the sensor.
+        extra_phi: (10,) parameters phi of an additional load on the sensor.
         visuals_collide: whether visual shapes also collide.
     """
 
     def __init__(
-        self, parse: ParseArm, reserve: Array, *, visuals_collide: bool, where: str = ""
+        self, parse: ParseArm, extra_phi: Array, *, visuals_collide: bool, where: str = ""
     ) -> None:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
-        _add_load(self.plant, instance, self.sensor_frame, reserve)
+        _add_load(self.plant, instance, self.sensor_frame, extra_phi)
         _complete_and_check_shapes(self.plant, self.scene_graph, visuals_collide, where)
         world, table = self.plant.world_body(), geometry.HalfSpace()
         _add_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)

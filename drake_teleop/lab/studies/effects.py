@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Factorial:
+class FactorialModel:
     """Points of a factorial design at which a measure has values.
 
     Attributes:
@@ -231,11 +231,11 @@ class _MeasureData:
         points = rows.unique("point", keep="first").sort("point")
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [factor_levels(f, c) for f, c in zip(self.factors, columns, strict=True)]
-        self.model: Factorial | LevelModel | None
+        self.model: FactorialModel | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
             counts = [len(levels.names) for levels in self.levels]
-            self.model = Factorial(index, counts, seen[used])
+            self.model = FactorialModel(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
             self.model = fit_level_model(self.factors, columns, known, by_chance=by_chance)
@@ -283,7 +283,7 @@ class _MeasureData:
         why = [TOO_FEW_POINTS] * len(compared) if self.model is None else why
         total = math.prod(len(f.names) for k, f in enumerate(self.levels) if k not in shown)
         used = round(np.mean(over) * total)
-        return why, used, total - used, not isinstance(self.model, Factorial)
+        return why, used, total - used, not isinstance(self.model, FactorialModel)
 
 
 def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array:
