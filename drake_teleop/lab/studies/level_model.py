@@ -117,16 +117,16 @@ class LevelModel:
     X: Array
     pseudo_inverse: Array
 
-    def comparison_weights(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
+    def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return the same as `FactorialModel`, but with a matrix from coefficients to means."""
-        others = sorted(set(itertools.chain(*self.failed)) - set(shown))
-        factors = [*shown, *others]
-        shape = [len(self.factors[factor].names) for factor in factors]
-        at = dict(zip(factors, np.indices(shape).reshape(len(shape), -1), strict=True))
+        others = sorted(set(itertools.chain(*self.failed)) - set(factors))
+        related = [*factors, *others]
+        shape = [len(self.factors[factor].names) for factor in related]
+        at = dict(zip(related, np.indices(shape).reshape(len(shape), -1), strict=True))
         there = np.ones(math.prod(shape), dtype=bool)
         for (i, j), failed in self.failed.items():
             there &= ~failed[at[i], at[j]]
-        count = math.prod(shape[: len(shown)])
+        count = math.prod(shape[: len(factors)])
         rows, columns = largest_complete_block(there.reshape(count, -1))
         terms = self._regression_terms(at).reshape(count, -1, self.X.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
@@ -278,8 +278,8 @@ def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
     return codes
 
 
-def _student_quantile(num_intervals: int, freedom: int) -> float:
-    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / num_intervals))
+def _student_quantile(num_intervals: int, degrees_of_freedom: int) -> float:
+    return float(stdtrit(degrees_of_freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / num_intervals))
 
 
 def _format_value(value: FactorValue) -> str:
