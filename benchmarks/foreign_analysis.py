@@ -140,7 +140,7 @@ def pressed(scenario: Scenario, grip: str, stiffness: float, share: float) -> fl
 
     The force scale ramps from a stable value to `share` of the scenario's.
     """
-    tip, ball = NominalSlave(scenario.slave).start_tip, 4e5  # N/m, in series
+    tip, ball = NominalSlave(scenario.slave).p_WTip_start, 4e5  # N/m, in series
     wall = Wall(
         position=tip.tolist(),
         stiffness=stiffness * ball / (ball - stiffness),

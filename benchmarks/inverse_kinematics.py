@@ -59,7 +59,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
     MIN_SINGULAR_VALUE_M,
     find_posture,
     follow_pose,
-    orientation_length,
+    orientation_weight_m,
 )
 from drake_teleop.station.slave.plant import ParseSlave, finalize_without_limit_warnings
 
@@ -196,7 +196,7 @@ class Follower:
     """Repeated calls of `follow_pose`, as in a station."""
 
     def __init__(self, arm: ArmModel, q: Array) -> None:
-        self.arm, self.L, self.posture, self.q = arm, orientation_length(arm), q.copy(), q.copy()
+        self.arm, self.L, self.posture, self.q = arm, orientation_weight_m(arm), q.copy(), q.copy()
         self.max_step = arm.velocity_limit * PERIOD
 
     def __call__(self, pose: Array) -> int:
@@ -357,7 +357,7 @@ class ClosedForm:
 
 def against_the_closed_form(arm: ArmModel, poses: int) -> dict[str, Any]:
     """Return figures from references up to 0.02 rad off, away from damped steps."""
-    random, worst, L = np.random.default_rng(1), 0.0, orientation_length(arm)
+    random, worst, L = np.random.default_rng(1), 0.0, orientation_weight_m(arm)
     statuses: Counter[str] = Counter()
     while statuses.total() < poses:
         q = random.uniform(arm.lower + 0.1, arm.upper - 0.1)

@@ -221,7 +221,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
     times = times_of(drawn, sum(mean_delay(line) for line in channel.networks_of_directions()))
     base = replace(base_scenario("contact_transition", seed), slave=slave, wrist_sensor__ideal=True)
     nominal = NominalSlave(slave)
-    tip = nominal.start_tip - [0.0, 0.0, GAP]
+    tip = nominal.p_WTip_start - [0.0, 0.0, GAP]
     beside = np.array([math.cos(drawn.azimuth), math.sin(drawn.azimuth)])
     if drawn.shape == "wall":
         normal = [*(math.sin(drawn.tilt) * beside), math.cos(drawn.tilt)]

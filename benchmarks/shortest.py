@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from drake_teleop.lab.excitation.limits import motion_of_sensor, motions_of_links
+from drake_teleop.lab.excitation.limits import link_motion_series, sensor_motion_series
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import design_shortest_motion
 from drake_teleop.load.normal_equations import identify
@@ -68,7 +68,7 @@ def reached(
     sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.heaviest_phi
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
-    vectors = motion_of_sensor(motions_of_links(table, *joints))
+    vectors = sensor_motion_series(link_motion_series(table, *joints))
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     noisy = without_parts(sensor, "calibration")
     constants, memory = initialize_sensor_chain(noisy, joints[0].shape[1], period)

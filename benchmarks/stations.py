@@ -138,7 +138,7 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
             dataclasses.replace(move, translation=[own * share * x for x in move.translation])
             for move in scenario.operator.intent
         ]
-        tip = NominalSlave(slave).start_tip
+        tip = NominalSlave(slave).p_WTip_start
         blocks = [
             dataclasses.replace(block, position=(tip + _BEFORE).tolist())
             for block in scenario.environment

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab import identified_load as module
-from drake_teleop.lab.identified_load import CACHE_VARIABLE, identified_load
+from drake_teleop.lab.identified_load import CACHE_ENV_NAME, identified_load
 from drake_teleop.lab.run import run_command, run_scenario
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification
@@ -52,7 +52,7 @@ def identifications(monkeypatch, tmp_path):
         return SimpleNamespace(identification=FOUND, noise_floor=lambda arm: FLOOR)
 
     monkeypatch.setattr(module, "identify_load", identify)
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(CACHE_ENV_NAME, str(tmp_path / "cache"))
     return asked
 
 
@@ -203,7 +203,7 @@ def test_failed_write_leaves_no_file_and_is_no_error(identifications, tmp_path, 
     assert not identified_load(Scenario(), fresh=True).from_cache
     assert list((tmp_path / "cache").iterdir()) == [path]
     assert identified_load(Scenario()).from_cache  # concurrent readers get the complete old file
-    monkeypatch.setenv(CACHE_VARIABLE, str(path))  # a file instead of a folder
+    monkeypatch.setenv(CACHE_ENV_NAME, str(path))  # a file instead of a folder
     assert not identified_load(Scenario()).from_cache
 
 

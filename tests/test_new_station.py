@@ -68,7 +68,7 @@ def test_station_is_written_and_run(tmp_path, runs, capsys):
     way = 1.5 * plan.swing_amplitude_m + 0.01
     assert way / scale <= 0.113 / 2
     # The distance from the tool's lowest point to the wall, which the tool enters by at most 1 cm.
-    tip = NominalSlave(scenario.slave).start_tip
+    tip = NominalSlave(scenario.slave).p_WTip_start
     wall = scenario.environment[0].position[2]
     assert wall == pytest.approx(tip[2] - 1.5 * plan.swing_amplitude_m, abs=1e-3)
     into = -scenario.operator.intent[1].translation[2] * scale - (tip[2] - wall)

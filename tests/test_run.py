@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import (
-    FILTER_TAIL_S,
+    FILTER_SETTLING_S,
     ScenarioRun,
     _detection_delays,
     _moving_body_displacements,
@@ -229,7 +229,7 @@ def test_bounces_belong_to_one_contact():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("before_s", "counts"), [(0.5 * FILTER_TAIL_S, False), (1.5 * FILTER_TAIL_S, True)]
+    ("before_s", "counts"), [(0.5 * FILTER_SETTLING_S, False), (1.5 * FILTER_SETTLING_S, True)]
 )
 @pytest.mark.parametrize("end", [False, True], ids=["before the contact", "after the contact"])
 def test_residual_leaves_out_the_time_beside_a_contact(contact, before_s, counts, end):

@@ -205,7 +205,7 @@ def test_fault_at_the_hand_is_reported_unless_the_slave_has_one():
 
 def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
     """The face of the wall is 20 mm above or below the end of the tool."""
-    tip = NominalSlave(Scenario().slave).start_tip
+    tip = NominalSlave(Scenario().slave).p_WTip_start
     for depth, count in ((0.02, 1), (-0.02, 0)):
         wall = Wall(position=[*tip[:2], tip[2] + depth], size=[0.05, 0.05])
         found = run_warnings(recorded(), replace(OVER_NETWORK, environment=[wall]), ARM)

@@ -13,8 +13,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.new_station import scenario_text
 from drake_teleop.lab.new_station.place import (
-    _find_roomy_holdable_postures,
     _order_postures_to_solve,
+    _rows_away_from_limits,
     find_start_place,
     sensor_axis_along_last_joint,
 )
@@ -39,7 +39,7 @@ from drake_teleop.station.slave.arm import (
     holding_torque,
     pose_into,
 )
-from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
+from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_weight_m
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.posture_shapes import (
     PostureShapes,
@@ -153,7 +153,7 @@ def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
     assert (part[0] < 0.7 * limit).all() and (part[1] > 0.7 * limit).any()
     assert (whole > 0.7 * limit).any(axis=1).all()
     weak = replace(arm, effort_limit=limit)
-    np.testing.assert_array_equal(_find_roomy_holdable_postures(weak, q), [0])
+    np.testing.assert_array_equal(_rows_away_from_limits(weak, q), [0])
 
 
 def test_singular_values_agree_with_finite_differences_of_turning_and_sliding_joints():
@@ -164,7 +164,7 @@ def test_singular_values_agree_with_finite_differences_of_turning_and_sliding_jo
     moved = postures_at(sliding, q + step * np.vstack([np.eye(6), -np.eye(6)]))
     turns = Rotation.from_matrix(moved.R_WS[:6]) * Rotation.from_matrix(moved.R_WS[6:]).inv()
     linear = moved.p_WS[:6] - moved.p_WS[6:]
-    columns = np.hstack([linear, orientation_length(sliding) * turns.as_rotvec()]) / (2.0 * step)
+    columns = np.hstack([linear, orientation_weight_m(sliding) * turns.as_rotvec()]) / (2.0 * step)
     found = _jacobian_singular_values(sliding, postures_at(sliding, q[np.newaxis]))[0]
     np.testing.assert_allclose(found, np.linalg.svd(columns, compute_uv=False), atol=1e-8)
 
@@ -307,13 +307,13 @@ def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     shapes = plain[1].posture_shapes
     postures, region = select_suitable_postures(random_postures(shapes.arm), 0.0, 0.1)
     usable, clear, clear_of_all = _order_postures_to_solve(shapes.arm, postures, region, shapes)
-    expected = _find_roomy_holdable_postures(shapes.arm, postures.q)
+    expected = _rows_away_from_limits(shapes.arm, postures.q)
     np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
     assert 3 < len(clear) < len(usable) < len(postures.q)
     assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
     for row in usable[:: len(usable) // 500 + 1]:
         shapes.move_to(postures.q[row])
-        assert (row in clear) != bool(overlap_warnings(shapes, of_arm=True))
+        assert (row in clear) != bool(overlap_warnings(shapes, slave_only=True))
     (only,) = _order_postures_to_solve(shapes.arm, postures, region, None)
     np.testing.assert_array_equal(only, usable)
 
@@ -398,7 +398,7 @@ def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None
     torque = np.abs([holding_torque(arm, each) for each in q])
     limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
     weak = replace(arm, effort_limit=limit)
-    kept = q[_find_roomy_holdable_postures(weak, q)]
+    kept = q[_rows_away_from_limits(weak, q)]
     roomy = least_joint_margins(weak, q) > 0.22
     assert 0 < roomy.sum() < len(q)
     if share > 1.0:

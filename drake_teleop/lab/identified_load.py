@@ -24,7 +24,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.station.scenario import Scenario, check_scenario
 
-CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
+CACHE_ENV_NAME = "DRAKE_TELEOP_CACHE_DIR"
 """Environment variable with the cache folder."""
 MAX_CACHED_FILES = 2000
 """Maximum number of cached files; each has 5 kB."""
@@ -78,7 +78,7 @@ def identified_load(
 def cache_folder() -> Path:
     from platformdirs import user_cache_path
 
-    return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))
+    return Path(os.environ.get(CACHE_ENV_NAME) or user_cache_path("drake_teleop", appauthor=False))
 
 
 def _hash_source_files(package: Path, models: Path) -> str:

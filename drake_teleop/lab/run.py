@@ -45,7 +45,7 @@ _SCENARIO_FILE_NAME = "scenario.yaml"
 _RESULT_FILE_NAMES = (
     *("sensor_log.parquet", "identification.json", "overview.png", "replay.html", "session.json"),
 )
-FILTER_TAIL_S = 0.01
+FILTER_SETTLING_S = 0.01
 """Settling time of the sensor's filter after a contact [s]."""
 
 
@@ -239,11 +239,11 @@ def _format_ms(delay: float | None) -> str:
 
 
 def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return whether each sample (N,) is in contact; gaps below `FILTER_TAIL_S` are closed."""
+    """Return whether each sample (N,) is in contact; gaps below `FILTER_SETTLING_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touch = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    return _since_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_TAIL_S
+    return _since_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_SETTLING_S
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
@@ -256,8 +256,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     calculated = contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
     contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
-    free = _since_contact_s(contact, result.t) > FILTER_TAIL_S
-    free &= _until_contact_s(contact, result.t) > FILTER_TAIL_S
+    free = _since_contact_s(contact, result.t) > FILTER_SETTLING_S
+    free &= _until_contact_s(contact, result.t) > FILTER_SETTLING_S
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
@@ -315,7 +315,7 @@ def _detection_delays(result: SimulationResult, spans: list[tuple[float, float]]
             delays.append(1e3 * float(times[0] - start) if len(times) else None)
         summary[key] = delays
     onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
-    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL_S for a, b in spans)]
+    false = [x for x in onsets if not any(a <= x <= b + FILTER_SETTLING_S for a, b in spans)]
     return summary | {"false_contacts": len(false)}
 
 

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.channel.channel import TeleopChannel
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario
-from drake_teleop.station.slave.joint_control import servo_at_tool
+from drake_teleop.station.slave.joint_control import servo_impedance
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
 from drake_teleop.station.wiring import export_outputs
 
@@ -98,7 +98,7 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
-    stiffness, damping, mass = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
+    stiffness, damping, mass = servo_impedance(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
         passivity, servo_stiffness=stiffness, servo_damping=damping, slave_mass=mass
     )

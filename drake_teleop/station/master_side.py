@@ -110,5 +110,5 @@ def _make_operator(scenario: Scenario, start_B: Array) -> Operator:
     gains = scaling.translation_scale, forces.scales().gamma * forces.force_scale
     training = OperatorTraining(scaling.R_WB, *gains, forward, backward, scenario.simulation.seed)
     slave = NominalSlave(scenario.slave)
-    tip = np.concatenate([slave.tip, slave.start_tip])
+    tip = np.concatenate([slave.tip, slave.p_WTip_start])
     return Operator(scenario.operator, start_B, training, slave.arm, tip)

@@ -88,7 +88,7 @@ def MakeSlaveSide(
         connect_ports(builder, controller, "joint_torque", joint_control, "requested_torque")
     else:
         follows_leader = scenario.master.is_joint_leader
-        name = joint_commands.ik_method_name(scenario.slave.inverse_kinematics, arm)
+        name = joint_commands.used_ik_method(scenario.slave.inverse_kinematics, arm)
         make_ik = joint_commands.IK_METHODS[name]
         if follows_leader:
             make_ik = joint_commands.LeaderJointFollower

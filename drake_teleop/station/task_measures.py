@@ -172,5 +172,5 @@ def _tip_error_W(result: SimulationResult, scenario: Scenario, task: Task, row: 
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     joints = result["slave_state"][row, : slave.arm.num_joints]
     forward_kinematics(slave.arm.table, joints, R_WS, p_WS)
-    off: Array = p_WS + R_WS @ slave.tip - slave.start_tip - np.array(task.translation)
+    off: Array = p_WS + R_WS @ slave.tip - slave.p_WTip_start - np.array(task.translation)
     return off

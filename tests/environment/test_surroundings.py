@@ -136,7 +136,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         plant.SetPositions(context, slave.instance, home + 0.01 * random.uniform(-1, 1, 6))
         turn = RollPitchYaw(random.uniform(-3, 3, 3))
         aside = RotationMatrix(turn) @ [0.05 if k % 2 else 0.5, 0.0, 0.0]
-        plant.SetFreeBodyPose(context, block, RigidTransform(turn, slave.start_tip + aside))
+        plant.SetFreeBodyPose(context, block, RigidTransform(turn, slave.p_WTip_start + aside))
         plant.GetJointByName("hinge").set_angle(context, 0.3 * random.uniform(-1, 1))
         plant.GetJointByName("slide").set_translation(context, 0.1 * random.uniform(-1, 1))
         size = plant.num_velocities()

@@ -24,7 +24,7 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.lab.excitation import excite as excite_module
 from drake_teleop.lab.excitation.check import check_motion, check_trajectory
 from drake_teleop.lab.excitation.excite import excite, trajectory_sensor_motion
-from drake_teleop.lab.excitation.limits import LIMIT_NAMES, motion_of_sensor, motions_of_links
+from drake_teleop.lab.excitation.limits import LIMIT_NAMES, link_motion_series, sensor_motion_series
 from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.optimizer import FeasibleIterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
@@ -178,7 +178,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     table, phi = slave.arm.table, slave.limits.heaviest_phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
-    vectors = motion_of_sensor(motions_of_links(table, *joints))
+    vectors = sensor_motion_series(link_motion_series(table, *joints))
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     constants, memory = initialize_sensor_chain(sensor, 6, period)
     estimator, remembered = initialize_motion_estimator(motion, sensor, 6, period)

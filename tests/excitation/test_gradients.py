@@ -21,8 +21,8 @@ from drake_teleop.lab.excitation.limits import (
     ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
     capsule_distances,
-    motions_of_links,
-    write_limit_uses,
+    link_motion_series,
+    max_limit_uses_into,
 )
 from drake_teleop.lab.excitation.optimizer import DesignProblem, _DescentSearch
 from drake_teleop.lab.excitation.prediction import (
@@ -196,8 +196,8 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     limits, rng = limits_of(arm), np.random.default_rng(3)
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
-    motions, gradient = motions_of_links(arm.table, q, qd, qdd), np.empty((7, 3, 30, 6))
-    smooth, largest = write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, gradient)
+    motions, gradient = link_motion_series(arm.table, q, qd, qdd), np.empty((7, 3, 30, 6))
+    smooth, largest = max_limit_uses_into(arm.table, q, qd, qdd, motions, limits, 20.0, gradient)
     assert np.all(smooth >= largest)
     R_WS, p_WS = motions[:, -1, 12:].reshape(-1, 3, 3), motions[:, -1, 9:12]
     points = p_WS[:, None] + np.einsum("tij,kj->tki", R_WS, limits.points_S)

@@ -361,4 +361,4 @@ def test_training_contains_scales_and_delays_of_the_station(monkeypatch):
     R_WB = RollPitchYaw(0.1, -0.2, 0.3).ToRotationMatrix().matrix()
     np.testing.assert_allclose(training.R_WB, R_WB)
     slave = NominalSlave(scenario.slave)
-    np.testing.assert_array_equal(tip, [*slave.tip, *slave.start_tip])
+    np.testing.assert_array_equal(tip, [*slave.tip, *slave.p_WTip_start])

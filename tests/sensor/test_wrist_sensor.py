@@ -216,7 +216,7 @@ def test_noisy_sensor_does_not_evaluate_plant_contact(monkeypatch):
         return asked[-1]
 
     def on_a_leaf(ideal: bool, asks: bool) -> tuple[np.ndarray, int]:
-        x, y, z = NominalSlave(Slave()).start_tip
+        x, y, z = NominalSlave(Slave()).p_WTip_start
         scenario = replace(
             Scenario(),
             sheet_spring=SheetSpring(position=[x, y, z - 1e-3]),

@@ -26,7 +26,7 @@ from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR_COLUMN
 from drake_teleop.station.slave.chain_joints import AddSkeleton
-from drake_teleop.station.slave.joint_commands import JointRangeMonitor, ik_method_name
+from drake_teleop.station.slave.joint_commands import JointRangeMonitor, used_ik_method
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
 from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool
@@ -124,14 +124,14 @@ def test_start_pose_and_assumptions(scenario):
 def test_arm_with_rx90_geometry_uses_closed_form():
     copy = Slave(model=str(models_dir() / "rx90.sdf"))
     arm = NominalSlave(copy).arm
-    assert ik_method_name("automatic", arm) == "closed_form"
+    assert used_ik_method("automatic", arm) == "closed_form"
     np.testing.assert_array_equal(NominalSlave(copy).start, NominalSlave(Slave()).start)
     np.testing.assert_array_equal(NominalSlave(copy).tip, [0.0, 0.0, 0.2])
     moved = Slave(base_pose=[0.1, -0.2, 0.3, 0.0, 0.0, 0.5])
     arm = NominalSlave(moved).arm
-    assert ik_method_name("automatic", arm) == "numeric"
+    assert used_ik_method("automatic", arm) == "numeric"
     with pytest.raises(DrakeTeleopError, match="closed form requires the geometry of an RX90"):
-        ik_method_name("closed_form", arm)
+        used_ik_method("closed_form", arm)
     plant, context = NominalSlave(moved).plant, NominalSlave(moved).plant.CreateDefaultContext()
     found = plant.GetFrameByName("sensor").CalcPoseInWorld(context)
     np.testing.assert_allclose(found.translation(), [0.55, 0.0, 0.45], atol=1e-8)

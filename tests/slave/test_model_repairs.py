@@ -452,7 +452,7 @@ def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
         model = ModelRepair(tmp_path, None, ModelPurpose(), tmp_path)
         link = ElementTree.fromstring(f'<link name="l">{text}{"</inertial>" * (k > 1)}</link>')
         check_lengths_and_inertias(link, "link l", model)
-        repair_inertia_and_detect_missing(link, model, is_sdf=False, at_rest=False)
+        repair_inertia_and_detect_missing(link, model, is_sdf=False, is_fixed=False)
         if allowed and not (k == 2 and value[0] == "-"):
             model.raise_faults()
         else:
@@ -490,7 +490,7 @@ def test_products_of_inertia_are_kept(tmp_path, izz, is_sdf):
         text = f'<mass value="2"/><inertia {words}/>'
     link = ElementTree.fromstring(f'<link name="l"><inertial>{text}</inertial></link>')
     model = ModelRepair(tmp_path, None, ModelPurpose(), tmp_path)
-    repair_inertia_and_detect_missing(link, model, is_sdf=is_sdf, at_rest=False)
+    repair_inertia_and_detect_missing(link, model, is_sdf=is_sdf, is_fixed=False)
     element = link.find("inertial/inertia")
     nearest, change = nearest_possible_inertia(inertia)
     assert (change > 0.0) == (izz == 0.09)

@@ -28,7 +28,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
     NumericInverseKinematics,
     find_posture,
     follow_pose,
-    orientation_length,
+    orientation_weight_m,
 )
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -99,7 +99,7 @@ def follow(case, pose, reference, *, max_step=np.inf, posture=None, pull=0.0):
     posture = np.array(reference if posture is None else posture, dtype=float)
     reference = np.array(reference, dtype=float)
     status = follow_pose(
-        arm.table, orientation_length(arm), pose, reference, arm.lower, arm.upper, far, posture,
+        arm.table, orientation_weight_m(arm), pose, reference, arm.lower, arm.upper, far, posture,
         pull, MIN_SINGULAR_VALUE_M, MAX_SOLVER_STEPS_PER_COMMAND, q,
     )  # fmt: skip
     return q, IkStatus(status)
@@ -253,7 +253,7 @@ def test_other_joints_compensate_for_joint_at_limit(rx90):
     assert status == IkStatus.JOINT_LIMIT
     assert q[0] == rx90.arm.upper[0]
     only_this_joint = np.append(q[0], beyond[1:])
-    L = orientation_length(rx90.arm)
+    L = orientation_weight_m(rx90.arm)
     ours, simply = (np.hypot(p, L * turn) for p, turn in (
         rx90.errors(pose, q), rx90.errors(pose, only_this_joint)))  # fmt: skip
     assert ours < 0.8 * simply

@@ -15,7 +15,7 @@ from drake_teleop.station.slave.joint_control import (
     POSITION_INTERFACES,
     JointControl,
     PositionInterface,
-    servo_at_tool,
+    servo_impedance,
 )
 from drake_teleop.station.slave.plant import NominalSlave
 
@@ -150,4 +150,4 @@ def test_scenario_overrides_single_interface_fields():
 def test_servo_at_tool_rejects_position_servo(arm):
     config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
     with pytest.raises(DrakeTeleopError, match="choose computed_torque"):
-        servo_at_tool(arm, HOME, config)
+        servo_impedance(arm, HOME, config)

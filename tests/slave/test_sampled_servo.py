@@ -18,7 +18,7 @@ from drake_teleop.station.slave.joint_control import (
 from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
 from drake_teleop.station.slave.sampled_servo import (
     SampledServo,
-    predict_torque_line,
+    predict_torque_ramp,
     servo_samples_per_event,
 )
 from drake_teleop.station.slave.slave_config import Slave
@@ -108,7 +108,7 @@ def test_one_sample_equals_joint_control_exactly():
         state = np.concatenate([slave.start, np.zeros(n)]) + random.normal(0.0, 0.3, 2 * n)
         scratch, line = np.zeros(3 * n), np.zeros(3 * n)
         computed_torque_into(slave.arm.table, command, state, *servo, scratch, torque)
-        predict_torque_line(
+        predict_torque_ramp(
             slave.arm.table, command, state, np.zeros(2), servo, slave.physics_of_plant, 1, 5e-4,
             scratch, line,
         )  # fmt: skip
@@ -122,7 +122,7 @@ def test_line_stays_within_torque_limits_and_survives_invalid_command():
     line = np.zeros(3 * n)
 
     def torques(command):
-        predict_torque_line(
+        predict_torque_ramp(
             arm.table, command, rest, np.zeros(2), servo, slave.physics_of_plant, 5, 1e-4,
             np.zeros(3 * n), line,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import inverse_dynamics, jacobian
 from drake_teleop.station.slave.home import home_posture
-from drake_teleop.station.slave.joint_control import operational_inertia, servo_at_tool
+from drake_teleop.station.slave.joint_control import operational_inertia, servo_impedance
 from drake_teleop.station.slave.plant import NominalSlave
 
 SCENARIO = Scenario()
@@ -42,7 +42,7 @@ def test_operational_inertia_gives_kinetic_energy(arm, home):
 def test_mass_bounds_kinetic_energy(arm, home):
     """One motion reaches the bound."""
     config = SCENARIO.joint_control
-    stiffness, damping, mass = servo_at_tool(arm, home, config)
+    stiffness, damping, mass = servo_impedance(arm, home, config)
     bound = np.diag(np.repeat(mass, 3))
     spare = np.linalg.eigvalsh(bound - operational_inertia(arm, home))
     assert spare[0] == pytest.approx(0.0, abs=1e-9) and mass[0] < 1e2
@@ -64,7 +64,7 @@ def test_ledger_uses_arm_mass_by_default(arm, home, monkeypatch):
         PassivityConfig(method="pspm"),
     ):
         MakeChannel(replace(SCENARIO, passivity=passivity))
-    expected = servo_at_tool(arm, home, SCENARIO.joint_control)
+    expected = servo_impedance(arm, home, SCENARIO.joint_control)
     assert (told[0].servo_stiffness, told[0].servo_damping, told[0].slave_mass) == expected
     assert told[1].slave_mass == [20.0, 0.5] and told[2].slave_mass is None
     assert told[1].servo_stiffness == told[2].servo_stiffness == PassivityConfig().servo_stiffness

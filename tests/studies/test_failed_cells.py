@@ -14,7 +14,7 @@ from scipy.stats import qmc
 from drake_teleop.lab.studies import pictures
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
-    Factorial,
+    FactorialModel,
     effects_table,
     fill_missing_values,
     main_effects,
@@ -152,7 +152,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
         table = random.normal(0, 3.0, 6) + random.normal(0, 0.5, (6, 6))
         table = fill_missing_values(np.where(seen, table, np.nan))
         for which, into in ((seen, inside), (np.ones_like(seen), narrow)):
-            found, halves = Factorial(levels, [3, 2], which).effects(table)
+            found, halves = FactorialModel(levels, [3, 2], which).effects(table)
             into.append(np.abs(found[0]) <= halves[0])
     assert np.mean(inside) >= 0.9  # 0.95 in the long run
     assert np.mean(narrow) < 0.8
@@ -164,7 +164,7 @@ def test_half_widths_equal_least_squares():
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = random.random((6, 4)) < 0.7
     table = fill_missing_values(np.where(seen, random.normal(size=(6, 4)), np.nan))
-    design = Factorial(levels, [3, 2], seen)
+    design = FactorialModel(levels, [3, 2], seen)
     weights = design.comparison_weights(0)[2]
     weights -= weights.mean(axis=0)
     X = np.hstack([np.repeat(np.eye(6), 4, axis=0), np.tile(np.eye(4), (6, 1))])[seen.ravel()]

@@ -109,7 +109,7 @@ def test_press_reaches_the_leaf_and_the_depth_at_the_masters_scale():
     assert press.t_start == pytest.approx(settle + task.press_start)
     assert press.t_start + press.duration == pytest.approx(settle + task.press_end)
     assert task.press_start == pytest.approx(2.3 + 0.07)
-    leaf, tip = setup.first_sheet_spring, NominalSlave(scaled.slave).start_tip
+    leaf, tip = setup.first_sheet_spring, NominalSlave(scaled.slave).p_WTip_start
     np.testing.assert_allclose(leaf.position, tip - [0.0, 0.0, 0.03])
     assert leaf.stiffness == pytest.approx(3000.0)
 

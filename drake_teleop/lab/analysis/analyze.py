@@ -171,7 +171,7 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
         remedy = "choose a scale above 0, or remove the sheet spring (sheet_spring or !SheetSpring)"
         raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
-    displacement = goal - NominalSlave(scenario.slave).start_tip
+    displacement = goal - NominalSlave(scenario.slave).p_WTip_start
     return list(scaling.R_WB.T @ displacement / scaling.translation_scale)
 
 

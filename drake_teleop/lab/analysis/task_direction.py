@@ -84,7 +84,7 @@ def task_direction(
     mobility = tool_W @ np.concatenate([a, alpha])
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
     servo, sheet = scenario.joint_control, scenario.first_sheet_spring
-    servo.check_computed_torque("the model of one axis")
+    servo.require_computed_torque("the model of one axis")
     scenario.master.check_pose_mode("the model of one axis")
     forward, backward = scenario.channel.networks_of_directions()
     axis = OneAxis(

@@ -85,7 +85,7 @@ def delayed_contact(
             (task.release_start, task.release_end, [-x for x in reach]),
         )
     )
-    x, y, z = NominalSlave(base.slave).start_tip.tolist()
+    x, y, z = NominalSlave(base.slave).p_WTip_start.tolist()
     sheet = SheetSpring(
         position=[x, y, z - _TIP_LEAF_GAP_M],
         length=_LEAF_SPRING_LENGTH_M,

@@ -114,17 +114,17 @@ class CollisionScene:
     """Plant and scene graph of the arm with its heaviest load.
 
     Args:
-        reserve: (10,) parameters phi of an additional load on the sensor.
+        extra_phi: (10,) parameters phi of an additional load on the sensor.
         visuals_collide: whether visual shapes also collide.
     """
 
     def __init__(
-        self, parse: ParseArm, reserve: Array, *, visuals_collide: bool, where: str = ""
+        self, parse: ParseArm, extra_phi: Array, *, visuals_collide: bool, where: str = ""
     ) -> None:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
-        _add_load(self.plant, instance, self.sensor_frame, reserve)
+        _add_load(self.plant, instance, self.sensor_frame, extra_phi)
         _complete_and_check_shapes(self.plant, self.scene_graph, visuals_collide, where)
         world, table = self.plant.world_body(), geometry.HalfSpace()
         _add_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)
@@ -191,7 +191,7 @@ class CollisionScene:
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
-        motions = limits.motions_of_links(self.arm.table, q, 0 * q, 0 * q)
+        motions = limits.link_motion_series(self.arm.table, q, 0 * q, 0 * q)
         capsules: dict[geometry.GeometryId, tuple[int, Capsule]] = {}
         shapes = {shape for pair in candidates for shape in pair}
         for shape in sorted(shapes, key=geometry.GeometryId.get_value):
@@ -215,7 +215,7 @@ class CollisionScene:
             shape_distances[first, second] = np.minimum(of_pair, known)
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         outer_capsules = [capsules[shape][1] for shape in outer_shapes]
-        motions = limits.motions_of_links(self.arm.table, postures, 0 * postures, 0 * postures)
+        motions = limits.link_motion_series(self.arm.table, postures, 0 * postures, 0 * postures)
         fields: dict[str, NDArray[Any]] = {
             "capsule_links": np.array([capsules[shape][0] for shape in outer_shapes], np.int64),
             "capsule_ends": np.array([each.ends for each in outer_capsules]).reshape(-1, 2, 3),

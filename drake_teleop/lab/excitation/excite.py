@@ -153,7 +153,7 @@ def trajectory_sensor_motion(
 ) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
     _, motions = _joint_and_link_motions(robot, trajectory)
-    s, omega, alpha = limits.motion_of_sensor(motions)
+    s, omega, alpha = limits.sensor_motion_series(motions)
     return s, omega, alpha
 
 
@@ -161,7 +161,7 @@ def _joint_and_link_motions(
     robot: Robot, trajectory: FourierTrajectory
 ) -> tuple[tuple[Array, Array, Array], Array]:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    return joints, limits.motions_of_links(robot.arm.table, *joints)
+    return joints, limits.link_motion_series(robot.arm.table, *joints)
 
 
 def _feasible_candidates(
@@ -204,4 +204,4 @@ def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     joints, motions = _joint_and_link_motions(robot, trajectory)
     gradients = np.empty((len(limits.LIMIT_NAMES), 3, *joints[0].shape))
     table, bounds = robot.arm.table, robot.limits
-    return limits.write_limit_uses(table, *joints, motions, bounds, 1e3, gradients)[1]
+    return limits.max_limit_uses_into(table, *joints, motions, bounds, 1e3, gradients)[1]

@@ -73,7 +73,7 @@ def finite_half_ranges(q_half: Array) -> Array:
 
 
 @njit(cache=True)
-def motions_of_links(table, q, qd, qdd):
+def link_motion_series(table, q, qd, qdd):
     """Return all links' motions (T, n+1, 21) at T samples q, qd, qdd (T, n)."""
     motions = np.empty((len(q), q.shape[1] + 1, SENSOR_MOTION_SIZE))
     for t in range(len(q)):
@@ -82,7 +82,7 @@ def motions_of_links(table, q, qd, qdd):
 
 
 @njit(cache=True)
-def motion_of_sensor(motions):
+def sensor_motion_series(motions):
     """Return specific force, omega, alpha (3, T, 3) of the sensor, in S."""
     out = np.empty((3, len(motions), 3))
     for t in range(len(motions)):
@@ -109,7 +109,7 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
 
 
 @njit(cache=True)
-def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, gradient):
+def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient):
     """Return the largest use of each of `LIMIT_NAMES` over all samples, smooth and exact (7,), T47.
 
     Write the gradient (7, 3, T, n) of the smooth one by joint positions, velocities, accelerations.
@@ -123,12 +123,12 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, gradient):
         largest[k], smooth[k] = _exact_and_smooth_maximum(use, sharpness)
         gradient[k, k] = use * (np.sign(x) / scales[k])
     samples = table, q, qd, qdd, motions
-    largest[3], smooth[3] = _write_torque_use(samples, limits, sharpness, gradient[3])
-    largest[4], smooth[4] = _write_sensor_use(samples, limits, sharpness, gradient[4])
-    largest[5], smooth[5] = _write_workspace_use(samples, limits, sharpness, gradient[5])
+    largest[3], smooth[3] = _max_torque_use_into(samples, limits, sharpness, gradient[3])
+    largest[4], smooth[4] = _max_sensor_use_into(samples, limits, sharpness, gradient[4])
+    largest[5], smooth[5] = _max_workspace_use_into(samples, limits, sharpness, gradient[5])
     largest[6] = smooth[6] = 0.0
     if len(limits.capsule_pairs) > 0:
-        largest[6], smooth[6] = _write_clearance_use(samples, limits, sharpness, gradient[6])
+        largest[6], smooth[6] = _max_clearance_use_into(samples, limits, sharpness, gradient[6])
     return smooth, largest
 
 
@@ -163,7 +163,7 @@ def _pull_back_seeds_of_sample(table, qd, qdd, motions, t, gradient, work):
 
 
 @njit(cache=True, inline="always")
-def _write_torque_use(samples, limits, sharpness, gradient):
+def _max_torque_use_into(samples, limits, sharpness, gradient):
     table, q, qd, qdd, motions = samples
     tau = np.empty(q.shape)
     for t in range(len(q)):
@@ -186,9 +186,9 @@ def _write_torque_use(samples, limits, sharpness, gradient):
 
 
 @njit(cache=True, inline="always")
-def _write_sensor_use(samples, limits, sharpness, gradient):
+def _max_sensor_use_into(samples, limits, sharpness, gradient):
     table, _, qd, qdd, motions = samples
-    sensor, size = motion_of_sensor(motions), np.empty((len(motions), 4))
+    sensor, size = sensor_motion_series(motions), np.empty((len(motions), 4))
     x = np.empty((len(motions), 12))  # force, torque, s, alpha in S
     x[:, 6:9], x[:, 9:] = sensor[0], sensor[2]
     for t in range(len(motions)):
@@ -217,7 +217,7 @@ def _write_sensor_use(samples, limits, sharpness, gradient):
 
 
 @njit(cache=True, inline="always")
-def _write_workspace_use(samples, limits, sharpness, gradient):
+def _max_workspace_use_into(samples, limits, sharpness, gradient):
     table, _, qd, qdd, motions = samples
     T, P = len(motions), len(limits.points_S)
     x = np.empty((T, P, 3))
@@ -241,7 +241,7 @@ def _write_workspace_use(samples, limits, sharpness, gradient):
 
 
 @njit(cache=True, inline="always")
-def _write_clearance_use(samples, limits, sharpness, gradient):
+def _max_clearance_use_into(samples, limits, sharpness, gradient):
     table, _, qd, qdd, motions = samples
     T, K = len(motions), len(limits.capsule_pairs)
     use, ends = np.empty((T, K)), np.empty((T, *limits.capsule_ends.shape))
@@ -282,7 +282,7 @@ def _write_clearance_use(samples, limits, sharpness, gradient):
 def capsule_distances(motions, capsule_links, capsule_ends, capsule_radius, capsule_pairs):
     """Return the distances (T, K) of K capsule pairs [m], negative for overlaps.
 
-    `motions` are from `motions_of_links`, others of `Limits`.
+    `motions` are from `link_motion_series`, others of `Limits`.
     """
     distances = np.empty((len(motions), len(capsule_pairs)))
     placed = np.empty(capsule_ends.shape)

@@ -42,11 +42,11 @@ def rotate_to_link(motion, a):
 
 
 @njit(cache=True)
-def add_vector_to_seed(motion, place, gradient, seed):
-    """Add to a link's `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in its frame."""
+def add_vector_to_seed(motion, offset, gradient, seed):
+    """Add to a link's `seed` a derivative by s, omega or alpha (`offset` 0, 3, 6), in its frame."""
     g = rotate_to_world(motion, gradient)
-    add_vector_into(seed, place, g)
-    add_vector_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, place)))
+    add_vector_into(seed, offset, g)
+    add_vector_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, offset)))
 
 
 @njit(cache=True)

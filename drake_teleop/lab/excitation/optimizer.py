@@ -99,8 +99,8 @@ class DesignProblem:
         q_qd_qdd[0] += x[:n]
         q_qd_qdd[1] /= slowdown
         q_qd_qdd[2] /= slowdown**2
-        self._motions = limits.motions_of_links(self._table, *q_qd_qdd)
-        self._vectors = limits.motion_of_sensor(self._motions)
+        self._motions = limits.link_motion_series(self._table, *q_qd_qdd)
+        self._vectors = limits.sensor_motion_series(self._motions)
         return q_qd_qdd
 
     def _write_gradients(
@@ -109,7 +109,7 @@ class DesignProblem:
         # Gradients (8, 3, T, n) of a function of V and of uses; returns smooth and largest uses.
         gradients[0] = 0.0
         limits.add_gradient_by_joints(self._table, self._motions, *q_qd_qdd[1:], g_V, gradients[0])
-        smooth, largest = limits.write_limit_uses(
+        smooth, largest = limits.max_limit_uses_into(
             self._table, *q_qd_qdd, self._motions, self._limits, sharpness, gradients[1:]
         )
         return smooth, float(largest.max())

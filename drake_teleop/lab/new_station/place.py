@@ -40,7 +40,7 @@ from drake_teleop.station.slave.arm import (
     holding_torque,
     pose_into,
 )
-from drake_teleop.station.slave.home import R_WS_HOME, positions_with_tool_down
+from drake_teleop.station.slave.home import R_WS_HOME, q_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_warnings
@@ -61,7 +61,7 @@ _CUBE_HALF_EDGES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of t
 # Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise; of
 # postures whose shapes are checked if all solved ones overlap.
 _NUM_SOLVED_POSTURES, _NUM_BEST_STARTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
-_MAX_SCORE_LOSS = 0.3  # largest disadvantage of a start with a larger cube
+_MAX_SCORE_LOSS_FOR_LARGER_CUBE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 _MAX_ERROR_OVER_DISPLACEMENT = 0.1  # error of an arm with few joints, over displacement
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
@@ -161,7 +161,7 @@ def find_start_place(
         if not all(place.has_overlaps for place in found):
             break
     found.sort(key=lambda place: place.posture_score, reverse=True)
-    least_score = found[0].posture_score - _MAX_SCORE_LOSS if found else 0.0
+    least_score = found[0].posture_score - _MAX_SCORE_LOSS_FOR_LARGER_CUBE if found else 0.0
     good = [place for place in found if place.posture_score > least_score]
     best = None
     for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
@@ -182,7 +182,7 @@ def find_start_place(
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
-def _find_roomy_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+def _rows_away_from_limits(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
     roomy = least_joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
     for share in (1.0, MIN_LOAD_SHARE_HELD_BY_MOTORS):
@@ -200,7 +200,7 @@ def _order_postures_to_solve(
     if not len(postures.q):
         return
     order = np.argsort(posture_scores(arm, postures, region))[::-1]
-    usable = order[np.isin(order, _find_roomy_holdable_postures(arm, postures.q))]
+    usable = order[np.isin(order, _rows_away_from_limits(arm, postures.q))]
     yield usable
     if shapes is None:
         return
@@ -209,7 +209,7 @@ def _order_postures_to_solve(
         clear = np.ones(len(few), dtype=bool)
         for k, row in enumerate(few):
             shapes.move_to(postures.q[row])
-            clear[k] = not overlap_warnings(shapes, of_arm=True)
+            clear[k] = not overlap_warnings(shapes, slave_only=True)
         yield few[clear]
 
 
@@ -223,7 +223,7 @@ def _solved_starts(
         solved = [s for q, p_WS in pairs for s in _starts_at_rounded_position(arm, q, p_WS)]
     if not solved:
         return
-    rows = _find_roomy_holdable_postures(arm, np.array([q for q, _, _ in solved]))
+    rows = _rows_away_from_limits(arm, np.array([q for q, _, _ in solved]))
     solved = [solved[k] for k in rows]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), least_joint_margins(arm, exact.q)
@@ -246,7 +246,7 @@ def _starts_at_rounded_position(
         R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
         pose = np.array([*R_WA.ToQuaternion().wxyz(), *position])
         if yaw_deg == 0.0 or has_closed_form(arm):
-            usual, status = positions_with_tool_down(arm, position, R_WA)
+            usual, status = q_with_tool_down(arm, position, R_WA)
             if status == IkStatus.OK:
                 yield usual, pose, yaw_deg == 0.0
         if not has_closed_form(arm):

@@ -33,7 +33,7 @@ _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
 # 680 N/m with medium grip.
-_WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
+_WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS_N_M = 2000.0, 400.0
 SWING_HZ, _MAX_JOINT_SPEED_USE = 1.0, 0.5  # Hz; largest share of the joint speed limits
 
 
@@ -106,7 +106,7 @@ def plan_station(
     peak = PEAK_FORCE_N if figures is None else figures.peak_force
     translation_scale = _floor_to_two_significant_digits(min(place.cube_half_m / room, 1.0))
     by_force = peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N)
-    by_stiffness = _MAX_DISPLAYED_STIFFNESS / (_WALL_STIFFNESS_N_M * translation_scale)
+    by_stiffness = _MAX_DISPLAYED_STIFFNESS_N_M / (_WALL_STIFFNESS_N_M * translation_scale)
     shapes.move_to(place.q)
     lowest = start.lowest_tool_point(shapes)
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
@@ -131,7 +131,7 @@ def plan_station(
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
         tool_axis_advice=start.tool_frame_advice(arm, sensor_frame, axis),
-        overlap_warnings=tuple(overlap_warnings(shapes, of_arm=True)),
+        overlap_warnings=tuple(overlap_warnings(shapes, slave_only=True)),
         base_plane_height=plane,
         weak_joints=weak_joints,
         posture_shapes=shapes,

@@ -15,7 +15,7 @@ from drake_teleop.station.slave.arm import (
     TRANSLATION_COLUMN,
     ArmModel,
 )
-from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
+from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_weight_m
 from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 
 NUM_RANDOM_POSTURES = 20_000
@@ -33,7 +33,7 @@ _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for 
 _HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_JOINT_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
 _MAX_RATIO_OF_ZERO_SINGULAR_VALUE = 1e-9  # singular values that are 0, over the largest
-_MAX_NEUTRAL_ELBOW_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
+_MAX_NEUTRAL_ELBOW_OFFSET_OVER_REACH = 0.03  # smaller offsets have no direction
 #: Sufficient values: margin to limits, smallest singular value over L, elbow up.
 _SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
@@ -171,7 +171,7 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     It combines limits, singularities, elbow, base plane and preferred place.
     """
     margin = np.minimum(least_joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
-    L = orientation_length(arm)
+    L = orientation_weight_m(arm)
     # Only as many singular values as the arm has degrees of freedom.
     rank = sensor_degrees_of_freedom(arm, postures)
     smallest = _jacobian_singular_values(arm, postures)[:, rank - 1]
@@ -193,11 +193,11 @@ def least_joint_margins(arm: ArmModel, q: Array) -> Array:
 
 
 def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
-    # Rotations are multiplied by `orientation_length` [m].
+    # Rotations are multiplied by `orientation_weight_m` [m].
     slides = (arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0)[:, None]
     arms = postures.p_WS[:, None] - postures.origins
     linear = np.where(slides, postures.axes, np.cross(postures.axes, arms))
-    angular = np.where(slides, 0.0, orientation_length(arm) * postures.axes)
+    angular = np.where(slides, 0.0, orientation_weight_m(arm) * postures.axes)
     return np.linalg.svd(np.concatenate([linear, angular], 2), compute_uv=False)
 
 
@@ -222,4 +222,4 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     rows, farthest = np.arange(len(sizes)), sizes.argmax(axis=1)
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
-    return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
+    return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET_OVER_REACH * reach, up, 1.0)

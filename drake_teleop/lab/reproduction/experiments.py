@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, UpdateProgress
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
-from drake_teleop.lab.run import FILTER_TAIL_S, is_in_contact
+from drake_teleop.lab.run import FILTER_SETTLING_S, is_in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.operator.operator import Sine
@@ -68,7 +68,7 @@ class RunsWithAndWithoutContact:
     def response_span_s(self) -> tuple[float, float]:
         """First contact, and end of the filters' response to the last; inf without contact [s]."""
         times = self.touched.result.t[self.in_contact]
-        return (times[0], times[-1] + FILTER_TAIL_S) if len(times) else (np.inf, np.inf)
+        return (times[0], times[-1] + FILTER_SETTLING_S) if len(times) else (np.inf, np.inf)
 
     @property
     def threshold_N(self) -> float:

@@ -19,10 +19,10 @@ from drake_teleop.common.numeric import Array
 _LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e-6), np.log(1.0))
 
 
-def propose_points(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
+def propose_points(points: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
     """Return the indices of the `count` candidates with the largest expected improvement.
 
-    `places` (n, d) and `candidates` (m, d) have coordinates from 0 to 1; `objective` (n,) is
+    `points` (n, d) and `candidates` (m, d) have coordinates from 0 to 1; `objective` (n,) is
     minimised; nan counts as the worst value.
     """
     y = np.array(objective, dtype=float)
@@ -30,42 +30,42 @@ def propose_points(places: Array, objective: ArrayLike, candidates: Array, count
         return list(range(count))
     y = np.where(np.isfinite(y), y, np.nanmax(np.where(np.isfinite(y), y, np.nan)))
     y = (y - y.mean()) / (y.std() or 1.0)
-    lengths, noise = _fit_kernel_lengths_and_noise(places, y)
-    places, candidates = places / lengths, candidates / lengths
+    lengths, noise = _fit_kernel_lengths_and_noise(points, y)
+    points, candidates = points / lengths, candidates / lengths
     chosen: list[int] = []
     for _ in range(count):
-        mean, deviation = _predict_points(places, y, candidates, noise)
+        mean, deviation = _predict_points(points, y, candidates, noise)
         # Improvement over the best predicted mean, not over the best noisy value.
-        best = _predict_points(places, y, places, noise)[0].min()
+        best = _predict_points(points, y, points, noise)[0].min()
         u = (best - mean) / deviation
         improvement = deviation * (u * ndtr(u) + norm.pdf(u))
         improvement[chosen] = -1.0
         chosen.append(int(np.argmax(improvement)))
-        places = np.vstack([places, candidates[chosen[-1]]])
+        points = np.vstack([points, candidates[chosen[-1]]])
         y = np.append(y, mean[chosen[-1]])
     return chosen
 
 
-def _fit_kernel_lengths_and_noise(places: Array, y: Array) -> tuple[Array, float]:
+def _fit_kernel_lengths_and_noise(points: Array, y: Array) -> tuple[Array, float]:
     def misfit(x: Array) -> float:
-        K = _matern_kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
+        K = _matern_kernel(points / np.exp(x[:-1]), points / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])
         factor = cho_factor(K, lower=True)
         logarithm = np.log(np.diag(factor[0])).sum()
         return float(0.5 * y @ cho_solve(factor, y) + logarithm)
 
-    bounds = [_LOG_LENGTH_BOUNDS] * places.shape[1] + [_LOG_NOISE_BOUNDS]
-    starts = (np.log([length] * places.shape[1] + [0.1]) for length in (0.3, 1.5))
+    bounds = [_LOG_LENGTH_BOUNDS] * points.shape[1] + [_LOG_NOISE_BOUNDS]
+    starts = (np.log([length] * points.shape[1] + [0.1]) for length in (0.3, 1.5))
     found = [minimize(misfit, start, method="L-BFGS-B", bounds=bounds) for start in starts]
     x = min(found, key=lambda result: result.fun).x
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 
 
-def _predict_points(places: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
-    K = _matern_kernel(places, places)
+def _predict_points(points: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
+    K = _matern_kernel(points, points)
     K[np.diag_indices_from(K)] += noise
     lower, _ = cho_factor(K, lower=True)
-    cross = _matern_kernel(places, queries)
+    cross = _matern_kernel(points, queries)
     mean = cross.T @ cho_solve((lower, True), y)
     explained = np.sum(solve_triangular(lower, cross, lower=True) ** 2, axis=0)
     return mean, np.sqrt(np.maximum(1.0 - explained, 1e-12))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Factorial:
+class FactorialModel:
     """Points of a factorial design at which a measure has values.
 
     Attributes:
@@ -46,14 +46,14 @@ class Factorial:
     counts: list[int]
     has_value: BooleanArray
 
-    def comparison_weights(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
+    def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
+        """Return flags of comparable levels of `factors` and of used combinations, and a matrix.
 
         For two factors, a level is a pair of levels. The matrix (comparable levels, n) maps values
         of points to means over the used combinations of the other factors' levels.
         """
-        others = [factor for factor in range(len(self.counts)) if factor not in shown]
-        row, rows = self._combination_indices(shown)
+        others = [factor for factor in range(len(self.counts)) if factor not in factors]
+        row, rows = self._combination_indices(factors)
         column, columns = self._combination_indices(others)
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
@@ -231,11 +231,11 @@ class _MeasureData:
         points = rows.unique("point", keep="first").sort("point")
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [factor_levels(f, c) for f, c in zip(self.factors, columns, strict=True)]
-        self.model: Factorial | LevelModel | None
+        self.model: FactorialModel | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
             counts = [len(levels.names) for levels in self.levels]
-            self.model = Factorial(index, counts, seen[used])
+            self.model = FactorialModel(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
             self.model = fit_level_model(self.factors, columns, known, by_chance=by_chance)
@@ -275,15 +275,15 @@ class _MeasureData:
         return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
     def _reasons_and_counts(
-        self, compared: BooleanArray, cell: NDArray[np.int64], over: BooleanArray, *shown: int
+        self, compared: BooleanArray, cell: NDArray[np.int64], over: BooleanArray, *factors: int
     ) -> tuple[list[str], int, int, bool]:
         # The last four fields of `MainEffect`; `over` flags the used combinations.
         points, runs = (np.bincount(cell, each, len(compared)) for each in (None, self.runs))
         why = missing_value_reasons(compared, points, runs)
         why = [TOO_FEW_POINTS] * len(compared) if self.model is None else why
-        total = math.prod(len(f.names) for k, f in enumerate(self.levels) if k not in shown)
+        total = math.prod(len(f.names) for k, f in enumerate(self.levels) if k not in factors)
         used = round(np.mean(over) * total)
-        return why, used, total - used, not isinstance(self.model, Factorial)
+        return why, used, total - used, not isinstance(self.model, FactorialModel)
 
 
 def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array:

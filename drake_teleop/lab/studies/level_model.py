@@ -26,33 +26,33 @@ NOT_COMPARABLE = "not comparable with the others"
 TOO_FEW_POINTS = "too few points"
 
 
-def largest_complete_block(there: BooleanArray) -> tuple[BooleanArray, BooleanArray]:
+def largest_complete_block(has_value: BooleanArray) -> tuple[BooleanArray, BooleanArray]:
     """Return rows and columns of the largest block without missing values.
 
-    `there` is True where a level (row) has a value at a combination (column).
+    `has_value` is True where a level (row) has a value at a combination (column).
     """
-    counts = there.sum(axis=0)
-    patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
+    counts = has_value.sum(axis=0)
+    patterns, times = np.unique(has_value[:, counts == counts.max()], axis=1, return_counts=True)
     rows = patterns[:, np.argmax(times)]
-    return rows, np.logical_and.reduce(there[rows], axis=0)
+    return rows, np.logical_and.reduce(has_value[rows], axis=0)
 
 
 def missing_value_reasons(
-    compared: BooleanArray, runs: NDArray[np.int64], good: NDArray[np.int64]
+    compared: BooleanArray, runs: NDArray[np.int64], successes: NDArray[np.int64]
 ) -> list[str]:
     """Return for each level or cell why it has no value; "" where `compared` is True.
 
-    `runs` and `good` count its points, and its runs with a value.
+    `runs` and `successes` count its points, and its runs with a value.
     """
-    why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
+    why = np.where(runs == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
 
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_PARTS_AND_PRODUCTS = [(parts, True) for parts in (5, 4, 3)]
-_PARTS_AND_PRODUCTS += [(parts, False) for parts in (5, 4, 3, 2)]
+_RANGE_PARTS_AND_PRODUCTS = [(parts, True) for parts in (5, 4, 3)]
+_RANGE_PARTS_AND_PRODUCTS += [(parts, False) for parts in (5, 4, 3, 2)]
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_LEVEL_COMBINATIONS = 50_000
 
@@ -117,16 +117,16 @@ class LevelModel:
     X: Array
     pseudo_inverse: Array
 
-    def comparison_weights(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return the same as `Factorial`, but with a matrix from coefficients to means."""
-        others = sorted(set(itertools.chain(*self.failed)) - set(shown))
-        factors = [*shown, *others]
-        shape = [len(self.factors[factor].names) for factor in factors]
-        at = dict(zip(factors, np.indices(shape).reshape(len(shape), -1), strict=True))
+    def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
+        """Return the same as `FactorialModel`, but with a matrix from coefficients to means."""
+        others = sorted(set(itertools.chain(*self.failed)) - set(factors))
+        related = [*factors, *others]
+        shape = [len(self.factors[factor].names) for factor in related]
+        at = dict(zip(related, np.indices(shape).reshape(len(shape), -1), strict=True))
         there = np.ones(math.prod(shape), dtype=bool)
         for (i, j), failed in self.failed.items():
             there &= ~failed[at[i], at[j]]
-        count = math.prod(shape[: len(shown)])
+        count = math.prod(shape[: len(factors)])
         rows, columns = largest_complete_block(there.reshape(count, -1))
         terms = self._regression_terms(at).reshape(count, -1, self.X.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
@@ -214,7 +214,7 @@ def fit_level_model(
     chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _PARTS_AND_PRODUCTS:
+    for parts, products in _RANGE_PARTS_AND_PRODUCTS:
         levels = [factor_levels(f, c, parts) for f, c in zip(factors, columns, strict=True)]
         model = _build_level_model(levels, products, known, by_chance)
         if model is not None:
@@ -278,8 +278,8 @@ def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
     return codes
 
 
-def _student_quantile(num_intervals: int, freedom: int) -> float:
-    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / num_intervals))
+def _student_quantile(num_intervals: int, degrees_of_freedom: int) -> float:
+    return float(stdtrit(degrees_of_freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / num_intervals))
 
 
 def _format_value(value: FactorValue) -> str:

@@ -112,7 +112,7 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
 
 
 def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
-    store.count_chunk_start(chunk[0]["run"])
+    store.record_chunk_start(chunk[0]["run"])
     try:
         return run(chunk)
     finally:

@@ -44,7 +44,7 @@ def run_study(
     study: Study,
     out: Path,
     work: RunFunction,
-    basis: dict[str, Any],
+    inputs: dict[str, Any],
     *,
     jobs: int = -1,
     cluster: str | None = None,
@@ -55,8 +55,8 @@ def run_study(
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
-    `basis` is JSON data of all inputs of the rows besides the study. `shard` "K/N" restricts runs
-    and rows to this shard; `merge` collects the rows of all shards and runs nothing.
+    `inputs` is JSON data of all other inputs of the rows. `shard` "K/N" restricts runs and rows to
+    this shard; `merge` collects the rows of all shards and runs nothing.
     """
     import polars as pl
 
@@ -67,8 +67,8 @@ def run_study(
     points = study.points()
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
-    identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
-    identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
+    identity = dataclasses.asdict(study) | inputs | {"design_sha256": digest}
+    identity |= {"version": __version__, "single_runs": _NUM_SINGLE_RUNS}  # determines chunks
     schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = _group_into_chunks(first_rows)

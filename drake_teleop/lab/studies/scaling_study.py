@@ -98,7 +98,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     draws = generator.multinomial(count, equal, _NUM_BOOTSTRAP_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
-        np.mean([_means_over_unscaled(tables[task][name], weights) for name in names], axis=0)
+        np.mean([_mean_ratios_to_unscaled(tables[task][name], weights) for name in names], axis=0)
         for task, names in counted.items()
         if names
     ]
@@ -118,7 +118,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     return ScaleRating(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
-def _means_over_unscaled(table: Array, weights: Array) -> Array:
+def _mean_ratios_to_unscaled(table: Array, weights: Array) -> Array:
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)

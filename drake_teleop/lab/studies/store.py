@@ -64,7 +64,7 @@ class Store:
             except OSError:  # a file system without links
                 shutil.copyfile(part, temporary)
 
-    def count_chunk_start(self, first_run: int) -> None:
+    def record_chunk_start(self, first_run: int) -> None:
         path = self._start_counts_folder / str(first_run)
         with files.wrap_write_errors(path):
             self._start_counts_folder.mkdir(exist_ok=True)

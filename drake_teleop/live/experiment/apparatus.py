@@ -137,7 +137,7 @@ class IntervalLog:
     def _detect_slot_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
-        tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
+        tip = p_WS + R_WS @ self._slave.tip - self._slave.p_WTip_start
         if tip[2] - insert.translation[2] + insert.depth > _MAX_SLOT_FLOOR_DISTANCE_M:
             self._on_floor = None
         elif self._on_floor is None:

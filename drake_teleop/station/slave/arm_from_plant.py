@@ -111,7 +111,7 @@ def _moving_joints_to_sensor(
     plant: MultibodyPlant, frame_S: tree.Frame
 ) -> list[tree.RevoluteJoint | tree.PrismaticJoint]:
     joints = list[tree.RevoluteJoint | tree.PrismaticJoint]()
-    for joint in chain_joints.find_chain(plant, frame_S.body()):
+    for joint in chain_joints.chain_to_body(plant, frame_S.body()):
         if isinstance(joint, (tree.RevoluteJoint, tree.PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, tree.WeldJoint):

@@ -43,7 +43,7 @@ def joints_by_child(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
     return {joint.child_body().index(): joint for joint in joints}
 
 
-def find_chain(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
+def chain_to_body(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
     """Return the joints that carry a body, also welds, from the base outwards."""
     inboard, chain = joints_by_child(plant), list[Joint]()
     while body.index() in inboard:
@@ -90,7 +90,7 @@ def weld_base_and_find_chain(
 
     A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
     """
-    chain, X_WB = find_chain(plant, frame.body()), X_WBase or RigidTransform()
+    chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
     if base.index() != plant.world_body().index():
         plant.WeldFrames(plant.world_frame(), base.body_frame(), X_WB)
@@ -222,7 +222,7 @@ def set_torque_limits(
         known[name].set_effort_limit(limit)
 
 
-def assume_rotor_inertias(
+def add_rotor_inertias(
     plant: MultibodyPlant, chain: list[Joint], frame: Frame, auxiliary_bodies: set[str]
 ) -> list[str]:
     """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
@@ -279,7 +279,7 @@ def _origin_in_body(frame: Frame) -> Array:
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
     """Add a stick as visual shape to links without visuals, from joint to joint or to S."""
     p_BEnd = _origin_in_body(sensor_frame)
-    for joint in reversed(find_chain(plant, sensor_frame.body())):
+    for joint in reversed(chain_to_body(plant, sensor_frame.body())):
         start, frame = _origin_in_body(joint.frame_on_child()), joint.frame_on_parent()
         if not isinstance(joint, WeldJoint):
             _add_stick(plant, joint.child_body(), start, p_BEnd)

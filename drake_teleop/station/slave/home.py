@@ -26,7 +26,7 @@ _SEARCHED_JOINT_RANGE_SHARES = (0.7, 0.9, 1.0)
 _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
-def positions_with_tool_down(
+def q_with_tool_down(
     arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[Array, IkStatus]:
     """Return joints (n,) [rad, m] for p_WS = `position` [m] and `R_WS`, and the `IkStatus`."""
@@ -44,7 +44,7 @@ def positions_with_tool_down(
 
 
 def home_posture(arm: ArmModel, position: list[float]) -> Array:
-    q, status = positions_with_tool_down(arm, np.array(position))
+    q, status = q_with_tool_down(arm, np.array(position))
     if status != IkStatus.OK:
         what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
         remedy = "move it, or give slave.home, the joint positions of a reachable posture"

@@ -38,7 +38,7 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 _JOINT_RANGE_TOLERANCE_SHARE = 0.01
 
 
-def ik_method_name(name: str, arm: ArmModel) -> str:
+def used_ik_method(name: str, arm: ArmModel) -> str:
     """Return the key in `IK_METHODS` for setting `name`; DrakeTeleopError if the arm has none."""
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"

@@ -1,6 +1,6 @@
-"""Joint control of the slave: computed torque with position and velocity loop (paper, VI-A), or
-the position interface of a commercial arm (docs/station.md):
+"""Joint control of the slave: computed torque (paper, VI-A), or the position interface of an arm.
 
+Position interface (docs/station.md):
 command --[dead time, held]--> target --[generator]--> reference r --[drives]--> torque
 
 d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))
@@ -24,7 +24,7 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 # Memory of a position interface: periods since the last command, index of the oldest command in
 # the queue; then target, r and dr/dt (n each), and the queue of commands.
 _PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
-_TWICE_BRAKING_SHARE = 2 * 0.8  # braking v^2 = 2 a d with 80 % of the largest acceleration
+_TWICE_DECELERATION_SHARE = 2 * 0.8  # braking v^2 = 2 a d with 80 % of the largest acceleration
 COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 
 
@@ -141,10 +141,10 @@ class JointControlConfig:
                 remedy = "lower it, or raise rates.joint_control_hz"
                 raise DrakeTeleopError(what, where=f"{where}.{name}", remedy=remedy)
 
-    def check_computed_torque(self, what: str) -> None:
-        """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
+    def require_computed_torque(self, caller: str) -> None:
+        """Raise DrakeTeleopError unless the servo is computed torque; `caller` names the caller."""
         if self.servo != COMPUTED_TORQUE_SERVO_NAME:
-            what = f"{what} does not support the servo {self.servo}"
+            what = f"{caller} does not support the servo {self.servo}"
             hz = 1 / (2 * np.pi * self.tracking_delay_s)
             value = f"with a position_bandwidth_hz of {hz:.2g} for the same lag"
             remedy = f"choose {COMPUTED_TORQUE_SERVO_NAME}, {value}; `run` supports every servo"
@@ -208,7 +208,7 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
     memory[_PERIODS_SINCE_COMMAND_INDEX] = (memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
-        fastest = min(limits[0, i], math.sqrt(_TWICE_BRAKING_SHARE * limits[1, i] * abs(away)))
+        fastest = min(limits[0, i], math.sqrt(_TWICE_DECELERATION_SHARE * limits[1, i] * abs(away)))
         towards = min(max(away / lookahead, -fastest), fastest)
         wanted = gain * lookahead * (towards - speed[i])
         wanted = min(max(wanted, -limits[1, i]), limits[1, i])
@@ -348,7 +348,7 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
     return np.linalg.inv(J @ np.linalg.inv(mass_matrix(arm, q)) @ J.T)
 
 
-def servo_at_tool(
+def servo_impedance(
     arm: ArmModel, q: Array, config: JointControlConfig
 ) -> tuple[list[float], list[float], list[float]]:
     """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.
@@ -357,7 +357,7 @@ def servo_at_tool(
     inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is that of the
     largest eigenvalues of its two blocks, their size the smallest possible.
     """
-    config.check_computed_torque("the servo model of the passivity methods")
+    config.require_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)
     blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
     unit = 1 / np.sqrt(np.repeat(blocks, 3))

@@ -41,7 +41,7 @@ _NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> tuple[list[ModelInstanceIndex], ModelRepair]:
-    """Repair the text of a model file, and parse it into a plant; return the added instances."""
+    """Repair a model file and parse it into a plant; return the added instances and the repair."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
@@ -146,7 +146,7 @@ def ParseModel(
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
         limits = model.effort_limits if model.text else None
         chain_joints.set_one_actuator_per_joint(plant, moving, limits)
-        rotors = chain_joints.assume_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)
+        rotors = chain_joints.add_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)
     of_chain = {joint.model_instance() for joint in moving}
     if len(of_chain) > 1:
         names = sorted(map(plant.GetModelInstanceName, of_chain))

@@ -51,8 +51,8 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 
 @njit(cache=True)
-def _pose_error(table, L, pose, q, x, J, e, push):
-    """Write Jacobian J (6, n), pose error e (6,) at q and J^T e (n,) to `push`; return |e|^2.
+def _pose_error_into(table, L, pose, q, x, J, e, Jt_e):
+    """Write Jacobian J (6, n), pose error e (6,) at q and J^T e (n,) to `Jt_e`; return |e|^2.
 
     Rotations are multiplied by L.
     """
@@ -68,9 +68,9 @@ def _pose_error(table, L, pose, q, x, J, e, push):
         for k in range(q.shape[0]):
             J[3 + i, k] *= L
     for k in range(q.shape[0]):
-        push[k] = 0.0
+        Jt_e[k] = 0.0
         for i in range(6):
-            push[k] += J[i, k] * e[i]
+            Jt_e[k] += J[i, k] * e[i]
     return squared
 
 
@@ -189,7 +189,7 @@ def follow_pose(
     g, push, trial, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     if towards_posture:
         if upper[n - 1] - lower[n - 1] == np.inf:
-            _pose_error(table, L, pose, q, x, J, e, push)
+            _pose_error_into(table, L, pose, q, x, J, e, push)
         for i in range(n):
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
@@ -198,7 +198,7 @@ def follow_pose(
                     step = push[i] / (J[:, i] ** 2).sum()
             q[i] = min(max(q[i] + step, low[i]), high[i])
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _pose_error(table, L, pose, q, x, J, e, push)
+    squared = _pose_error_into(table, L, pose, q, x, J, e, push)
     _smaller_gram_matrix_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
@@ -217,7 +217,7 @@ def follow_pose(
             largest = _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
             if largest < _POSE_ROUNDING_ERROR_M:
                 break
-            found = _pose_error(table, L, pose, trial, x, J, e, push)
+            found = _pose_error_into(table, L, pose, trial, x, J, e, push)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
@@ -228,7 +228,7 @@ def follow_pose(
                 vectors.copy_into(q, 0, trial, 0, n)
             else:
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_RELATIVE_DAMPING)
-        _pose_error(table, L, pose, q, x, J, e, push)
+        _pose_error_into(table, L, pose, q, x, J, e, push)
         p, rotation = vectors.vector_at(e, 0), vectors.vector_at(e, 3)
         if (
             vectors.dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
@@ -239,7 +239,7 @@ def follow_pose(
             # The pose has priority: repeat without the posture.
             towards_posture = False
             vectors.copy_into(q, 0, start, 0, n)
-            squared = _pose_error(table, L, pose, q, x, J, e, push)
+            squared = _pose_error_into(table, L, pose, q, x, J, e, push)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
@@ -273,7 +273,7 @@ def follow_pose(
             slope += g[i] * push[i]
         for i in range(n):
             q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _pose_error(table, L, pose, q, x, J, e, push)
+        squared = _pose_error_into(table, L, pose, q, x, J, e, push)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
@@ -281,7 +281,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
 
     The search starts at the reference (n,). Without a solution, the positions nearest to the pose
     are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the status of a singularity.
-    Rotation errors are multiplied by `orientation_length`.
+    Rotation errors are multiplied by `orientation_weight_m`.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
@@ -291,7 +291,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     ratio = 2.0
     for _ in range(30):
         ratio = (1.0 + ratio) ** (1.0 / (n + 1))
-    start, status, L, smallest = reference, _OUT_OF_REACH, orientation_length(arm), np.inf
+    start, status, L, smallest = reference, _OUT_OF_REACH, orientation_weight_m(arm), np.inf
     x, e, J, push = np.empty(21), np.empty(6), np.empty((6, n)), np.empty(n)
     for k in range(_NUM_SEARCH_STARTS):
         found = follow_pose(
@@ -300,7 +300,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
             return _nearest_joints_by_whole_turns(arm, q, reference), IkStatus(found)
-        squared = _pose_error(arm.table, L, pose, q, x, J, e, push)
+        squared = _pose_error_into(arm.table, L, pose, q, x, J, e, push)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
@@ -320,7 +320,7 @@ def _nearest_joints_by_whole_turns(arm: ArmModel, q: Array, reference: Array) ->
     return np.where((arm.lower <= nearer) & (nearer <= arm.upper), nearer, q)
 
 
-def orientation_length(arm: ArmModel) -> float:
+def orientation_weight_m(arm: ArmModel) -> float:
     """Return the length [m] that weights orientation against position error: arm length / 5."""
     return float(np.linalg.norm(arm.table[:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum()) / 5.0
 
@@ -368,7 +368,7 @@ class NumericInverseKinematics(LeafSystem):
         #: Joint speed limits (n,) [rad/s, m/s]; values may be changed in place.
         self.speed_limit = arm.velocity_limit.copy()
         limits = arm.lower, arm.upper, self.speed_limit
-        self._fixed = (arm.table, orientation_length(arm), *limits, posture)
+        self._fixed = (arm.table, orientation_weight_m(arm), *limits, posture)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)
         self.DeclareDiscreteState(np.append(posture, 0.0))  # last command and its time

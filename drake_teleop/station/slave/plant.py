@@ -112,7 +112,7 @@ class SlavePlant:
         return None if self.contact.drake_contact_reason else self.contact.leaf_instance
 
     @property
-    def start_tip(self) -> Array:
+    def p_WTip_start(self) -> Array:
         """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
         X_WS = RigidTransform(Quaternion(start[:4] / np.linalg.norm(start[:4])), start[4:])

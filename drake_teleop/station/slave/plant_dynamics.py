@@ -185,7 +185,7 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
     sheet, rest = x[half - 1 : 2 * half : half], x[2 * half :]
-    if not _take_or_request_given_wrench(given, x, wrench_W):
+    if not _copy_or_request_wrench(given, x, wrench_W):
         environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, rest, wrench_W)
     else:
         added, none = np.empty(6), pairs[:0]
@@ -195,7 +195,7 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _take_or_request_given_wrench(given, x, wrench_W):
+def _copy_or_request_wrench(given, x, wrench_W):
     """Copy the next wrench of `given` to `wrench_W` and return True; without one write a request.
 
     `given` is empty, or has a row [number given, number used, x of the request] and then wrenches.

@@ -206,12 +206,12 @@ def _cached_overlap_texts(key: HashableByValue) -> tuple[tuple[str, ...], tuple[
     return tuple(overlap_warnings(shapes)), tuple(shapes.assumptions)
 
 
-def overlap_warnings(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
-    """Return a warning for each pair of overlapping bodies, with `of_arm` only of slave bodies."""
+def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list[str]:
+    """Return a warning for each pair of overlapping bodies, with `slave_only` of the slave only."""
     found = []
     for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
-        if distance > -MIN_OVERLAP_M or (of_arm and with_surroundings):
+        if distance > -MIN_OVERLAP_M or (slave_only and with_surroundings):
             continue
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:

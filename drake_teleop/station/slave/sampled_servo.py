@@ -44,7 +44,7 @@ def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 
 @njit(cache=True)
-def predict_torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
+def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
     """Write the motor torque over the next `samples` of the servo as a linear function of time.
 
     Args:
@@ -114,7 +114,7 @@ class SampledServo(LeafSystem):
         if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, slave.start)
-        # The line that `predict_torque_line` writes, then its start time.
+        # The line that `predict_torque_ramp` writes, then its start time.
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
@@ -134,5 +134,5 @@ class SampledServo(LeafSystem):
         following = discrete_state.get_mutable_value(0)
         sheet = self._at_rest if self._sheet is None else self._sheet.Eval(context)
         inputs = self._command.Eval(context), self._state.Eval(context), sheet
-        predict_torque_line(self._arm, *inputs, *self._constants, following[:-1])
+        predict_torque_ramp(self._arm, *inputs, *self._constants, following[:-1])
         following[-1] = context.get_time()

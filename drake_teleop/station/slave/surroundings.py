@@ -84,7 +84,7 @@ def MakeToolContactModel(
     sensor_frame: tree.Frame,
     tool: tree.BodyIndex,
     environment: Environment,
-    touched: AddedEnvironment,
+    added: AddedEnvironment,
 ) -> ToolContactModel:
     """Return the contact model of tool and environment, in a finalized plant.
 
@@ -97,8 +97,8 @@ def MakeToolContactModel(
         # Integers, because Drake's identifiers would keep the plant alive.
         tool_bodies=frozenset(int(index) for index in shapes),
         tool_shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
-        leaf_instance=touched.leaf_instance,
-        moving_bodies=MovingBodiesExceptLeaf(plant, touched),
+        leaf_instance=added.leaf_instance,
+        moving_bodies=MovingBodiesExceptLeaf(plant, added),
     )
     if contact.moving_bodies:
         inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
@@ -129,7 +129,7 @@ def MakeToolContactModel(
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
         compiled, monitored, reason = FindContactPairs(
-            plant, inspector, from_S, touched.instances, slip_speed, order
+            plant, inspector, from_S, added.instances, slip_speed, order
         )
     except DrakeTeleopError as error:
         return contact._replace(drake_contact_reason=str(error))
@@ -144,10 +144,10 @@ def MakeToolContactModel(
 
 
 def MovingBodiesExceptLeaf(
-    plant: MultibodyPlant, touched: AddedEnvironment
+    plant: MultibodyPlant, added: AddedEnvironment
 ) -> dict[str, tree.BodyIndex]:
     """Return the moving bodies of the environment, except the leaf, by unique name."""
-    instances = [each for each in touched.instances if each != touched.leaf_instance]
+    instances = [each for each in added.instances if each != added.leaf_instance]
     indices = [index for instance in instances for index in plant.GetBodyIndices(instance)]
     moving = [body for body in map(plant.get_body, indices) if not plant.IsAnchored(body)]
     short = [body.name() for body in moving]

@@ -59,7 +59,7 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
             for shape in [*link.findall("collision"), *link.findall("visual")]:
                 link.remove(shape)
     for fault, links in lost.items():
-        model.state_repair("shapes are missing of", f"{join_names(links)}: {fault}")
+        model.add_repair("shapes are missing of", f"{join_names(links)}: {fault}")
 
 
 def _shape_fault(shape: ElementTree.Element) -> str | None:
@@ -109,7 +109,7 @@ def _resolve_mesh_file(shape: ElementTree.Element, model: ModelRepair) -> str | 
 
 
 @lru_cache(maxsize=1024)
-def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
+def _is_mesh_readable(path: Path, _mtime_ns: int) -> bool:  # the time: an edited file is read again
     try:
         if path.suffix.lower() not in (".gltf", ".vtk"):
             return len(read_triangles(path).faces) > 0
@@ -120,7 +120,7 @@ def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file i
 
 
 @lru_cache(maxsize=1024)
-def _obj_text_of_stl(path: Path, _: int) -> str:
+def _obj_text_of_stl(path: Path, _mtime_ns: int) -> str:
     triangles = read_triangles(path)
     with suppress(ValueError):
         triangles = convex_hull(triangles.vertices)

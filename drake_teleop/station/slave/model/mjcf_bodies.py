@@ -167,7 +167,7 @@ class BodyReader:
             self.lost.setdefault(fault, []).append((body, given))
             return
         if given.get("shellinertia") == "true":
-            self._mjcf.model.state_assumption("solid instead of hollow shapes of", body.name)
+            self._mjcf.model.add_assumption("solid instead of hollow shapes of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
     def _read_inertial(self, body: Body, given: Attributes) -> mjcf_meshes.MassProperties:
@@ -209,14 +209,14 @@ class BodyReader:
             if geom.mesh:
                 shape = mjcf_meshes.unit_density_properties_of_mesh(geom.mesh)
         except ValueError as error:
-            self._mjcf.model.state_repair(f"no mass, because {error}, of", geom.attributes.label)
+            self._mjcf.model.add_repair(f"no mass, because {error}, of", geom.attributes.label)
             return mjcf_meshes.ZERO_MASS_PROPERTIES
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)
         return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)
 
 
-class MjcfText:
+class MjcfWriter:
     """Writer of MJCF text; in the text of a tool the top bodies float.
 
     Contact shapes are convex hulls, as in MuJoCo, except in a scene.
@@ -274,7 +274,7 @@ class MjcfText:
             values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            self._model.state_assumption("no damping, instead of a negative one, of", joint.name)
+            self._model.add_assumption("no damping, instead of a negative one, of", joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
@@ -298,7 +298,7 @@ class MjcfText:
                 hull = self._add_mesh_asset(contact_mesh, hull=True)
                 SubElement(element, "geom", values | invisible | hull)
             except ValueError as error:
-                self._model.state_repair(f"{error}; shapes are missing of", body.name)
+                self._model.add_repair(f"{error}; shapes are missing of", body.name)
 
     def _add_mesh_asset(self, mesh: mjcf_meshes.Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull

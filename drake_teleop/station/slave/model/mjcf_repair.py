@@ -15,7 +15,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.station.slave.model import model_numbers
-from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint, MjcfText
+from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint, MjcfWriter
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
 from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
@@ -33,11 +33,11 @@ def repair_mjcf(model: ModelRepair) -> None:
     purpose, mjcf = model.purpose, Mjcf(model)
     reader = BodyReader(mjcf)
     if not mjcf.root.get("model"):
-        model.state_assumption("the model is named after its file:", model.path.stem)
+        model.add_assumption("the model is named after its file:", model.path.stem)
     for option in mjcf.root.findall("option"):
         gravity = Attributes(option.attrib, "option", model).vector("gravity", _DRAKE_GRAVITY_M_S2)
         if np.abs(np.subtract(gravity, _DRAKE_GRAVITY_M_S2)).max() > _GRAVITY_TOLERANCE_M_S2:
-            model.state_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
+            model.add_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.is_in_directives
     if is_complete or not purpose.sensor_name:
         world = _split_into_one_joint_bodies(reader.read_world())
@@ -54,7 +54,7 @@ def repair_mjcf(model: ModelRepair) -> None:
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
         what = "left out, because the tool does not carry them: shapes of"
-        model.state_assumption(what, "the world")
+        model.add_assumption(what, "the world")
     _check_names_and_generators(bodies, model)
     _set_mass_properties_of_bodies(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
@@ -62,10 +62,10 @@ def repair_mjcf(model: ModelRepair) -> None:
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if shape.has_contact or not body.geoms:
-                model.state_repair(f"{fault}; shapes are missing of", body.name)
+                model.add_repair(f"{fault}; shapes are missing of", body.name)
     model.auxiliary_bodies = {body.name for body in bodies if body.is_auxiliary}
     model.raise_faults()
-    model.text = MjcfText(mjcf).write(world, [] if purpose.is_scene else with_motor)
+    model.text = MjcfWriter(mjcf).write(world, [] if purpose.is_scene else with_motor)
     model.raise_faults()
 
 
@@ -89,14 +89,14 @@ def _read_world_with_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
     world = reader.read_world()
     names_of_others = [other.get("name") or "a body without name" for _, other in others]
     for name in (*names_of_others, *world.generator_tags):
-        model.state_assumption("left out, because the arm does not carry it:", name)
+        model.add_assumption("left out, because the arm does not carry it:", name)
     world.generator_tags.clear()
     world = _split_into_one_joint_bodies(world)
     if kind == "site":
         sensors = [each for each in mjcf.elements_in("sensor") if each.tag in ("force", "torque")]
         is_measured = any(each.get("site") == sensor for each in sensors)
         _insert_sensor_frame_at_site(world, sensor, is_force_sensor_site=is_measured)
-        model.state_assumption("a frame of the model in place of the site", sensor)
+        model.add_assumption("a frame of the model in place of the site", sensor)
     return world
 
 
@@ -155,9 +155,9 @@ def _weld_other_joints_and_list_moving(
             is_held = joint.kind != "free" and joint.name in model.purpose.held_positions
             if joint.kind == "free":
                 if chain:  # a tool is welded to the sensor
-                    model.state_assumption("welded to the world, where it may float:", body.name)
+                    model.add_assumption("welded to the world, where it may float:", body.name)
             elif not is_held and body not in chain:
-                model.state_assumption("held:", joint.name)
+                model.add_assumption("held:", joint.name)
             elif not is_held and joint.kind not in ("hinge", "slide"):
                 model.add_fault(f"{joint.name} is a {joint.kind} joint; use hinges and slides")
             else:
@@ -187,15 +187,15 @@ def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mj
             model.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
-            model.state_assumption("no effect on the arm of the equality", name)
+            model.add_assumption("no effect on the arm of the equality", name)
     for element in mjcf.elements_in("tendon"):
         for name in (each.get("joint", "") for each in element.iter("joint")):
             if name in moving:
-                model.state_assumption("no tendon, which the model has, of", name)
+                model.add_assumption("no tendon, which the model has, of", name)
     for joint in joints:
         for attribute, what in (("stiffness", "spring"), ("frictionloss", "dry friction")):
             if joint.attributes.number(attribute, 0.0) != 0.0:
-                model.state_assumption(f"no {what}, which the model has, of", joint.name)
+                model.add_assumption(f"no {what}, which the model has, of", joint.name)
 
 
 def _report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
@@ -203,11 +203,11 @@ def _report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
     for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
-            mjcf.model.state_repair("no coupling, which Drake does not read from MJCF, by", name)
+            mjcf.model.add_repair("no coupling, which Drake does not read from MJCF, by", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
             what = "no spring, which Drake does not read from MJCF, of"
-            mjcf.model.state_repair(what, joint.name)
+            mjcf.model.add_repair(what, joint.name)
 
 
 def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
@@ -290,9 +290,9 @@ def _set_mass_properties_of_bodies(
                 inertia = correct(scaled.inertia, body.name, model)
             body.inertial = scaled._replace(inertia=inertia)
         elif body in moved and given.inertia.any():
-            model.state_repair("an inertia without a mass left out of", body.name)
+            model.add_repair("an inertia without a mass left out of", body.name)
         if body in driven and body.inertial is ZERO_MASS_PROPERTIES:
-            model.state_assumption("no inertia of", body.name)
+            model.add_assumption("no inertia of", body.name)
 
 
 def _sum_of_masses_in_file(model: ModelRepair) -> float:

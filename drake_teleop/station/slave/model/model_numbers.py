@@ -9,10 +9,10 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.model_repair import ModelRepair
-from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
+from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_link
 
 # Row and column: ixx: (0, 0), ixy: (0, 1) and so on.
-_INERTIA_ENTRIES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
+_INERTIA_INDICES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
@@ -21,18 +21,18 @@ _TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
 
 
 def repair_inertia_and_detect_missing(
-    link: Element, model: ModelRepair, *, is_sdf: bool, at_rest: bool
+    link: Element, model: ModelRepair, *, is_sdf: bool, is_fixed: bool
 ) -> bool:
     """Replace physically impossible inertia of a link by the nearest possible one.
 
-    Report changes and faults. A link that no joint moves (`at_rest`) loses impossible
+    Report changes and faults. A link that no joint moves (`is_fixed`) loses impossible
     values. Return True if a link that joints may move has no inertia.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     mass_element = link.find("inertial/mass")
     if inertial is None or mass_element is None:
         if is_sdf:
-            model.state_assumption("1 kg, the default of SDF, for", name)
+            model.add_assumption("1 kg, the default of SDF, for", name)
         elif inertial is not None:
             link.remove(inertial)
         return not is_sdf
@@ -47,17 +47,17 @@ def repair_inertia_and_detect_missing(
     elif not (np.abs(inertia) <= MAX_MODEL_VALUE_SI).all():
         fault = f"an entry of its inertia is no number up to {MAX_MODEL_VALUE_SI:g} kg m^2"
     no_mass = not fault and mass == 0.0
-    if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
+    if is_fixed and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
         link.remove(inertial)
         what = "an impossible inertia left out, as no joint of the arm moves the link, of"
-        model.state_assumption(what, name)
+        model.add_assumption(what, name)
     elif fault:
         model.add_fault(f"link {name}: {fault}")
     else:
         if no_mass and inertia.any():
-            model.state_repair("an inertia without a mass left out of", name)
+            model.add_repair("an inertia without a mass left out of", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, model)
-        entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_ENTRIES.items()}
+        entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_INDICES.items()}
         pose = inertial.findall("pose" if is_sdf else "origin")[:1]
         inertial.clear()
         inertial.extend(pose)
@@ -69,14 +69,14 @@ def repair_inertia_and_detect_missing(
         else:
             SubElement(inertial, "mass", value=f"{mass:.17g}")
             SubElement(inertial, "inertia", entries)
-    return not at_rest and not inertia.any()
+    return not is_fixed and not inertia.any()
 
 
 def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
-    for name, (row, column) in _INERTIA_ENTRIES.items():
+    for name, (row, column) in _INERTIA_INDICES.items():
         default = "1" if is_sdf and row == column else "0"
         text = element.get(name) or element.findtext(name) or default
         tensor[row, column] = tensor[column, row] = parse_number(text)
@@ -88,11 +88,11 @@ def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) ->
     nearest, change = nearest_possible_inertia(inertia)
     largest_change = change * np.abs(inertia).max()
     if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
-        model.state_assumption("an inertia corrected for rounding of", name)
+        model.add_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
         warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_SHARE else ""
-        model.state_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
+        model.add_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     return nearest
 
 
@@ -170,7 +170,7 @@ def repair_joint(joint: Element, links: set[str], model: ModelRepair, *, in_chai
     where, is_held = f"joint {name}", name in model.purpose.held_positions
     in_chain &= not is_held
     for end in ("parent", "child"):
-        link = joint_end(joint, end)
+        link = joint_link(joint, end)
         if not link:
             model.add_fault(f"{where} has no {end} link")
         elif link not in links and link != WORLD_NAME and "::" not in link and in_chain:
@@ -192,7 +192,7 @@ def repair_joint(joint: Element, links: set[str], model: ModelRepair, *, in_chai
 def _check_joint_type_mimic_and_axis(joint: Element, where: str, model: ModelRepair) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
     if kind not in ("revolute", "continuous", "prismatic"):
-        between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
+        between = f" on {joint_link(joint, 'parent')}" if kind == "floating" else ""
         remedy = "up to the sensor, use joints that turn about one axis or slide along it"
         model.add_fault(f"{name} is a {kind} joint{between}; {remedy}")
     elif joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
@@ -230,10 +230,10 @@ def _check_joint_dynamics(dynamics: Element, name: str, model: ModelRepair) -> N
     texts = [dynamics.get(tag) or dynamics.findtext(tag) for tag in ("damping", "friction")]
     damping, friction = (parse_number(text or "0") for text in texts)
     if friction != 0.0:
-        model.state_assumption("no dry friction, which the model has, of", name)
+        model.add_assumption("no dry friction, which the model has, of", name)
         dynamics.attrib.pop("friction", None)
     if not damping >= 0.0:
-        model.state_repair("damping 0 in place of a negative or unreadable one for", name)
+        model.add_repair("damping 0 in place of a negative or unreadable one for", name)
         dynamics.attrib.pop("damping", None)
         for inner in dynamics.findall("damping"):
             dynamics.remove(inner)

@@ -123,11 +123,11 @@ class ModelFiles:
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
             self.sizes.clear()
-            files, size = self._count_with_references(path, ())
+            files, size = self._count_files_and_bytes(path, ())
         self._total = self._total[0] + files, self._total[1] + size
         _check_num_files_and_size(*self._total, self._model)
 
-    def _count_with_references(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
+    def _count_files_and_bytes(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read_file(real):
             what = f"references {real}, which is outside the model's folder and its packages"
@@ -144,7 +144,7 @@ class ModelFiles:
             files, size = 1, real.stat().st_size
             _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
-                more = self._count_with_references(named, (*including, real))
+                more = self._count_files_and_bytes(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_num_files_and_size(files, size, path)
             self.sizes[real] = files, size

@@ -80,16 +80,16 @@ class ModelRepair:
         path.write_text(text, encoding="utf-8")
         return path
 
-    def state_assumption(self, what: str, name: str) -> None:
+    def add_assumption(self, what: str, name: str) -> None:
         """Add an assumption, such as `no inertia of`, about the joint or link `name`."""
         self._names.setdefault(what, {})[name] = None
 
-    def state_repair(self, what: str, name: str) -> None:
+    def add_repair(self, what: str, name: str) -> None:
         """Add a repair as an assumption; in a scene, where it may change contact, as a fault."""
         if self.purpose.is_scene:
             self.add_fault(f"{what} {name}")
         else:
-            self.state_assumption(what, name)
+            self.add_assumption(what, name)
 
     def add_fault(self, cause: str) -> None:
         self._causes[cause] = None

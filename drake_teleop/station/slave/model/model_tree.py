@@ -15,9 +15,9 @@ def list_joints(scope: Element) -> list[Element]:
     return [child for child in scope if child.tag in ("joint", "drake:joint")]
 
 
-def joint_end(joint: Element, name: str) -> str:
+def joint_link(joint: Element, end: str) -> str:
     """Return the name of a joint's `parent` or `child` link, or an empty text."""
-    element = joint.find(name)
+    element = joint.find(end)
     return "" if element is None else (element.get("link") or element.text or "").strip()
 
 
@@ -26,7 +26,7 @@ def link_of_frame(scope: Element, frame: str) -> str:
     links = [link.get("name", "") for link in scope.findall("link")]
     frames = scope.findall("frame")
     carriers = {x.get("name", ""): x.get("link") or x.get("attached_to") or "" for x in frames}
-    carriers |= {each.get("name", ""): joint_end(each, "child") for each in list_joints(scope)}
+    carriers |= {each.get("name", ""): joint_link(each, "child") for each in list_joints(scope)}
     passed = set[str]()
     while frame not in links and frame in carriers and frame not in passed:
         passed.add(frame)
@@ -47,7 +47,7 @@ def reduce_to_chain(
     if joints is None:
         return None
     joints = _remove_free_base(scope, joints, model)
-    root, chain = joint_end(joints[0], "parent") if joints else sensor_link, set(joints)
+    root, chain = joint_link(joints[0], "parent") if joints else sensor_link, set(joints)
     num_joints_to_link = _remove_unconnected_links(scope, root, chain, model)
     for joint in list_joints(scope):
         if joint not in chain and joint.get("name") not in model.purpose.held_positions:
@@ -65,7 +65,7 @@ def reduce_to_chain(
 def make_joint_fixed(joint: Element, model: ModelRepair) -> None:
     if joint.get("type") == "fixed":
         return
-    model.state_assumption("held:", joint.get("name", ""))
+    model.add_assumption("held:", joint.get("name", ""))
     joint.tag = "joint"
     joint.set("type", "fixed")
     for child in list(joint):
@@ -76,7 +76,7 @@ def make_joint_fixed(joint: Element, model: ModelRepair) -> None:
 def _joint_chain_to_link(scope: Element, link: str, model: ModelRepair) -> list[Element] | None:
     inboard: dict[str, list[Element]] = {}
     for joint in list_joints(scope):
-        inboard.setdefault(joint_end(joint, "child"), []).append(joint)
+        inboard.setdefault(joint_link(joint, "child"), []).append(joint)
     chain, passed = list[Element](), set[str]()
     while joints := inboard.get(link):
         names = [joint.get("name", "") for joint in joints]
@@ -92,7 +92,7 @@ def _joint_chain_to_link(scope: Element, link: str, model: ModelRepair) -> list[
             return None
         passed.add(link)
         chain.append(joints[0])
-        link = joint_end(joints[0], "parent")
+        link = joint_link(joints[0], "parent")
     return chain[::-1]
 
 
@@ -100,8 +100,8 @@ def _remove_free_base(scope: Element, chain: list[Element], model: ModelRepair) 
     first = next((k for k, each in enumerate(chain) if each.get("type") != "fixed"), None)
     if first is None or chain[first].get("type") not in ("floating", "planar"):
         return chain
-    base = joint_end(chain[first], "child")
-    model.state_assumption("welded to the world, where it may float:", base)
+    base = joint_link(chain[first], "child")
+    model.add_assumption("welded to the world, where it may float:", base)
     scope.remove(chain[first])
     for link in scope.findall("link"):
         if link.get("name") == WORLD_NAME:
@@ -115,12 +115,12 @@ def _remove_unconnected_links(
     links = {link.get("name", ""): link for link in scope.findall("link")}
     held, outboard = model.purpose.held_positions, dict[str, list[Element]]()
     for joint in sorted(list_joints(scope), key=lambda joint: joint not in chain):
-        outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
+        outboard.setdefault(joint_link(joint, "parent"), []).append(joint)
     num_joints_to_link, ahead, kept = {root: 0}, [root], set[Element]()
     while ahead:
         parent = ahead.pop()
         for joint in outboard.get(parent, []):
-            child, in_chain = joint_end(joint, "child"), joint in chain
+            child, in_chain = joint_link(joint, "child"), joint in chain
             is_new = child not in num_joints_to_link and child != WORLD_NAME
             if is_new and (child in links or in_chain):
                 moves = in_chain and joint.get("type") != "fixed" and joint.get("name") not in held
@@ -131,11 +131,11 @@ def _remove_unconnected_links(
         scope.remove(links[name])
         if name != WORLD_NAME:
             what = "not connected to the arm and left out:"
-            model.state_repair(what, name or "a link without name")
+            model.add_repair(what, name or "a link without name")
     for joint in list_joints(scope):
         if joint not in kept:
             scope.remove(joint)
-            if joint_end(joint, "parent") in num_joints_to_link:
+            if joint_link(joint, "parent") in num_joints_to_link:
                 what = "left out, as it closes a loop or has no child:"
-                model.state_repair(what, joint.get("name", ""))
+                model.add_repair(what, joint.get("name", ""))
     return num_joints_to_link

@@ -15,7 +15,7 @@ from drake_teleop.station.slave.model import model_numbers, model_tree
 from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
 from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, read_xml
 from drake_teleop.station.slave.model.model_repair import ModelRepair
-from drake_teleop.station.slave.model.model_tree import joint_end, link_of_frame, list_joints
+from drake_teleop.station.slave.model.model_tree import joint_link, link_of_frame, list_joints
 
 # Children that Drake reads; it also reads elements with its own prefix.
 _CHILD_TAGS_READ_BY_DRAKE = {
@@ -75,15 +75,15 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
         joints = list_joints(scope)
         for joint in joints:
             model_numbers.repair_joint(joint, links, model, in_chain=joint in chain)
-        moving = {joint_end(each, "child") for each in joints if each.get("type") != "fixed"}
+        moving = {joint_link(each, "child") for each in joints if each.get("type") != "fixed"}
         for link in scope.findall("link"):
             name = link.get("name", "")
             for part in [link] if model.purpose.is_scene else link.findall("inertial"):
                 model_numbers.check_lengths_and_inertias(part, f"link {name}", model)
-            at_rest = num_joints_to_link.get(name) == 0
+            is_fixed = num_joints_to_link.get(name) == 0
             repair = model_numbers.repair_inertia_and_detect_missing
-            if repair(link, model, is_sdf=is_sdf, at_rest=at_rest) and name in moving:
-                model.state_assumption("no inertia of", name)
+            if repair(link, model, is_sdf=is_sdf, is_fixed=is_fixed) and name in moving:
+                model.add_assumption("no inertia of", name)
 
 
 def _convert_meshes_and_write_text(model: ModelRepair) -> None:
@@ -106,11 +106,11 @@ def find_dependence_reasons(root: Element) -> dict[str, str]:
     """Return, by name, why joints (mimic) or links (floating) do not move independently."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
-        parent = joint_end(joint, "parent")
+        parent = joint_link(joint, "parent")
         if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
             found[joint.get("name", "")] = "moves with another joint (mimic)"
         if joint.get("type") == "floating" and parent != model_tree.WORLD_NAME:
-            found[joint_end(joint, "child")] = f"floats on {parent}"
+            found[joint_link(joint, "child")] = f"floats on {parent}"
     return found
 
 
@@ -134,17 +134,17 @@ def _make_names_unique(scope: Element, model: ModelRepair) -> None:
         name = joint.get("name", "")
         if not name or name in names:
             new = f"{name or 'joint'}_{number_of_joint}"
-            model.state_repair("a new name for the joint", f"{name or 'without name'} ({new})")
+            model.add_repair("a new name for the joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
-    links, children = set[str](), Counter(joint_end(joint, "child") for joint in joints)
+    links, children = set[str](), Counter(joint_link(joint, "child") for joint in joints)
     for link in scope.findall("link"):
         name = link.get("name", "")
         if name in links and children[name] > 1:
             model.add_fault(f"two links are named {name}; rename one of them")
         elif name in links:
             scope.remove(link)
-            model.state_repair("a second link of the same name left out:", name)
+            model.add_repair("a second link of the same name left out:", name)
         links.add(name)
 
 
@@ -238,7 +238,7 @@ def _keep_model_with_sensor(model: ModelRepair) -> None:
     for other in named:
         if other is not kept:
             name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
-            model.state_repair("models beside the arm left out:", name)
+            model.add_repair("models beside the arm left out:", name)
 
 
 def _has_sensor_frame(element: Element, model: ModelRepair) -> bool:
