@@ -47,8 +47,8 @@ from drake_teleop.station.sensor.motion_estimation import (
 )
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK_SIZE,
-    SENSOR_PARTS,
     SAMPLES_PER_NOISE_BLOCK,
+    SENSOR_PARTS,
     WristSensorConfig,
     initialize_sensor_chain,
     read_sensor_into,
