@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.math import RollPitchYaw
 
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import CannotWrite
@@ -199,7 +198,7 @@ class Live:
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
-            "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
+            "alignment": scaling.R_WB.tolist(),
             "scenes": SCENE_NAMES,
         }
 

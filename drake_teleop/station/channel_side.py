@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
@@ -52,8 +51,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             builder.ExportOutput(wire.get_output_port(), exit_)
         return builder.Build()
     scaling = scenario.kinematic_scaling
-    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
+    R_WB, scales = scaling.R_WB, scaling.scales
     passivity, start = _passivity_with_arm_and_device(scenario), start_pose(scenario.slave)
     gain, period = _rendered_over_contact_force(scenario), 1 / scenario.rates.hand_hz
     seed = scenario.simulation.seed
@@ -108,8 +106,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 
 def slave_wrench_power_scale(scenario: Scenario) -> Array:
     """Return factors (2,) from the slave's wrench to the master's power units: force, torque."""
-    scaling = scenario.kinematic_scaling
-    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    scales = scenario.kinematic_scaling.scales
     return _rendered_over_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.common.numeric import Array
@@ -14,8 +13,7 @@ from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.operator import Operator
-from drake_teleop.station.scaling.joint_coupling import JointCoupling
-from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
+from drake_teleop.station.scaling.kinematic_scaling import JointCoupling, KinematicScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
 from drake_teleop.station.wiring import export_outputs
@@ -109,9 +107,8 @@ def _make_operator(scenario: Scenario, start_B: Array) -> Operator:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
     forward, backward = (mean_delay(line) for line in scenario.channel.networks_of_directions())
-    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     gains = scaling.translation_scale, forces.scales().gamma * forces.force_scale
-    training = OperatorTraining(R_WB, *gains, forward, backward, scenario.simulation.seed)
+    training = OperatorTraining(scaling.R_WB, *gains, forward, backward, scenario.simulation.seed)
     slave = NominalSlave(scenario.slave)
     tip = np.concatenate([slave.tip, slave.start_tip])
     return Operator(scenario.operator, start_B, training, slave.arm, tip)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Meshcat, Rgba, SceneGraph
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
@@ -35,6 +35,9 @@ from drake_teleop.station.slave.plant import (
 )
 
 Signals = Mapping[str, Array]
+_Device = tuple[ModelInstanceIndex, Callable[[Array], Array], Frame, Array]
+"""Haptic device in the plant: instance, function from logged joint positions to the plant's, frame
+of the stylus, and the point (3,) [m] in it that the hand holds."""
 
 _TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
@@ -147,11 +150,12 @@ def _find_logs(run: Path) -> list[Path]:
         return [run / "log.parquet"]
     logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
     if not logs:
-        remedy = (
-            "give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
-            " stores measures only: run one of its points as a scenario"
+        raise DrakeTeleopError(
+            "contains no log of a run",
+            where=str(run),
+            remedy="give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
+            " stores measures only: run one of its points as a scenario",
         )
-        raise DrakeTeleopError("contains no log of a run", where=str(run), remedy=remedy)
     return logs
 
 
@@ -170,7 +174,7 @@ class ReplayScene:
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
-        self.canvas: replay_file.Canvas = meshcat
+        self.canvas: Any = meshcat  # or an object with its SetTransform and SetProperty
         self.plant, self._shapes = MultibodyPlant(time_step=0.0), SceneGraph()
         self.plant.RegisterAsSourceForSceneGraph(self._shapes)
         self._parsed = ParseSlave(self.plant, scenario.slave)
@@ -182,9 +186,9 @@ class ReplayScene:
         if scenario.surroundings is not None:
             touched = surroundings.AddEnvironment(self.plant, scenario.surroundings)
         self._sheet = touched.leaf_instance
-        self._master = None
+        self._device = None
         if "master_state" in recorded:
-            self._master = _add_haptic_device(self.plant, scenario)
+            self._device = _add_haptic_device(self.plant, scenario)
         finalize_without_limit_warnings(self.plant)
         self._moving_bodies = {
             MOVING_BODY_POSE_PREFIX + k: body
@@ -192,16 +196,15 @@ class ReplayScene:
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._draw_bodies_and_yield_moving_ones(meshcat))
-        _draw_room_and_set_camera(meshcat, scenario, with_table=self._master is not None)
+        _draw_room_and_set_camera(meshcat, scenario, with_table=self._device is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
-        alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
-        self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
-        kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
+        self._R_BW = scenario.kinematic_scaling.R_WB.T
+        arrows = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
         self._arrows = [
             (force, place, ForceArrow(meshcat, f"{force}_at_{place}", colour))
-            for force, at_slave, colour in kinds
+            for force, at_slave, colour in arrows
             if f"{force}_wrench_S" in recorded
-            for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
+            for place in ((at_slave,) if self._device is None else (at_slave, "stylus"))
         ]
 
     def _draw_bodies_and_yield_moving_ones(
@@ -217,14 +220,14 @@ class ReplayScene:
             elif shapes:
                 yield path, body
 
-    def show_sample(self, replay_time: float, signals: Mapping[str, Array], sample: int) -> None:
+    def show_sample(self, replay_time: float, signals: Signals, sample: int) -> None:
         """Record row `sample` of the signals as the scene at `replay_time` [s] of the replay."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
-        if self._master is not None:
+        if self._device is not None:
+            instance, to_plant_positions, *_ = self._device
             state = signals["master_state"][sample]
-            q = self._master.to_plant_positions(state[: len(state) // 2])
-            plant.SetPositions(context, self._master.instance, q)
+            plant.SetPositions(context, instance, to_plant_positions(state[: len(state) // 2]))
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
         for name, body in self._moving_bodies.items():
@@ -232,11 +235,23 @@ class ReplayScene:
                 self._set_body_pose(body, signals[name][sample])
         for path, body in self._bodies.items():
             self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), replay_time)
-        if not self._arrows:
-            return
-        forces, places = self._arrow_forces_W(signals, sample), self._arrow_positions_W()
+        if self._arrows:
+            self._show_arrows(replay_time, signals, sample)
+
+    def _show_arrows(self, replay_time: float, signals: Signals, sample: int) -> None:
+        X_WS = self._sensor.CalcPoseInWorld(self.context)
+        places = {
+            "wrist": X_WS @ _ARM_WRIST_P_S + _WRIST_ARROW_OFFSET_W,
+            "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
+        }
+        if self._device is not None:
+            *_, hand, grip = self._device
+            places["stylus"] = hand.CalcPoseInWorld(self.context) @ grip
         for force, place, arrow in self._arrows:
-            f_W = forces[force]
+            f_S = signals[f"{force}_wrench_S"][sample, :3]
+            if force == "measured":
+                f_S = f_S - signals["load_estimate"][sample, :3]
+            f_W = -X_WS.rotation().matrix() @ f_S
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
             arrow.show_force(self.canvas, replay_time, places[place], f_W)
 
@@ -251,51 +266,20 @@ class ReplayScene:
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 
-    def _arrow_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
-        R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
-        offset = signals["load_estimate"][sample, :3]
-        forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
-        if "contact_wrench_S" in signals:
-            forces["contact"] = -R_WS @ signals["contact_wrench_S"][sample, :3]
-        return forces
 
-    def _arrow_positions_W(self) -> dict[str, Array]:
-        X_WS = self._sensor.CalcPoseInWorld(self.context)
-        places = {
-            "wrist": X_WS @ _ARM_WRIST_P_S + _WRIST_ARROW_OFFSET_W,
-            "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
-        }
-        if self._master is not None:
-            places["stylus"] = self._master.hand.CalcPoseInWorld(self.context) @ self._master.grip
-        return places
-
-
-class _ReplayDevice(NamedTuple):
-    """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
-
-    `to_plant_positions` is a function from logged joint positions to the plant's.
-    """
-
-    instance: ModelInstanceIndex
-    hand: Frame
-    grip: Array
-    to_plant_positions: Callable[[Array], Array]
-
-
-def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
+def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _Device:
     if (leader := scenario.master.leader) is not None:
         order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
         on_table = RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M])
         arm = leader.add_to_plant(plant, on_table)
-        hand, grip = arm.sensor_frame, np.zeros(3)
-        return _ReplayDevice(arm.instance, hand, grip, lambda q: q[order])
+        return arm.instance, lambda q: q[order], arm.sensor_frame, np.zeros(3)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(files.models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
-    positions = serial_joint_angles if is_phantom else np.copy
-    return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
+    to_plant_positions = serial_joint_angles if is_phantom else np.copy
+    return master, to_plant_positions, plant.GetFrameByName("stylus", master), _GRIP_P_E
 
 
 def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:

@@ -9,18 +9,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from pydrake.geometry import (
-    Cylinder,
-    GeometryId,
-    Meshcat,
-    MeshcatCone,
-    MeshcatParams,
-    Rgba,
-    SceneGraphInspector,
-)
+from pydrake import geometry
+from pydrake.geometry import Cylinder, GeometryId, Meshcat, MeshcatCone, MeshcatParams, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.files import make_folder, write_text
@@ -45,16 +38,6 @@ _SECURITY_POLICY_TAG = '<meta http-equiv="Content-Security-Policy" content="{}">
 _VIEWPORT_AND_TITLE_TAGS = (
     '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
 )
-
-
-class Canvas(Protocol):
-    """Interface for 3D objects with poses and properties: Meshcat or a substitute."""
-
-    def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
-        """Set the pose of the object at scene `path` at a time of the recording [s]."""
-
-    def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
-        """Set a property of an object, such as "scale", at a time of the recording [s]."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +169,7 @@ def set_plain_background(meshcat: Meshcat) -> None:
 def add_shapes(
     meshcat: Meshcat,
     path: str,
-    inspector: SceneGraphInspector,
+    inspector: geometry.SceneGraphInspector,
     shapes: Iterable[GeometryId],
     colour: Rgba = _DEFAULT_SHAPE_COLOUR,
 ) -> None:
@@ -213,7 +196,7 @@ class ForceArrow:
         head = MeshcatCone(_ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba)
 
-    def show_force(self, canvas: Canvas, replay_time: float, p_W: Array, force: Array) -> None:
+    def show_force(self, canvas: Any, replay_time: float, p_W: Array, force: Array) -> None:
         """Show `force` (3,) [N] at the point `p_W` (3,) [m], both in W, at `replay_time` [s]."""
         length = _ARROW_LENGTH_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _ARROW_HEAD_M, 1e-3)

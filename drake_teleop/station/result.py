@@ -13,13 +13,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from drake_teleop.common.errors import (
-    DrakeTeleopError,
-    expect_type,
-    refuse_polars_in_forked_process,
-    remedy_to_install_extra,
-    wrap_read_errors,
-)
+from drake_teleop.common import errors
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
 from drake_teleop.common.numeric import Array, float_array
 from drake_teleop.common.parquet_sizes import check_parquet
@@ -94,6 +89,7 @@ class SimulationResult:
     ) -> None:
         self._t = _read_only_view(float_array("t", t))
         self._specs = {spec.name: spec for spec in specs}
+        self._columns = {c: (spec.name, i) for spec in specs for i, c in enumerate(spec.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             what = f"only one of `signals` and `specs` contains {', '.join(odd)}"
@@ -147,7 +143,7 @@ class SimulationResult:
             return SimulationResult(self._t[name], rows, self.specs)
         if name == "t":
             return self._t
-        if (found := self._find_column(name)) is not None:
+        if (found := self._columns.get(name)) is not None:
             return self._values[found[0]][:, found[1]]
         try:
             return self._values[name]
@@ -156,14 +152,8 @@ class SimulationResult:
             near = difflib.get_close_matches(str(name), names, n=3) or self.signals
             raise KeyError(f"there is no signal {name!r}; there are {', '.join(near)}") from None
 
-    def _find_column(self, name: object) -> tuple[str, int] | None:
-        signal = str(name).partition(".")[0]
-        if signal not in self._specs or name not in self._specs[signal].columns:
-            return None
-        return signal, self._specs[signal].columns.index(str(name))
-
     def __contains__(self, name: object) -> bool:
-        return name == "t" or name in self._specs or self._find_column(name) is not None
+        return name == "t" or name in self._specs or name in self._columns
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._specs)
@@ -172,8 +162,7 @@ class SimulationResult:
         return len(self._specs)
 
     def _ipython_key_completions_(self) -> list[str]:
-        columns = (column for spec in self.specs for column in spec.columns)
-        return ["t", *self._specs, *columns]
+        return ["t", *self._specs, *self._columns]
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the samples as a pandas frame, with the columns of `to_dataframe`."""
@@ -181,7 +170,7 @@ class SimulationResult:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
             what = f"{error.name or 'a library'} is not installed, but pandas frames require it"
-            remedy = remedy_to_install_extra("notebook")
+            remedy = errors.remedy_to_install_extra("notebook")
             raise DrakeTeleopError(what, where="to_pandas", remedy=remedy) from None
 
     def to_dataframe(self) -> pl.DataFrame:
@@ -257,9 +246,9 @@ class SimulationResult:
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
         parts = _files_of_log(path)
         for part in parts:
-            with wrap_read_errors(part, remedy, "is not a simulation result"):
+            with errors.wrap_read_errors(part, remedy, "is not a simulation result"):
                 check_parquet(part)
-        with wrap_read_errors(path, remedy, "is not a simulation result"):
+        with errors.wrap_read_errors(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(parts[0])[_SIGNAL_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = _read_columns(path, ["t"])[:, 0]
@@ -292,8 +281,8 @@ class SimulationResult:
         return figure
 
     def _plot_panels(self, name: str) -> list[tuple[str, str, list[int]]]:
-        if (found := self._find_column(name)) is not None:
-            signal, index = found
+        if name in self._columns:
+            signal, index = self._columns[name]
             return [(signal, self._specs[signal].units[index], [index])]
         if name not in self._specs:
             self[name]  # a KeyError with a suggestion
@@ -327,23 +316,17 @@ class SimulationResult:
         return f"<b>SimulationResult</b>: {self._time_range_text()}{table}"
 
 
-class _SignalsOnDisk(Mapping[str, Array]):
+class _SignalsOnDisk(dict[str, Any]):
+    """Columns of each signal; an access by name reads the signal from the disk."""
+
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
-        self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
+        super().__init__((spec.name, spec.columns) for spec in specs)
+        self._path = path
 
     def __getitem__(self, name: str) -> Array:
-        columns = self._columns[name]
-        with wrap_read_errors(self._path, "write it again"):
+        columns = super().__getitem__(name)
+        with errors.wrap_read_errors(self._path, "write it again"):
             return _read_only_view(_read_columns(self._path, columns))
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._columns
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
 
 
 def _curve_extremes(t: Array, values: Array) -> tuple[Array, Array]:
@@ -368,7 +351,7 @@ def _files_of_log(path: Path) -> list[Path]:
 def _read_columns(path: Path, columns: list[str]) -> Array:
     import polars as pl
 
-    refuse_polars_in_forked_process()
+    errors.refuse_polars_in_forked_process()
     table = pl.read_parquet(_files_of_log(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"columns {', '.join(columns)} do not contain numbers")

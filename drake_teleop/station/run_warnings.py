@@ -12,21 +12,12 @@ from scipy.ndimage import uniform_filter1d
 from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
+from drake_teleop.station import oscillation
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
-from drake_teleop.station.oscillation import (
-    MAX_FORCE_RIPPLE_RMS_AT_REST_N,
-    MAX_REVERSAL_DELAY_S,
-    dominant_frequency,
-    doubled_quaternions,
-    find_chatter,
-    flag_pose_oscillation,
-    flag_unexplained_oscillation,
-    high_pass_above_5_hz,
-    pose_reversal_times,
-)
+from drake_teleop.station.oscillation import doubled_quaternions, flag_pose_oscillation
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
@@ -190,7 +181,8 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
             "move more slowly, or use another passivity method",
         )
     yield from _check_reserve_speed_limit(result, scenario)
-    oscillating = flag_pose_oscillation(t, sent, received, MAX_REVERSAL_DELAY_S + window)
+    window += oscillation.MAX_REVERSAL_DELAY_S
+    oscillating = flag_pose_oscillation(t, sent, received, window)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     advice = "use another passivity method or network"
     yield f"the channel ({by}) makes the slave's command oscillate", spans, advice
@@ -262,7 +254,8 @@ def _check_joints(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         advice = "move more slowly, or increase the bandwidth of joint_control"
         yield f"joint {k + 1} is up to {way} behind its command", spans, advice
-    oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_OSCILLATION_RAD)
+    least = _MIN_JOINT_OSCILLATION_RAD
+    oscillating = oscillation.flag_unexplained_oscillation(t, command, actual, least)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     advice = "change the bandwidth of joint_control, or damp the touched object"
     yield "the slave oscillates while its command does not,", spans, advice
@@ -279,9 +272,10 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
     if "true_contact_wrench_W" not in result:
         return
     force = np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
-    command = next((result[name] for name in ("intent", "pose_command") if name in result), None)
-    reversals = np.empty(0) if command is None else pose_reversal_times(result.t, command)
-    if found := find_chatter(result.t, force, reversals):
+    reversals = np.empty(0)
+    if command := next((name for name in ("intent", "pose_command") if name in result), ""):
+        reversals = oscillation.pose_reversal_times(result.t, result[command])
+    if found := oscillation.find_chatter(result.t, force, reversals):
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
             f"contact chatter of the tool: {sum(each.num_touches for each in found)} touches at"
@@ -296,13 +290,14 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     if not {"intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
-    force = high_pass_above_5_hz(t, result["force_to_master"][:, :3])
+    force = oscillation.high_pass_above_5_hz(t, result["force_to_master"][:, :3])
     rows = round(_MIN_INTENT_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
     largest, least = _maximum_of_last_rows(intent, rows), -_maximum_of_last_rows(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_FORCE_RIPPLE_RMS_AT_REST_N), _MIN_WARNING_SPAN_S)
+    oscillates = rests & (rms > oscillation.MAX_FORCE_RIPPLE_RMS_AT_REST_N)
+    spans = find_spans(t, oscillates, _MIN_WARNING_SPAN_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
@@ -312,7 +307,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     if crossings < 2 * _MIN_FORCE_OSCILLATION_CYCLES:  # a step is no oscillation
         return
     over_network = "ports" in result
-    frequency, share = dominant_frequency(t, part)
+    frequency, share = oscillation.dominant_frequency(t, part)
     if not over_network and share < _MIN_POWER_SHARE_OF_OSCILLATION:
         return  # noise of the sensor
     ledger = ", or increase passivity.ledger.initial with ledger" if over_network else ""

@@ -9,18 +9,8 @@ from typing import Any, TypeVar, cast
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.common.config import (
-    check_all_field_values,
-    check_field,
-    check_field_name,
-    check_structure,
-    choice,
-    plain,
-    quantity,
-    settings,
-    unchecked_assignments,
-    with_absolute_paths,
-)
+from drake_teleop.common import config
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError, expect_type, suggest_name
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.common.registry import Registry
@@ -154,13 +144,10 @@ class Scenario:
 
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
-        check_all_field_values(self, where)
-        self.operator.check(f"{where}:operator")
-        self.passivity.check(f"{where}:passivity")
+        config.check_all_field_values(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
-        self.load_estimator.check(f"{where}:load_estimator")
-        self.master.check(f"{where}:master")
-        self.slave.check(f"{where}:slave")
+        for name in ("operator", "passivity", "load_estimator", "master", "slave"):
+            getattr(self, name).check(f"{where}:{name}")
         self.joint_control.check(f"{where}:joint_control", self.rates.joint_control_hz)
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
         for index, thing in enumerate(self.environment):
@@ -219,16 +206,16 @@ def settings_without_range_check(
     schema: type[_T], data: Any, where: str, defaults: _T | None = None
 ) -> _T:
     """Return settings from parsed YAML data, with unchecked ranges; `where` begins messages."""
-    check_structure(schema, data, where)
+    config.check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
-    with unchecked_assignments():
+    with config.unchecked_assignments():
         text = yaml_dump(data)
-        config = yaml_load_typed(schema=schema, data=text, defaults=defaults or schema())
+        loaded = yaml_load_typed(schema=schema, data=text, defaults=defaults or schema())
         for thing in things:
             kind = ENVIRONMENTS[thing.pop("_tag", "!Wall").removeprefix("!")]
-            config.environment.append(yaml_load_typed(schema=kind, data=yaml_dump(thing)))
-    return cast(_T, config)
+            loaded.environment.append(yaml_load_typed(schema=kind, data=yaml_dump(thing)))
+    return cast(_T, loaded)
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
@@ -236,7 +223,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
 
     `where` is the file's name for messages. Paths in the data are relative to its folder.
     """
-    check_structure(Scenario, data, where)  # before the presets are read
+    config.check_structure(Scenario, data, where)  # before the presets are read
     sensor, master, control = (
         data.get(name) or {} for name in ("wrist_sensor", "master", "joint_control")
     )
@@ -249,7 +236,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
         defaults.joint_control.interface = copy.deepcopy(interface)
     scenario = settings_without_range_check(Scenario, data, where, defaults)
     scenario.check(where)
-    absolute: Scenario = with_absolute_paths(scenario, Path(where).parent)
+    absolute: Scenario = config.with_absolute_paths(scenario, Path(where).parent)
     return absolute
 
 
@@ -280,16 +267,16 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     expect_type(Scenario, scenario, "scenario")
     for name, value in changes.items():
         block, _, inner = name.partition("__")
-        check_field_name(Scenario, block, f"scenario:{block}")
+        config.check_field_name(Scenario, block, f"scenario:{block}")
         if inner:
-            config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
-            if config is None or isinstance(config, str):
+            present, place = getattr(scenario, block), f"scenario:{block}.{inner}"
+            if present is None or isinstance(present, str):
                 what = f"{block} is null or a text in this scenario, so it has no field {inner}"
                 remedy = f"set the whole block {block} first"
                 raise DrakeTeleopError(what, where=place, remedy=remedy)
-            check_field(type(config), inner, value, place)
-            value = dataclasses.replace(config, **{inner: value})
-        check_field(Scenario, block, value, f"scenario:{block}")
+            config.check_field(type(present), inner, value, place)
+            value = dataclasses.replace(present, **{inner: value})
+        config.check_field(Scenario, block, value, f"scenario:{block}")
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
     return scenario
 
@@ -330,8 +317,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"
         remedy = "set it to pose, or remove network, passivity and contact_detection"
         raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
-    scaling = scenario.kinematic_scaling
-    scales = (scaling.translation_scale, scaling.rotation_scale)
+    scales = scenario.kinematic_scaling.scales
     if scenario.passivity.method != "none" and min(scales) < _MIN_KINEMATIC_SCALE_WITH_PASSIVITY:
         least = _MIN_KINEMATIC_SCALE_WITH_PASSIVITY
         what = f"passivity methods require kinematic scales >= {least:g}, not {min(scales):g}"

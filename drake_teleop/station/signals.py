@@ -29,22 +29,13 @@ _CHANNEL_PORT_COMPONENTS = (
 )
 
 
-def _joint_state_components(joints: int) -> tuple[str, str]:
-    names = [f"{letter}_{i + 1}" for letter in "qv" for i in range(joints)]
-    return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
-
-
-def _joint_components(joints: int, unit: str) -> tuple[str, str]:
-    return " ".join(f"joint_{i + 1}" for i in range(joints)), unit
-
-
-# Signals with one component per joint.
-_JOINT_SIGNAL_NAMES = ("joint_position", "joint_torque", "joint_command")
-
-#: All signals in the order of the log, for an arm with six joints.
-SIGNALS = {
-    name: _signal(name, components, units, description)
-    for name, (components, units), description in (
+def _signals_of_arm(joints: int) -> dict[str, Signal]:
+    numbers = range(1, joints + 1)
+    names = " ".join(f"joint_{i}" for i in numbers)
+    angles, torques = (names, "rad"), (names, "N m")
+    state_names = " ".join(f"{letter}_{i}" for letter in "qv" for i in numbers)
+    state = (state_names, ",".join(joints * ["rad"] + joints * ["rad/s"]))
+    rows = (
         ("measured_wrench_S", _WRENCH_COMPONENTS, "sensor's wrench, Eq. (1), at sample_time"),
         ("specific_force_S", ("s_x s_y s_z", "m/s^2"), "a - g at So, at sample_time"),
         ("angular_velocity_S", ("omega_x omega_y omega_z", "rad/s"), "omega at sample_time"),
@@ -52,24 +43,24 @@ SIGNALS = {
         ("saturated", ("saturated", "1"),
          "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after a"
          " lost reading"),
-        ("joint_position", _joint_components(6, "rad"),
+        ("joint_position", angles,
          "encoder readings of the slave, at sample_time"),
         ("sample_time", ("t", "s"),
          "time of the wrist sensor's sample in this row; other signals are of t"),
         ("load_estimate", _LOAD_ESTIMATE_COMPONENTS, "offsets and phi, Eq. (7)"),
-        ("slave_state", _joint_state_components(6), "true joint angles and velocities, at t"),
-        ("joint_torque", _joint_components(6, "N m"), "of the slave's motors"),
+        ("slave_state", state, "true joint angles and velocities, at t"),
+        ("joint_torque", torques, "of the slave's motors"),
         ("load_state", ("state", "1"),
          "of the monitored load: 0 learning, 1 settled, 2 disturbed, 3 another load"),
         ("true_contact_wrench_W", _WRENCH_COMPONENTS, "environment on the tool, about Wo, in W"),
         ("sheet_state", ("z v_z", "m,m/s"), "deflection of the sheet spring's end, upwards"),
         ("intent", _POSE_COMPONENTS, "intended pose of the stylus, X_BE"),
         ("hand_wrench_E", _WRENCH_COMPONENTS, "wrench of the hand on the stylus at Eo, in B"),
-        ("master_state", _joint_state_components(6), "joint angles and velocities of the device"),
+        ("master_state", state, "joint angles and velocities of the device"),
         ("pose_master", _POSE_COMPONENTS, "pose X_BE of the stylus"),
         ("twist_master", _TWIST_COMPONENTS, "twist of the stylus in the device's base"),
         ("pose_command", _POSE_COMPONENTS, "setpoint of the slave, X_WS"),
-        ("joint_command", _joint_components(6, "rad"), "setpoints of the joints"),
+        ("joint_command", angles, "setpoints of the joints"),
         ("ik_status", ("status", "1"), "IkStatus of the inverse kinematics, 0 = OK"),
         ("scaled_wrench_S", _WRENCH_COMPONENTS, "F' of Fig. 2, before the scale to the master"),
         ("contact_wrench_S", _WRENCH_COMPONENTS, "Eq. (13), calculated contact wrench"),
@@ -86,8 +77,12 @@ SIGNALS = {
          " packet at each end; energy of the slave's wrench along the command"),
         ("contact", ("contact", "1"), "1 while the slave's detector reports contact"),
         ("contact_at_hand", ("contact", "1"), "contact flag after the channel, at the master"),
-    )
-}  # fmt: skip
+    )  # fmt: skip
+    return {name: _signal(name, *parts, description) for name, parts, description in rows}
+
+
+#: All signals in the order of the log, for an arm with six joints.
+SIGNALS = _signals_of_arm(6)
 
 
 def signal_of(name: str, size: int) -> Signal:
@@ -95,11 +90,6 @@ def signal_of(name: str, size: int) -> Signal:
     if name.startswith(MOVING_BODY_POSE_PREFIX):
         body = name.removeprefix(MOVING_BODY_POSE_PREFIX)
         return _signal(name, *_POSE_COMPONENTS, f"where the body {body} is, in W, at t")
-    signal = SIGNALS[name]
-    if size == len(signal.components):
-        return signal
-    if name in _JOINT_SIGNAL_NAMES:
-        return _signal(name, *_joint_components(size, signal.units[0]), signal.description)
-    if name in ("slave_state", "master_state"):
-        return _signal(name, *_joint_state_components(size // 2), signal.description)
-    return signal
+    if size == len(SIGNALS[name].components):
+        return SIGNALS[name]
+    return _signals_of_arm(size // 2 if name in ("slave_state", "master_state") else size)[name]

@@ -64,7 +64,9 @@ def simulate(
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
     on_disk = None if log is None else LogOnDisk(Path(log), simulator, simulation.settle)
-    stops, rows = simulation.on_fault == "stop", 0
+    stops, rows, task = simulation.on_fault == "stop", 0, None
+    if simulation.end_with_task and diagram.HasOutputPort("task_state"):
+        task = diagram.GetOutputPort("task_state")
     simulator.Initialize()
     try:
         # Products, as Drake's event times are: a rounding difference would be a step of 1e-17 s.
@@ -76,7 +78,7 @@ def simulate(
             if on_disk is not None and on_disk.num_unwritten_rows() >= _LOG_ROWS_PER_PART:
                 on_disk.write_and_clear_rows()
                 rows = 0
-            over = simulation.end_with_task and _task_is_over(simulator)
+            over = task is not None and task.Eval(simulator.get_context())[OUTCOME_INDEX] != 0.0
             progress(1.0 if over else time / end)
             if over:
                 break
@@ -86,14 +88,6 @@ def simulate(
     if log is not None:
         return SimulationResult.scan_parquet(log)
     return read_recorded_signals(simulator, simulation.settle)
-
-
-def _task_is_over(simulator: Simulator) -> bool:
-    station = simulator.get_system()
-    if not station.HasOutputPort("task_state"):
-        return False
-    state = station.GetOutputPort("task_state").Eval(simulator.get_context())
-    return bool(state[OUTCOME_INDEX] != 0.0)
 
 
 def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
@@ -19,14 +16,8 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
+from drake_teleop.station.slave import joint_commands
 from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, ForwardKinematics
-from drake_teleop.station.slave.joint_commands import (
-    IK_METHODS,
-    ExcitationCommand,
-    JointRangeMonitor,
-    LeaderJointFollower,
-    ik_method_name,
-)
 from drake_teleop.station.slave.joint_control import HeldTorque, JointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import DrakeContact, ToolContact
@@ -86,40 +77,52 @@ def MakeSlaveSide(
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
     torques = _is_torque_controller(controller, scenario)
-    initial = load_estimate, load_covariance
-    body = _add_slave_blocks(builder, scenario, *initial, custom_torque=torques)
-    arm = body.slave.arm
+    slave, sample, held = _add_slave_blocks(
+        builder, scenario, load_estimate, load_covariance, custom_torque=torques
+    )
+    arm, joint_control = slave.arm, builder.GetSubsystemByName("joint_control")
     if controller is not None:
         builder.AddNamedSystem("controller", controller)
         builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
-    follows_leader = scenario.master.is_joint_leader
-    setpoint = "leader_joints" if follows_leader else "pose_command"
     if torques:
-        connect_ports(builder, controller, "joint_torque", body.joint_control, "requested_torque")
+        connect_ports(builder, controller, "joint_torque", joint_control, "requested_torque")
     else:
-        ik = _add_inverse_kinematics(builder, scenario, body, follows_leader)
+        follows_leader = scenario.master.is_joint_leader
+        name = joint_commands.ik_method_name(scenario.slave.inverse_kinematics, arm)
+        make_ik = joint_commands.IK_METHODS[name]
+        if follows_leader:
+            make_ik = joint_commands.LeaderJointFollower
+        ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, slave.start, held))
+        connect_matching_inputs(builder, ik, {"joint_position": sample["joint_position"]})
+        connect_ports(builder, ik, "joint_command", joint_control, "joint_command")
+        monitor = builder.GetSubsystemByName("monitor")
+        connect_ports(builder, ik, "ik_status", monitor, "ik_status")
+        export_outputs(builder, ik, "joint_command")
+        export_outputs(builder, monitor, "ik_status")
+        setpoint = "leader_joints" if follows_leader else "pose_command"
         if controller is None:
             builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
         else:
             connect_ports(builder, controller, "pose_command", ik, "pose_command")
 
-    R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
+    R_WB = scenario.kinematic_scaling.R_WB
     largest = scenario.wrist_sensor.largest_plausible_wrench()
     max_age_s = max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz)
     scaling = ForceScaling(scenario.force_scaling, arm, R_WB, largest, max_age_s)
     force_scaling = builder.AddNamedSystem("force_scaling", scaling)
-    estimate = {"load_estimate": body.load_estimator.GetOutputPort("load_estimate")}
-    connect_matching_inputs(builder, force_scaling, body.sample_ports | estimate)
+    load_estimator = builder.GetSubsystemByName("load_estimator")
+    sources = sample | {"load_estimate": load_estimator.GetOutputPort("load_estimate")}
+    connect_matching_inputs(builder, force_scaling, sources)
     export_outputs(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _has_load_estimate(scenario, load_estimate):
         export_outputs(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
-    connect_matching_inputs(builder, kinematics, body.slave.ports)
+    connect_matching_inputs(builder, kinematics, slave.ports)
     export_outputs(builder, kinematics, "pose_slave")
     if controller is not None:
-        inputs = body.sample_ports | {
-            "slave_state": body.slave.ports["slave_state"],
+        inputs = sample | {
+            "slave_state": slave.ports["slave_state"],
             "pose_slave": kinematics.GetOutputPort("pose_slave"),
             "contact_wrench_S": force_scaling.GetOutputPort("contact_wrench_S"),
         }
@@ -133,7 +136,7 @@ def MakeSlaveSide(
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
         builder.AddNamedSystem("contact_detection", detection)
-        connect_matching_inputs(builder, detection, body.sample_ports | estimate)
+        connect_matching_inputs(builder, detection, sources)
         export_outputs(builder, detection, "contact")
     return builder.Build()
 
@@ -155,23 +158,6 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
     return torques
 
 
-def _add_inverse_kinematics(
-    builder: DiagramBuilder, scenario: Scenario, body: _SlaveBlocks, follows_leader_joints: bool
-) -> LeafSystem:
-    arm = body.slave.arm
-    name = ik_method_name(scenario.slave.inverse_kinematics, arm)
-    make_ik = LeaderJointFollower if follows_leader_joints else IK_METHODS[name]
-    ik = make_ik(arm, body.slave.start, body.command_period_s)
-    builder.AddNamedSystem("inverse_kinematics", ik)
-    if not follows_leader_joints:
-        builder.Connect(body.sample_ports["joint_position"], ik.GetInputPort("joint_position"))
-    connect_ports(builder, ik, "joint_command", body.joint_control, "joint_command")
-    builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
-    export_outputs(builder, ik, "joint_command")
-    export_outputs(builder, body.monitor, "ik_status")
-    return ik
-
-
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build the slave side without master: its joints follow an excitation trajectory.
 
@@ -180,21 +166,13 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
-    body = _add_slave_blocks(builder, scenario, q_start=start)
-    command = ExcitationCommand(trajectory, scenario.simulation.settle)
+    _add_slave_blocks(builder, scenario, q_start=start)
+    command = joint_commands.ExcitationCommand(trajectory, scenario.simulation.settle)
     builder.AddNamedSystem("joint_trajectory", command)
-    connect_ports(builder, command, "joint_command", body.joint_control, "joint_command")
+    joint_control = builder.GetSubsystemByName("joint_control")
+    connect_ports(builder, command, "joint_command", joint_control, "joint_command")
     export_outputs(builder, command, "joint_command")
     return builder.Build()
-
-
-class _SlaveBlocks(NamedTuple):
-    slave: SlavePlant
-    joint_control: LeafSystem
-    monitor: LeafSystem
-    load_estimator: LeafSystem
-    sample_ports: dict[str, OutputPort]
-    command_period_s: float
 
 
 def _add_slave_blocks(
@@ -205,7 +183,8 @@ def _add_slave_blocks(
     q_start: Array | None = None,
     *,
     custom_torque: bool = False,
-) -> _SlaveBlocks:
+) -> tuple[SlavePlant, dict[str, OutputPort], float]:
+    """Add arm, joint control, sensor, load estimator; return arm, sample's ports, period [s]."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start, ports = slave.arm, slave.plant, slave.start, slave.ports
@@ -229,7 +208,8 @@ def _add_slave_blocks(
     builder.Connect(torque["joint_torque"], plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    monitor = builder.AddNamedSystem("monitor", JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S))
+    range_monitor = joint_commands.JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S)
+    monitor = builder.AddNamedSystem("monitor", range_monitor)
     connect_matching_inputs(builder, monitor, ports)
 
     motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz
@@ -254,7 +234,7 @@ def _add_slave_blocks(
 
     if slave.can_touch:
         _add_tool_contact(builder, slave)
-    return _SlaveBlocks(slave, control, monitor, estimator, sample, held)
+    return slave, sample, held
 
 
 def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:

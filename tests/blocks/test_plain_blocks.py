@@ -16,6 +16,7 @@ from pydrake.symbolic import Evaluate, MakeVectorVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from rendered_wrench import wrench_to_master
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
@@ -28,11 +29,7 @@ from drake_teleop.station.estimation import contact_detection, load_estimator
 from drake_teleop.station.master.force_display import initial_display_state, step_display
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
-from drake_teleop.station.scaling.force_scaling import (
-    ForceScaling,
-    ForceScalingConfig,
-    wrench_to_master,
-)
+from drake_teleop.station.scaling.force_scaling import ForceScaling, ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.plant_wrist_sensor import AddWristSensor

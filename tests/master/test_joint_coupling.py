@@ -16,7 +16,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.operator.operator import Sine
-from drake_teleop.station.scaling.joint_coupling import JointCoupling
+from drake_teleop.station.scaling.kinematic_scaling import JointCoupling
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import jacobian, pose_into

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,7 @@ from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
     LAST_PORT_WRENCH,
     MEMORY_SIZE,
+    RECEIVED_ENERGY,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
@@ -74,6 +77,20 @@ def wrenches(rng: np.random.Generator, steps: int) -> np.ndarray:
         np.outer(t, rng.uniform(2, 30, 6)) + rng.uniform(0, 6, 6)
     )
     return f * (np.sin(7.0 * t) > 0)[:, None]
+
+
+class EnergyBalance(NamedTuple):
+    """Energy balance of one end, each (2,) for translation and rotation [J]."""
+
+    stored: np.ndarray
+    received: np.ndarray
+    sent: np.ndarray
+    lost: np.ndarray
+
+
+def energy_balance(memory: np.ndarray) -> EnergyBalance:
+    parts = STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY
+    return EnergyBalance(*(memory[part] for part in parts))
 
 
 def run(method, config, master_poses, slave_poses, f_e, newest):

@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_methods import START, line, poses, run, wrenches
+from test_methods import START, energy_balance, line, poses, run, wrenches
 
 from drake_teleop.lab.comparison.one_dof import (
     AT_COMMAND,
@@ -26,7 +26,7 @@ from drake_teleop.lab.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.energy import energy_balance, port_work
+from drake_teleop.station.passivity.energy import port_work
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import CUMULATIVE_ENERGY, pose_difference_into

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
+from rendered_wrench import wrench_to_master
 
 from drake_teleop.common.vectors import quaternion_exponential
-from drake_teleop.station.scaling.force_scaling import wrench_to_master, wrench_to_master_into
+from drake_teleop.station.scaling.force_scaling import wrench_to_master_into
 from drake_teleop.station.scaling.kinematic_scaling import scale_pose_into
 
 TOOL_DOWN = np.diag([1.0, -1.0, -1.0])

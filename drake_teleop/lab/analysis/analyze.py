@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.math import RollPitchYaw
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
@@ -173,8 +172,7 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
         raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).start_tip
-    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    return list(R_WB.T @ displacement / scaling.translation_scale)
+    return list(scaling.R_WB.T @ displacement / scaling.translation_scale)
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:

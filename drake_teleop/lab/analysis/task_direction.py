@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RollPitchYaw, RotationMatrix
+from pydrake.math import RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -66,7 +66,7 @@ def task_direction(
         raise DrakeTeleopError(what, where="force_scaling.eta", remedy="set eta: null")
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand
-    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
+    R_WB = scaling.R_WB
     displacement_B = finite_array("displacement", displacement, 3)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
     device_mass, device_damping = _device_mass_and_damping(scenario, displacement_B, hand_B)

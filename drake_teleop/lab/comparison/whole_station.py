@@ -21,7 +21,8 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.energy import energy_balance, port_work
+from drake_teleop.station.passivity.energy import port_work
+from drake_teleop.station.passivity.memory import STORED_ENERGY
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
@@ -219,13 +220,11 @@ def start_energy(scenario: Scenario) -> Array:
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    memory = methods.initial_method_memory(scenario.passivity.method, p, pose)
-    return 2 * energy_balance(memory).stored
+    return 2 * methods.initial_method_memory(scenario.passivity.method, p, pose)[STORED_ENERGY]
 
 
 def _kinematic_scales(scenario: Scenario) -> Array:
-    scaling = scenario.kinematic_scaling
-    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    scales = scenario.kinematic_scaling.scales
     return np.where(scales > 0.0, scales, 1.0)
 
 

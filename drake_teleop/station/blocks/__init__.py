@@ -1,9 +1,8 @@
 """Drake blocks of the paper's Fig. 4, with one port per signal, for use in your own Diagram."""
 
-from drake_teleop.station.blocks.ends import PassivityAtMaster, PassivityAtSlave
+from drake_teleop.station.blocks.channel import NetworkChannel, PassivityAtMaster, PassivityAtSlave
 from drake_teleop.station.blocks.estimators import ContactDetector, LoadEstimator
 from drake_teleop.station.blocks.force_display import ForceDisplay
-from drake_teleop.station.blocks.network_channel import NetworkChannel
 from drake_teleop.station.blocks.wrenches import (
     NonContactWrench,
     NonContactWrench_,

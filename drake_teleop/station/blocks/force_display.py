@@ -7,12 +7,9 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.station.master import force_display as display
 from drake_teleop.station.master.dynamics import HapticDevice
-from drake_teleop.station.master.force_display import (
-    DISPLAYED_WRENCH_SLOTS,
-    initial_display_state,
-    step_display,
-)
+from drake_teleop.station.master.force_display import DISPLAYED_WRENCH_SLOTS
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.stepped_block import SteppedBlock
 
@@ -44,7 +41,7 @@ class ForceDisplay(SteppedBlock):
     ) -> None:
         super().__init__()
         self._period, self._parameters, self._jacobian = period, device.parameters, np.zeros((6, 6))
-        memory = initial_display_state(finite_array("start", start, 6), device.parameters)
+        memory = display.initial_display_state(finite_array("start", start, 6), device.parameters)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._position = self.DeclareVectorInputPort("joint_position", 6)
         self._declare_step([memory], 1, period)
@@ -57,4 +54,4 @@ class ForceDisplay(SteppedBlock):
         (drive,), command = results, self._command.Eval(context)
         device = drive.copy()
         device[:6] = self._position.Eval(context)
-        step_display(command, device, self._parameters, self._period, self._jacobian, drive)
+        display.step_display(command, device, self._parameters, self._period, self._jacobian, drive)

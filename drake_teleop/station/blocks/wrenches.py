@@ -13,13 +13,11 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import finite_array
-from drake_teleop.load.compensation import (
-    add_excess_weight_into,
-    scaled_wrench_into,
-    unknown_gravity_error,
-)
+from drake_teleop.load import compensation
+from drake_teleop.load.compensation import add_excess_weight_into, scaled_wrench_into
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
+from drake_teleop.station.scaling import force_scaling
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, Scales
 
 _GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
@@ -138,39 +136,31 @@ def WrenchScaling_(T: Any) -> Any:
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
             Impl._construct(self, other._config, other._R_WB, other._gravity_W, converter=converter)
 
-        def _scaled(self, context: Any, scales: tuple[float, float, float]) -> Any:
+        def _scaled(self, context: Any, scales: Scales) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
-            wrench = _zero_vector_of_type(T, 6)
-            _compiled_or_python(scaled_wrench_into, T)(
-                measured, estimate[:6], s, omega, alpha, *self._parts(estimate), *scales, wrench
-            )
-            return wrench
-
-        def _parts(self, estimate: Any) -> tuple[Any, Any]:
-            given = self._config.gripper_phi
+            given, wrench = self._config.gripper_phi, _zero_vector_of_type(T, 6)
             gripper = estimate[6:] if given is None else np.asarray(given)
-            return gripper, estimate[6:] - gripper
+            parts = gripper, estimate[6:] - gripper
+            _compiled_or_python(scaled_wrench_into, T)(
+                measured, estimate[:6], s, omega, alpha, *parts, *scales[:3], wrench
+            )
+            excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
+            if any(excess):
+                if not self._orientation.HasValue(context):
+                    where = "WrenchScaling: gravity in S"
+                    raise compensation.unknown_gravity_error(where, "connect R_WS")
+                gravity = self._R_WS(context).T @ self._gravity_W
+                _compiled_or_python(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
+            return wrench
 
         def _R_WS(self, context: Any) -> Any:
             return np.ascontiguousarray(self._orientation.Eval(context)).reshape(3, 3)
 
         def _calc_contact(self, context: Any, output: Any) -> None:
-            output.SetFromVector(self._scaled(context, (0.0, 0.0, 1.0)))
+            output.SetFromVector(self._scaled(context, Scales(0.0, 0.0, 1.0, 0.0, 0.0)))
 
         def _calc_scaled(self, context: Any, output: Any) -> None:
-            output.SetFromVector(self._scaled_wrench(context))
-
-        def _scaled_wrench(self, context: Any) -> Any:
-            scales = self._scales
-            wrench = self._scaled(context, scales[:3])
-            excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
-            if any(excess):
-                if not self._orientation.HasValue(context):
-                    raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
-                gravity = self._R_WS(context).T @ self._gravity_W
-                parts = self._parts(self._inputs[-1].Eval(context))
-                _compiled_or_python(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
-            return wrench
+            output.SetFromVector(self._scaled(context, self._scales))
 
         def _calc_to_master(self, context: Any, output: Any) -> None:
             if not self._orientation.HasValue(context):
@@ -178,8 +168,9 @@ def WrenchScaling_(T: Any) -> Any:
                 remedy = "connect a rotation matrix, by rows"
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
-            scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)
-            _compiled_or_python(wrench_to_master_into, T)(scaled, R_WS, self._R_WB, k, k, wrench)
+            scaled, R_WS = self._scaled(context, self._scales), self._R_WS(context)
+            to_master_into = _compiled_or_python(force_scaling.wrench_to_master_into, T)
+            to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)
 
     return Impl

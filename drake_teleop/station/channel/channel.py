@@ -1,4 +1,4 @@
-"""Channel between master and slave (long: one file for one compiled step of both ends)."""
+"""Channel between master and slave: one compiled step of both ends."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import copy_into
+from drake_teleop.common.vectors import apply_matrix, copy_into, matrix_at, transposed, vector_at
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import memory as slots
@@ -165,9 +165,7 @@ def step_master_end(
     before, held = ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG], ends[_RENDERED_HAND_WRENCH]
     watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
-    valid = _update_pose_and_write_increment(pose_command, before, dx)
-    for i in range(6):
-        twist[i] = dx[i] / T
+    valid = _update_pose(pose_command, before, T, dx, twist)
     for g in range(2):
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
@@ -201,9 +199,7 @@ def step_slave_end(
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
-    valid = _update_pose_and_write_increment(slave_pose, before, dx)
-    for i in range(6):
-        twist[i] = dx[i] / T
+    valid = _update_pose(slave_pose, before, T, dx, twist)
     for g in range(2):
         work[g] += dot_of_group(held, dx, g)
     load = memory[slots.LOAD_WRENCH]
@@ -240,38 +236,36 @@ def step_slave_end(
 
 
 @njit(cache=True)
-def _update_pose_and_write_increment(pose, before, dx):
-    """Write the change `dx` (6,), 0 unless both are valid; return whether `pose` is valid."""
+def _update_pose(pose, before, T, dx, twist):
+    """Write change (6,) and twist (6,), 0 unless both poses are valid; return whether `pose` is."""
     valid = are_finite_and_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
         copy_into(before, 0, pose, 0, 7)
     if not valid or before[7] > 0.0:
         dx[:] = 0.0
+    for i in range(6):
+        twist[i] = dx[i] / T
     before[7] = 0.0 if valid else 1.0
     return valid
 
 
 @njit(cache=True)
 def _convert_wrench_to_world(wrench_B, frame, out):
-    R, scales = frame[_R_WB_ROWS], frame[_MOTION_SCALES]
+    R_WB, scales = matrix_at(frame, _R_WB_ROWS.start), frame[_MOTION_SCALES]
     for g in range(2):
+        rotated = apply_matrix(R_WB, vector_at(wrench_B, 3 * g))
         for i in range(3):
-            total = 0.0
-            for j in range(3):
-                total += R[3 * i + j] * wrench_B[3 * g + j]
-            out[3 * g + i] = total / scales[g]
+            out[3 * g + i] = (rotated[i] + 0.0) / scales[g]  # 0, never -0
 
 
 @njit(cache=True)
 def _convert_wrench_to_master(wrench, frame, out):
-    R, scales = frame[_R_WB_ROWS], frame[_MOTION_SCALES]
+    R_BW, scales = transposed(matrix_at(frame, _R_WB_ROWS.start)), frame[_MOTION_SCALES]
     for g in range(2):
+        rotated = apply_matrix(R_BW, vector_at(wrench, 3 * g))
         for i in range(3):
-            total = 0.0
-            for j in range(3):
-                total += R[3 * j + i] * wrench[3 * g + j]
-            out[3 * g + i] = total * scales[g]
+            out[3 * g + i] = (rotated[i] + 0.0) * scales[g]  # 0, never -0
 
 
 class TeleopChannel(SteppedBlock):
@@ -279,24 +273,11 @@ class TeleopChannel(SteppedBlock):
 
     While the wrist sensor is saturated, the last valid wrench is used.
 
-    .. pydrake_system::
-
-        name: TeleopChannel
-        input_ports:
-        - pose_command: (7,) commanded pose X_WS, after kinematic scaling
-        - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
-        - hand_wrench_E: (6,) wrench of the hand on the stylus at E, in B [N, N m]
-        - pose_slave: (7,) actual X_WS of the slave
-        - saturated: (1,) 1 while the wrench is invalid
-        - contact: (1,) flag of the slave's contact detector; 0 if unconnected
-        - load_wrench_B: (6,) part of wrench_B from the load, for method `ledger`; 0 if unconnected
-        output_ports:
-        - pose_received: (7,) X_WS command of the slave
-        - wrench_received: (6,) F_E_B to render at the hand [N, N m]
-        - ports: (8,) energy input of the hand (2) and of the slave's wrench (2), by translation and
-          rotation [J]; time without packets at master and slave (2) [s]; energy input of the
-          slave's wrench along the slave's command (2) [J]
-        - contact_at_hand: (1,) contact flag of the newest packet at the master
+    Ports are those of `MakeChannel`; pose_received and wrench_received are outputs, contact (0 if
+    unconnected) is always an input, and load_wrench_B is used by the method `ledger` only.
+    `ports` (8,) contains the energy input of the hand (2) and of the slave's wrench (2), by
+    translation and rotation [J]; time without packets at master and slave (2) [s]; energy input of
+    the slave's wrench along the slave's command (2) [J].
 
     Args:
         R_WB: (3, 3) alignment of the master's base with the world.

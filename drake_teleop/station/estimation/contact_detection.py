@@ -61,14 +61,8 @@ class ContactDetection(LeafSystem):
 
     The flag keeps its value while the wrist sensor is saturated or the sensor's low-pass recovers.
 
-    .. pydrake_system::
-
-        name: ContactDetection
-        input_ports:
-        - sample: sample of the wrist sensor, see `drake_teleop.load.regressor`
-        - load_estimate: (16,) load estimate of Eq. (7), [offsets; phi]
-        output_ports:
-        - contact: (1,) 1 in contact, else 0
+    Ports are those of `blocks.ContactDetector`, with one input `sample` of the wrist sensor, see
+    `drake_teleop.load.regressor`, in the place of its parts.
     """
 
     __slots__ = ONE_DICT

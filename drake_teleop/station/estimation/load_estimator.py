@@ -12,16 +12,10 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.load.online import watched
 from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import METHODS
-from drake_teleop.load.online.watched import (
-    MEMORY_SIZE,
-    STATE_INDEX,
-    STATE_LEARNING,
-    STATE_SETTLED,
-    initial_monitor_memory,
-    monitor_load,
-)
+from drake_teleop.load.online.watched import STATE_INDEX, STATE_LEARNING
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
 _SAMPLES_PER_SETTLING_CHECK = 16
@@ -57,14 +51,8 @@ class LoadEstimatorConfig:
 class LoadEstimator(LeafSystem):
     """Block with the estimate of load and offsets: constant, updated in every period or monitored.
 
-    .. pydrake_system::
-
-        name: LoadEstimator
-        input_ports:
-        - sample: the wrist sensor's sample
-        output_ports:
-        - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
-        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATE_NAMES`
+    Ports are those of `blocks.LoadEstimator`, with one input `sample` of the wrist sensor in the
+    place of its parts. load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
@@ -106,9 +94,9 @@ class LoadEstimator(LeafSystem):
         calculate = weak_callback(self._calc_load_state)
         self.DeclareVectorOutputPort("load_state", 1, calculate, {self.xd_ticket()})
         if config.watch:
-            monitor = np.zeros(MEMORY_SIZE)
+            monitor = np.zeros(watched.MEMORY_SIZE)
             if covariance is not None:
-                monitor = initial_monitor_memory(start, covariance)
+                monitor = watched.initial_monitor_memory(start, covariance)
             self.DeclareDiscreteState(monitor)
             noise, share = (noise_std, motion_std, period), config.relative_wrench_error
             change = change_detector_parameters(*noise, relative_wrench_error=share)
@@ -125,22 +113,18 @@ class LoadEstimator(LeafSystem):
         if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._load_state_index(discrete_state) == STATE_LEARNING:
-            self._update_estimate(estimate, sample, discrete_state, context.get_time())
-        else:
+        if self._load_state_index(discrete_state) != STATE_LEARNING:
             memory = discrete_state.get_mutable_value(2)
-            monitor_load(estimate, memory, sample, *self._watch_arguments)
-
-    def _update_estimate(
-        self, estimate: Array, sample: Array, discrete_state: DiscreteValues, time: float
-    ) -> None:
+            watched.monitor_load(estimate, memory, sample, *self._watch_arguments)
+            return
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
+        step = round(context.get_time() / self._period)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _SAMPLES_PER_SETTLING_CHECK == 0
+        due = self._watches and step % _SAMPLES_PER_SETTLING_CHECK == 0
         if due and self._estimator.is_state_settled(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
-            discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
+            discrete_state.set_value(2, watched.initial_monitor_memory(estimate, covariance))
 
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
         return int(discrete_state.value(2)[STATE_INDEX]) if self._watches else STATE_LEARNING
@@ -151,4 +135,4 @@ class LoadEstimator(LeafSystem):
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.is_state_settled(estimate, memory.reshape(self._shape))
-            output[0] = STATE_SETTLED if settled else STATE_LEARNING
+            output[0] = watched.STATE_SETTLED if settled else STATE_LEARNING

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.passivity import memory as slots
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
 #: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
@@ -46,28 +43,3 @@ def _cumulative_work_into(wrench, pose, share, work):
             f[i] = wrench[k - 1, i] + share * (wrench[k, i] - wrench[k - 1, i])
         for g in range(2):
             work[k, g] = work[k - 1, g] + dot_of_group(f, dx, g)
-
-
-@dataclass(frozen=True)
-class EnergyBalance:
-    """Energy balance at one channel end, each (..., 2) for translation and rotation [J].
-
-    Attributes:
-        stored: energy that this end may still release.
-        received, sent: total energy received from, and sent to, the other end.
-        lost: energy removed from the loop (damper, overflow, withheld work).
-    """
-
-    stored: Array
-    received: Array
-    sent: Array
-    lost: Array
-
-
-def energy_balance(memory: Array) -> EnergyBalance:
-    """Return the energy balance of one end's `memory` (..., MEMORY_SIZE); zeros without one."""
-    if memory.shape[-1] != slots.MEMORY_SIZE:
-        what = f"expected shape (..., {slots.MEMORY_SIZE}), found {memory.shape}"
-        raise DrakeTeleopError(what, where="memory", remedy="give the memory of one channel end")
-    parts = slots.STORED_ENERGY, slots.RECEIVED_ENERGY, slots.SENT_ENERGY, slots.DISSIPATED_ENERGY
-    return EnergyBalance(*(memory[..., part].copy() for part in parts))

@@ -10,16 +10,8 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.packet import (
-    POSE,
-    VELOCITY,
-    WRENCH,
-    fill_packet,
-    has_arrived,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import fill_packet, has_arrived, pose_difference_into
 
 # Parameters; pairs are for translation and rotation.
 _layout = slots.own_parameters()
@@ -60,15 +52,15 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     difference[:] = 0.0
     connected = has_arrived(received)
     if connected:
-        pose_difference_into(received[POSE], pose, difference)
+        pose_difference_into(received[fields.POSE], pose, difference)
     for i in range(6):
         g, gain = i // 3, p[_HAND_FEEDBACK_GAIN]
-        wrench[i] = (1.0 + gain) * received[WRENCH][i] + gain * hand[i]
+        wrench[i] = (1.0 + gain) * received[fields.WRENCH][i] + gain * hand[i]
         if connected:
             wrench[i] += p[_COUPLING_STIFFNESS][g] * difference[i]
-            wrench[i] += p[_COUPLING_DAMPING][g] * (received[VELOCITY][i] - twist[i])
+            wrench[i] += p[_COUPLING_DAMPING][g] * (received[fields.VELOCITY][i] - twist[i])
     for g in range(2):
-        limit_group(wrench, g, limits[g])
+        fields.limit_group(wrench, g, limits[g])
     fill_packet(pose, twist, hand, packet)
 
 
@@ -78,10 +70,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         shift = memory[_POSE_DIFFERENCE]
         for i in range(6):
             g, gain = i // 3, p[_SLAVE_FEEDBACK_GAIN]
-            force = (1.0 + gain) * received[WRENCH][i] + gain * wrench[i]
-            shift[i] = (force + p[slots.SERVO_D][g] * received[VELOCITY][i]) / p[slots.SERVO_K][g]
-        move_pose_into(received[POSE], shift, memory[slots.COMMAND_POSE])
-        copy_into(memory, slots.COMMAND_TWIST.start, received, VELOCITY.start, 6)
+            force = (1.0 + gain) * received[fields.WRENCH][i] + gain * wrench[i]
+            force += p[slots.SERVO_D][g] * received[fields.VELOCITY][i]
+            shift[i] = force / p[slots.SERVO_K][g]
+        fields.move_pose_into(received[fields.POSE], shift, memory[slots.COMMAND_POSE])
+        copy_into(memory, slots.COMMAND_TWIST.start, received, fields.VELOCITY.start, 6)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

@@ -1,4 +1,4 @@
-"""Master's end of the passivity method "ledger" (long: one file for steps M1 to M7).
+"""Master's end of the passivity method "ledger", steps M1 to M7.
 
 docs/theory.md, "The energy ledger", has the equations of these steps.
 """
@@ -12,54 +12,11 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.passivity import ledger_slave as shared
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.ledger_slave import (
-    ANGLE_PER_LENGTH,
-    CONTACT_DIRECTION,
-    CONTACT_THRESHOLD,
-    DRAG_WRENCH,
-    ENCODER_STEP,
-    FILTERED_OWN_VELOCITY,
-    IN_CONTACT,
-    INITIAL_LEDGER_ENERGY,
-    MASTER_RESERVE,
-    MEAN_CONTACT_WRENCH,
-    NEWEST_SLAVE_PACKET,
-    PACKET_CONTACT_DAMPING,
-    PACKET_CONTACT_STIFFNESS,
-    PACKET_LEDGER_LEVEL,
-    RESERVE_SHARE_AT_MASTER,
-    ROUND_TRIP,
-    SERVO_MODEL_POSE,
-    SLAVE_MASS_FACTOR,
-    SLAVE_RESERVE,
-    TORQUE_PER_FORCE,
-    UNUSED_RESERVE_SHARE,
-    WRENCH_METRIC,
-    filter_velocity,
-    is_in_contact,
-    update_contact_direction,
-    work_along,
-    wrench_component_along,
-)
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    MAX_HAND_WRENCH_RATE,
-    PACKET_LOAD_WRENCH,
-    PACKET_NUMBER,
-    POSE,
-    VELOCITY,
-    WRENCH,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    length_of_group,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-    scale_group,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.ledger_slave import work_along, wrench_component_along
+from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, limit_group
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 _HAND_VELOCITY_FILTER_S = 4e-3
@@ -86,12 +43,12 @@ _MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED = 0.02  # m/s
 _FADE_TIME_AT_HAND_REST_S = 0.1
 _LOST_HAND_MOTION_ENCODER_STEPS = 1.1
-_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
+_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - shared.RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
 # Memory. The first places are those of `ledger_slave`, up to `CONTACT_DIRECTION`.
 _layout = slots.own_memory()
-_layout.vector(CONTACT_DIRECTION.stop - FILTERED_OWN_VELOCITY.start)
+_layout.vector(shared.CONTACT_DIRECTION.stop - shared.FILTERED_OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
 _HAND_OFFSET_AT_CONTACT_ONSET, _DIRECTION_INTO_WALL = _layout.vector(6), _layout.vector(6)
@@ -139,18 +96,18 @@ class LedgerConfig:
     )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
-        p[INITIAL_LEDGER_ENERGY] = self.initial
-        p[SLAVE_RESERVE], p[MASTER_RESERVE] = self.reserve, self.hand_reserve
+        p[shared.INITIAL_LEDGER_ENERGY] = self.initial
+        p[shared.SLAVE_RESERVE], p[shared.MASTER_RESERVE] = self.reserve, self.hand_reserve
         scales = p[slots.SLAVE_PER_MASTER_MOTION]
-        p[DRAG_WRENCH], p[CONTACT_THRESHOLD] = self.drag / scales, self.touch / scales
-        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], scales)
-        p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * scales / scales[0]) ** 2
+        p[shared.DRAG_WRENCH], p[shared.CONTACT_THRESHOLD] = self.drag / scales, self.touch / scales
+        p[shared.ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], scales)
+        p[shared.WRENCH_METRIC] = (shared.ANGLE_PER_LENGTH * scales / scales[0]) ** 2
 
 
 def initialize(p: Array, memory: Array) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
-    memory[slots.STORED_ENERGY] = p[INITIAL_LEDGER_ENERGY] / 2.0
-    memory[SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
+    memory[slots.STORED_ENERGY] = p[shared.INITIAL_LEDGER_ENERGY] / 2.0
+    memory[shared.SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
 
 
 def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
@@ -158,32 +115,32 @@ def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
-    left = (1.0 - UNUSED_RESERVE_SHARE) * np.asarray(config.reserve)
-    return np.sqrt(2.0 * left / (SLAVE_MASS_FACTOR * mass))
+    left = (1.0 - shared.UNUSED_RESERVE_SHARE) * np.asarray(config.reserve)
+    return np.sqrt(2.0 * left / (shared.SLAVE_MASS_FACTOR * mass))
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    velocity, offset_to_slave = memory[FILTERED_OWN_VELOCITY], wrench  # overwritten below
+    velocity, offset_to_slave = memory[shared.FILTERED_OWN_VELOCITY], wrench  # overwritten below
     _store_hand_step_without_flicker(dx, p, memory)
     steady = memory[_HAND_STEP_WITHOUT_FLICKER]
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
-    filter_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
+    shared.filter_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
     memory[_HAND_WALL_DEPTH] += work_along(memory[_DIRECTION_INTO_WALL], steady)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
-        _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
-        memory[slots.STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
+        _update_hand_ledger(g, dx, inside or memory[shared.IN_CONTACT] > 0.0, p, memory)
+        memory[slots.STORED_ENERGY][g] += fields.count_newly_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
-    if has_arrived(received):
-        pose_difference_into(pose, received[POSE], offset_to_slave)
+    if fields.has_arrived(received):
+        fields.pose_difference_into(pose, received[fields.POSE], offset_to_slave)
         for i in range(6):
             offset_to_slave[i] -= memory[_LOST_HAND_MOTION][i]
     _predict_contact(received, steady, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
-        wrench[i] += received[PACKET_LOAD_WRENCH][i]
-    newest = received[PACKET_NUMBER]
+        wrench[i] += received[fields.PACKET_LOAD_WRENCH][i]
+    newest = received[fields.PACKET_NUMBER]
     if newest > memory[_LAST_RECEIVED_PACKET_NUMBER] + 1.0:
         memory[_IS_WRENCH_CROSS_FADING] = 1.0
     memory[_LAST_RECEIVED_PACKET_NUMBER] = newest
@@ -191,21 +148,21 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _cross_fade_wrench(g, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
         _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
-        level = p[MASTER_RESERVE][g]
-        if memory[IN_CONTACT] > 0.0:
-            level += RESERVE_SHARE_AT_MASTER * p[SLAVE_RESERVE][g]
+        level = p[shared.MASTER_RESERVE][g]
+        if memory[shared.IN_CONTACT] > 0.0:
+            level += shared.RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
         surplus = max(memory[slots.STORED_ENERGY][g] - level, 0.0)
         memory[slots.SENT_ENERGY][g] += surplus
         memory[slots.STORED_ENERGY][g] -= surplus
         _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
-        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
-        packet[PACKET_LEDGER_LEVEL][g] = memory[slots.STORED_ENERGY][g]
-    fill_packet(pose, velocity, wrench, packet)
+        packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        packet[shared.PACKET_LEDGER_LEVEL][g] = memory[slots.STORED_ENERGY][g]
+    fields.fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
         steady[i] = -memory[_LOST_HAND_MOTION][i]
-    move_pose_into(packet[POSE], steady, packet[POSE])
-    packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
+    fields.move_pose_into(packet[fields.POSE], steady, packet[fields.POSE])
+    packet[shared.NEWEST_SLAVE_PACKET] = received[fields.PACKET_NUMBER]
 
 
 @njit(cache=True)
@@ -215,7 +172,8 @@ def _store_hand_step_without_flicker(dx, p, memory):
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             lost[i] += dx[i]
-        size, width = length_of_group(lost, g), _LOST_HAND_MOTION_ENCODER_STEPS * p[ENCODER_STEP][g]
+        size = length_of_group(lost, g)
+        width = _LOST_HAND_MOTION_ENCODER_STEPS * p[shared.ENCODER_STEP][g]
         share = 1.0 - width / size if size > width else 0.0
         for i in range(3 * g, 3 * g + 3):
             steady[i] = share * lost[i]
@@ -226,7 +184,8 @@ def _store_hand_step_without_flicker(dx, p, memory):
 def _update_hand_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g), memory[slots.STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
-    if work < 0.0 and in_contact and ledger[g] > _HAND_INPUT_SENDING_LEVEL * p[MASTER_RESERVE][g]:
+    sending_level = _HAND_INPUT_SENDING_LEVEL * p[shared.MASTER_RESERVE][g]
+    if work < 0.0 and in_contact and ledger[g] > sending_level:
         memory[slots.SENT_ENERGY][g] -= work
     else:
         ledger[g] -= work
@@ -238,13 +197,14 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal = received[WRENCH], memory[CONTACT_DIRECTION]
+    contact_wrench, normal = received[fields.WRENCH], memory[shared.CONTACT_DIRECTION]
     inward = memory[_DIRECTION_INTO_WALL]
-    k = min(_CONTACT_STIFFNESS_FACTOR * received[PACKET_CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
-    if not is_in_contact(contact_wrench, p):
-        if memory[IN_CONTACT] > 0.0:
+    stiffness = received[shared.PACKET_CONTACT_STIFFNESS]
+    k = min(_CONTACT_STIFFNESS_FACTOR * stiffness, _MAX_WALL_STIFFNESS)
+    if not shared.is_in_contact(contact_wrench, p):
+        if memory[shared.IN_CONTACT] > 0.0:
             memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
-        memory[IN_CONTACT] = 0.0
+        memory[shared.IN_CONTACT] = 0.0
         removal_depth = _FORGET_WALL_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
         removal_depth = min(_MAX_FORGET_WALL_DEPTH_M, max(removal_depth, _MIN_FORGET_WALL_DEPTH_M))
         slave_depth = memory[_HAND_WALL_DEPTH] - work_along(inward, offset_to_slave)
@@ -252,7 +212,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         memory[_MISSING_WALL_IMPULSE] += T * memory[_WALL_STIFFNESS] * excess
         if excess <= 0.0:
             memory[_MISSING_WALL_IMPULSE] = 0.0
-        if memory[_WALL_STIFFNESS] > 0.0 and received[PACKET_CONTACT_STIFFNESS] == 0.0:
+        if memory[_WALL_STIFFNESS] > 0.0 and stiffness == 0.0:
             memory[_WALL_STIFFNESS] = 0.0
             memory[_IS_WRENCH_CROSS_FADING][:] = memory[_WORK_ON_HAND_SINCE_REST][:] = 0.0
         if slave_depth > removal_depth or memory[_MISSING_WALL_IMPULSE] > _MAX_MISSING_IMPULSE_NS:
@@ -262,11 +222,13 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             wrench[i] = -min(force, _MAX_WALL_FORCE_N) * inward[i]
         return
     memory[_MISSING_WALL_IMPULSE] = 0.0
-    offset, onset = memory[_HAND_OFFSET_AT_CONTACT_ONSET], memory[IN_CONTACT] == 0.0
-    if onset or not wrench_component_along(contact_wrench, memory[MEAN_CONTACT_WRENCH], p) > 0.0:
+    offset, onset = memory[_HAND_OFFSET_AT_CONTACT_ONSET], memory[shared.IN_CONTACT] == 0.0
+    mean_wrench = memory[shared.MEAN_CONTACT_WRENCH]
+    if onset or not wrench_component_along(contact_wrench, mean_wrench, p) > 0.0:
         memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
-    size = update_contact_direction(contact_wrench, received[ROUND_TRIP], T, p, memory)
-    damper, speed = received[PACKET_CONTACT_DAMPING], work_along(normal, received[VELOCITY])
+    round_trip, damper = received[shared.ROUND_TRIP], received[shared.PACKET_CONTACT_DAMPING]
+    size = shared.update_contact_direction(contact_wrench, round_trip, T, p, memory)
+    speed = work_along(normal, received[fields.VELOCITY])
     depth = max(size + damper * speed, 0.0) / max(k, _MIN_WALL_STIFFNESS)
     depth -= work_along(normal, offset_to_slave)
     if onset:
@@ -277,16 +239,16 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             offset[:] = 0.0
         else:
             copy_into(offset, 0, offset_to_slave, 0, 6)
-        memory[IN_CONTACT] = 1.0
+        memory[shared.IN_CONTACT] = 1.0
         memory[_FRICTION_COEFFICIENT] = memory[_HAND_RETREAT_DISTANCE] = 0.0
         for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _UNMODELLED_FRICTION):
             memory[friction] = 0.0
-        copy_into(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
+        copy_into(memory, _LAST_SLAVE_POSE.start, received, fields.POSE.start, 7)
     fade = 1.0 - min(T / _HAND_OFFSET_FADE_S, 1.0)
     for i in range(6):
         offset[i] *= fade
         offset_to_slave[i] -= offset[i]
-    hand_speed = work_along(normal, memory[FILTERED_OWN_VELOCITY])
+    hand_speed = work_along(normal, memory[shared.FILTERED_OWN_VELOCITY])
     penetration = work_along(normal, offset_to_slave) + _HAND_PREDICTION_LEAD_STEPS * T * hand_speed
     force = size
     if size > 0.0:
@@ -299,8 +261,8 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     memory[_HAND_RETREAT_DISTANCE] = retreat
     force *= min(max(3.0 * (1.0 - retreat / _ZERO_FORCE_RETREAT_DISTANCE_M), 0.0), 1.0)
     last = memory[_LAST_SLAVE_POSE]
-    pose_difference_into(received[POSE], last, memory[_SLAVE_DISPLACEMENT])
-    copy_into(last, 0, received, POSE.start, 7)
+    fields.pose_difference_into(received[fields.POSE], last, memory[_SLAVE_DISPLACEMENT])
+    copy_into(last, 0, received, fields.POSE.start, 7)
     _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
@@ -317,21 +279,21 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
     """
     near, far = memory[_MODEL_FRICTION_AT_HAND], memory[_MODEL_FRICTION_AT_SLAVE]
-    rest, normal = memory[_UNMODELLED_FRICTION], memory[CONTACT_DIRECTION]
+    rest, normal = memory[_UNMODELLED_FRICTION], memory[shared.CONTACT_DIRECTION]
     slave_step, cone = memory[_SLAVE_DISPLACEMENT], memory[_FRICTION_COEFFICIENT]
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
-    copy_into(wrench, 0, received, WRENCH.start, 6)
+    copy_into(wrench, 0, received, fields.WRENCH.start, 6)
     _remove_normal_component(wrench, p, memory)
-    decay = min(T / max(_FRICTION_COEFFICIENT_DECAY_S, 3.0 * received[ROUND_TRIP]), 1.0)
+    decay = min(T / max(_FRICTION_COEFFICIENT_DECAY_S, 3.0 * received[shared.ROUND_TRIP]), 1.0)
     for g in range(2):
-        metric = max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
+        metric = max(p[shared.WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
         least = _MIN_FRICTION_RELAXATION_S
         lag = cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED)
         if g == 1:
             least = _FRICTION_TORQUE_RELAXATION_S
-            lag = _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * received[ROUND_TRIP]
+            lag = _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * received[shared.ROUND_TRIP]
         share = T / max(lag, least)
         for i in range(3 * g, 3 * g + 3):
             inward = metric * normal[i]
@@ -343,8 +305,9 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     for g in range(2):
         limit_group(far, g, cone[g] * size)
         limit_group(near, g, cone[g] * force)
+        metric = max(p[shared.WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         for i in range(3 * g, 3 * g + 3):
-            across = dx[i] - step * max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT) * normal[i]
+            across = dx[i] - step * metric * normal[i]
             wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
     _remove_normal_component(wrench, p, memory)
     for g in range(2):
@@ -354,12 +317,12 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
 @njit(cache=True)
 def _friction_stiffness(g, p):
     factor = 1.0 if g == 0 else _ROTATION_FRICTION_STIFFNESS_FACTOR
-    return factor * _MAX_WALL_STIFFNESS / max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
+    return factor * _MAX_WALL_STIFFNESS / max(p[shared.WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
 
 
 @njit(cache=True)
 def _remove_normal_component(wrench, p, memory):
-    normal = memory[CONTACT_DIRECTION]
+    normal = memory[shared.CONTACT_DIRECTION]
     component = wrench_component_along(wrench, normal, p)
     for i in range(6):
         wrench[i] -= component * normal[i]
@@ -371,9 +334,9 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
     size = length_of_group(wrench, g)
-    most = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+    most = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
     if fading[g] > 0.0 and size > most:
-        scale_group(wrench, g, most / size)
+        fields.scale_group(wrench, g, most / size)
     else:
         fading[g] = 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -385,11 +348,11 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
 def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
     size, cost = length_of_group(wrench, g), 0.0
     if size > 0.0:
-        displacement = dot_of_group(wrench, memory[FILTERED_OWN_VELOCITY], g) / size * T
+        displacement = dot_of_group(wrench, memory[shared.FILTERED_OWN_VELOCITY], g) / size * T
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
-            cost += size * _MAX_HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
-    unused = _NEVER_USED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]
+            cost += size * _MAX_HAND_ACCELERATION * shared.ANGLE_PER_LENGTH[g] * T * T
+    unused = _NEVER_USED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)
     if share * cost > most:
@@ -397,39 +360,41 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
     memory[_WITHHELD_WRENCH_SHARE][g] = 1.0 - share
     if not cost > 0.0:
         share *= _permitted_braking_share(g, dx, T, p, memory)
-    scale_group(wrench, g, share)
+    fields.scale_group(wrench, g, share)
 
 
 @njit(cache=True)
 def _permitted_braking_share(g, dx, T, p, memory):
-    if memory[slots.STORED_ENERGY][g] >= _NEVER_USED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]:
+    unused = _NEVER_USED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
+    if memory[slots.STORED_ENERGY][g] >= unused:
         return 1.0
-    velocity = memory[FILTERED_OWN_VELOCITY]
+    velocity = memory[shared.FILTERED_OWN_VELOCITY]
     along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)
     return min(max(along, 0.0) / max(along, T * speed * speed, 1e-300), 1.0)
 
 
 @njit(cache=True)
 def _add_drag_force(g, received, dx, T, p, memory, wrench):
-    velocity, drag, active = memory[FILTERED_OWN_VELOCITY], 0.0, memory[_IS_DRAG_ACTIVE]
+    velocity, drag, active = memory[shared.FILTERED_OWN_VELOCITY], 0.0, memory[_IS_DRAG_ACTIVE]
     speed = length_of_group(velocity, g)
-    own_level = memory[slots.STORED_ENERGY][g] / p[MASTER_RESERVE][g]
+    own_level = memory[slots.STORED_ENERGY][g] / p[shared.MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.
-    slave_energy = received[PACKET_LEDGER_LEVEL][g] + memory[slots.SENT_ENERGY][g]
-    lowest = min(own_level, slave_energy / p[SLAVE_RESERVE][g])
-    in_contact = memory[IN_CONTACT] > 0.0
+    slave_energy = received[shared.PACKET_LEDGER_LEVEL][g] + memory[slots.SENT_ENERGY][g]
+    lowest = min(own_level, slave_energy / p[shared.SLAVE_RESERVE][g])
+    in_contact = memory[shared.IN_CONTACT] > 0.0
     if (in_contact and own_level < _DRAG_OFF_LEVEL) or (not in_contact and lowest < _DRAG_ON_LEVEL):
         active[g] = 1.0
     elif in_contact or lowest >= _DRAG_OFF_LEVEL:
         active[g] = 0.0
     if active[g] > 0.0:
-        drag = p[DRAG_WRENCH][g]
-    if speed < _FULL_DRAG_HAND_SPEED * ANGLE_PER_LENGTH[g]:
+        drag = p[shared.DRAG_WRENCH][g]
+    full_drag_speed = _FULL_DRAG_HAND_SPEED * shared.ANGLE_PER_LENGTH[g]
+    if speed < full_drag_speed:
         memory[_WORK_ON_HAND_SINCE_REST][g] *= 1.0 - min(T / _FADE_TIME_AT_HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND_SINCE_REST][g] > 0.0:
-        excess = speed / ANGLE_PER_LENGTH[g] - _NO_BRAKE_HAND_SPEED
+        excess = speed / shared.ANGLE_PER_LENGTH[g] - _NO_BRAKE_HAND_SPEED
         share = excess / (_FULL_BRAKE_HAND_SPEED - _NO_BRAKE_HAND_SPEED)
-        drag = max(drag, _HAND_BRAKE_FORCE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
+        drag = max(drag, _HAND_BRAKE_FORCE_N * shared.TORQUE_PER_FORCE[g] * min(share, 1.0))
     drag *= _permitted_braking_share(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
-        wrench[i] -= drag * velocity[i] / max(speed, _FULL_DRAG_HAND_SPEED * ANGLE_PER_LENGTH[g])
+        wrench[i] -= drag * velocity[i] / max(speed, full_drag_speed)

@@ -1,4 +1,4 @@
-"""Slave's end of the passivity method "ledger" (long: one file for steps S1 to S6).
+"""Slave's end of the passivity method "ledger", steps S1 to S6.
 
 docs/theory.md, "The energy ledger", has the equations of these steps.
 """
@@ -9,31 +9,11 @@ import math
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.passivity import contact_fit
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.contact_fit import (
-    NUM_CONTACT_FIT_SUMS,
-    force_change_by_slip,
-    force_without_slip_steps,
-    update_contact_fit,
-)
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    METHOD_INTEGRAL,
-    PACKET_LOAD_WRENCH,
-    POSE,
-    SECOND_ENERGY_COUNTER,
-    VELOCITY,
-    WRENCH,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    length_of_group,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-    scale_group,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.contact_fit import force_without_slip_steps, update_contact_fit
+from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, move_pose_into
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 #: For translation and rotation: angle that equals a unit length, torque that equals a unit force.
@@ -67,11 +47,9 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, ROUND_TRIP = range(
-    METHOD_INTEGRAL.start, METHOD_INTEGRAL.start + 3
-)
-PACKET_LEDGER_LEVEL = SECOND_ENERGY_COUNTER
-NEWEST_SLAVE_PACKET = METHOD_INTEGRAL.stop - 1
+_numbers = range(fields.METHOD_INTEGRAL.start, fields.METHOD_INTEGRAL.stop)
+PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, ROUND_TRIP, *_, NEWEST_SLAVE_PACKET = _numbers
+PACKET_LEDGER_LEVEL = fields.SECOND_ENERGY_COUNTER
 
 # Parameters, in the master's power units.
 _layout = slots.own_parameters()
@@ -94,7 +72,7 @@ _STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
 # lag of its filter; length of the fit and its sums.
 _FILTERED_FORCE, _SAMPLE_START_FORCE, _SAMPLE_START_SPEED = (_layout.number() for _ in range(3))
 _FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = (_layout.number() for _ in range(3))
-_FIT_SUMS = _layout.vector(NUM_CONTACT_FIT_SUMS)
+_FIT_SUMS = _layout.vector(contact_fit.NUM_CONTACT_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
 _SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
 _CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = _layout.vector(6), _layout.vector(6)
@@ -154,7 +132,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[slots.COMMAND_POSE], memory[slots.COMMAND_TWIST]
-    connected = has_arrived(received)
+    connected = fields.has_arrived(received)
     memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
@@ -178,8 +156,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
-        pose_difference_into(received[POSE], now, error)
-    pose_difference_into(now, pose, memory[_MOTOR_WRENCH])
+        fields.pose_difference_into(received[fields.POSE], now, error)
+    fields.pose_difference_into(now, pose, memory[_MOTOR_WRENCH])
     _generate_command(received, connected, T, p, memory, error)
     for i in range(6):
         error[i] = T * velocity[i]
@@ -187,18 +165,18 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _limit_command_to_motor_energy(now, pose, twist, p, memory)
     _step_servo_model(received, connected, T, p, memory, error)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
-    fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
+    fields.fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT] > 0.0:
         normal = memory[CONTACT_DIRECTION]
         correction = memory[_RENDERED_FORCE] - wrench_component_along(contact, normal, p)
         for i in range(6):
-            packet[WRENCH][i] += correction * normal[i]
-    copy_into(packet, PACKET_LOAD_WRENCH.start, filtered, 0, 6)
+            packet[fields.WRENCH][i] += correction * normal[i]
+    copy_into(packet, fields.PACKET_LOAD_WRENCH.start, filtered, 0, 6)
     k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
         size = length_of_group(memory[CONTACT_DIRECTION], g)
         compliance += size * size / (_SERVO_STIFFNESS_FACTOR * p[slots.SERVO_K][g])
-        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
         level = memory[slots.STORED_ENERGY][g] - memory[slots.RECEIVED_ENERGY][g]
         packet[PACKET_LEDGER_LEVEL][g] = level
     packet[PACKET_CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
@@ -210,7 +188,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g))
-    new = count_newly_received_energy(g, received, memory)
+    new = fields.count_newly_received_energy(g, received, memory)
     ledger, input_energy = memory[slots.STORED_ENERGY], memory[_ENERGY_IN_CONTACT]
     reserve = p[SLAVE_RESERVE][g]
     ledger[g] += new
@@ -301,7 +279,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         stretch, damping = memory[_FIT_SAMPLE_LENGTH], memory[_CONTACT_DAMPING]
         change = memory[_FILTERED_FORCE] - memory[_SAMPLE_START_FORCE] - damping * speed_change
         largest = max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch
-        change -= force_change_by_slip(change, largest, max_change)
+        change -= contact_fit.force_change_by_slip(change, largest, max_change)
         change += damping * speed_change
         k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
@@ -346,7 +324,7 @@ def _max_force_change_by_slip(wrench, normal_force, T, p, memory):
 
 @njit(cache=True)
 def _generate_command(received, connected, T, p, memory, error):
-    velocity, feed = memory[slots.COMMAND_TWIST], received[VELOCITY]
+    velocity, feed = memory[slots.COMMAND_TWIST], received[fields.VELOCITY]
     normal, compliance, beyond_wall, inward_speed = memory[CONTACT_DIRECTION], 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
         beyond_wall = memory[_SLAVE_WALL_DEPTH] - work_along(normal, error)
@@ -367,10 +345,10 @@ def _generate_command(received, connected, T, p, memory, error):
                 error[i] += feed[i] + compliance * inward_speed * p[WRENCH_METRIC][g] * normal[i]
         unused, mass = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], p[slots.SLAVE_MASS][g]
         available = max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
-        limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * mass)))
+        fields.limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * mass)))
         for i in range(3 * g, 3 * g + 3):
             error[i] -= velocity[i]
-        limit_group(error, g, acceleration * T)
+        fields.limit_group(error, g, acceleration * T)
         for i in range(3 * g, 3 * g + 3):
             velocity[i] += error[i]
 
@@ -379,7 +357,7 @@ def _generate_command(received, connected, T, p, memory, error):
 def _limit_command_to_motor_energy(command, pose, twist, p, memory):
     """Move the command (7,) so that the motors' energy suffices; return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
-    pose_difference_into(command, pose, motor_wrench)
+    fields.pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
         K = _SERVO_STIFFNESS_FACTOR * p[slots.SERVO_K][g]
         D = _SERVO_DAMPING_FACTOR * p[slots.SERVO_D][g]
@@ -423,7 +401,8 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
         permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
     reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
-        scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
+        permitted_wrench = max(max(available - margin, 0.0) / reach, permitted)
+        fields.scale_group(motor_wrench, g, permitted_wrench / size)
         changed = True
     if balance < margin and not stands:
         strongest = mass * _MAX_SLAVE_DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
@@ -440,7 +419,7 @@ def _step_servo_model(received, connected, T, p, memory, error):
     model, velocity = memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:
-        pose_difference_into(received[POSE], model, error)
+        fields.pose_difference_into(received[fields.POSE], model, error)
     for i in range(6):
         mass = p[slots.SLAVE_MASS][i // 3]
         stiff, damped = p[slots.SERVO_K][i // 3] / mass, p[slots.SERVO_D][i // 3] / mass

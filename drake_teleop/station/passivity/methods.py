@@ -5,23 +5,16 @@ wrench times motion of the slave's command is the work at the hand, docs/theory.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
+from drake_teleop.common import config
 from drake_teleop.common.compiled import address_of_function, make_call_at_address, njit
-from drake_teleop.common.config import (
-    check_all_field_values,
-    check_field_name,
-    choice,
-    plain,
-    quantity,
-    settings,
-    unchecked_assignments,
-)
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
@@ -38,16 +31,11 @@ from drake_teleop.station.passivity import (
     wave,
 )
 from drake_teleop.station.passivity import memory as slots
+from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.four_channel import FourChannelConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.packet import (
-    PACKET_NUMBER,
-    PACKET_SIZE,
-    POSE,
-    SENDER_INPUTS_FINITE,
-    are_vectors_finite,
-)
+from drake_teleop.station.passivity.packet import are_vectors_finite
 from drake_teleop.station.passivity.pspm import PspmConfig
 from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
 from drake_teleop.station.passivity.tdpa import TdpaConfig, charged_tdpa_config
@@ -117,29 +105,18 @@ METHODS = Registry(
 """All methods by name."""
 
 
-@settings
-@dataclass
-class MethodConfigs:
-    """Parameters of the shipped passivity methods."""
-
-    wave: WaveConfig = field(default_factory=WaveConfig)
-    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
-    charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)
-    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
-    pspm: PspmConfig = field(default_factory=PspmConfig)
-    ledger: LedgerConfig = field(default_factory=LedgerConfig)
-    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
-    local_force_limit: ForceLimitConfig = field(
-        default_factory=ForceLimitConfig, metadata={"method": "force_limit"}
-    )
-
-
-_CONFIG_FIELD_OF_METHOD = {f.metadata.get("method", f.name): f.name for f in fields(MethodConfigs)}
 _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
+@settings
 @dataclass
-class _CommonMethodConfig:
+class PassivityConfig:
+    """Method that keeps the station passive, and the parameters of each method.
+
+    The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
+    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
+    """
+
     method: str = choice(
         "none", (),
         "passivity method of the channel; two_layer, pspm, four_channel and force_limit are"
@@ -164,16 +141,14 @@ class _CommonMethodConfig:
         " mass and servo of the station's arm at the start", length=2,
     )  # fmt: skip
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
-
-
-@settings
-@dataclass
-class PassivityConfig(MethodConfigs, _CommonMethodConfig):
-    """Method that keeps the station passive, and the parameters of each method.
-
-    The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
-    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
-    """
+    wave: WaveConfig = field(default_factory=WaveConfig)
+    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
+    charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)
+    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
+    pspm: PspmConfig = field(default_factory=PspmConfig)
+    ledger: LedgerConfig = field(default_factory=LedgerConfig)
+    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
+    local_force_limit: ForceLimitConfig = field(default_factory=ForceLimitConfig)
 
     def check(self, where: str) -> None:
         METHODS.check(self.method, f"{where}.method")
@@ -189,14 +164,16 @@ class PassivityConfig(MethodConfigs, _CommonMethodConfig):
                     where=f"{where}.registered",
                     remedy="leave them out; a shipped method has its own block of parameters",
                 )
-            entry = _CONFIG_FIELD_OF_METHOD.get(self.method)
-            return None if entry is None else getattr(self, entry)
+            # The number `force_limit` is a limit of all methods.
+            name = "local_force_limit" if self.method == "force_limit" else self.method
+            own = getattr(self, name, None)
+            return own if is_dataclass(own) else None
         for name in self.registered:
-            check_field_name(schema, name, f"{where}.registered.{name}")
-        with unchecked_assignments():
-            config = schema(**self.registered)
-        check_all_field_values(config, f"{where}.registered")
-        return config
+            config.check_field_name(schema, name, f"{where}.registered.{name}")
+        with config.unchecked_assignments():
+            own = schema(**self.registered)
+        config.check_all_field_values(own, f"{where}.registered")
+        return own
 
 
 def method_parameters(
@@ -233,7 +210,7 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(slots.MEMORY_SIZE)
     memory[slots.COMMAND_POSE] = pose
-    memory[slots.LAST_HEALTHY_SENT_PACKET][POSE] = pose
+    memory[slots.LAST_HEALTHY_SENT_PACKET][fields.POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -261,12 +238,12 @@ def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
 @njit(cache=True)
 def _set_packet_number_and_health(healthy, memory, packet):
     if healthy:
-        packet[SENDER_INPUTS_FINITE] = 1.0
-        copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, PACKET_SIZE)
+        packet[fields.SENDER_INPUTS_FINITE] = 1.0
+        copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, fields.PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, slots.LAST_HEALTHY_SENT_PACKET.start, PACKET_SIZE)
-        packet[SENDER_INPUTS_FINITE] = 0.0
-    packet[PACKET_NUMBER] = memory[slots.STEP_COUNT]
+        copy_into(packet, 0, memory, slots.LAST_HEALTHY_SENT_PACKET.start, fields.PACKET_SIZE)
+        packet[fields.SENDER_INPUTS_FINITE] = 0.0
+    packet[fields.PACKET_NUMBER] = memory[slots.STEP_COUNT]
     memory[slots.STEP_COUNT] += 1.0
 
 

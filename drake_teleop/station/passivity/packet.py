@@ -7,14 +7,9 @@ from __future__ import annotations
 
 import math
 
+from drake_teleop.common import vectors
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    normalized_quaternion,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-)
+from drake_teleop.common.vectors import normalized_quaternion, quaternion_product
 from drake_teleop.station.passivity.memory import RECEIVED_ENERGY, SlotAllocator
 
 PACKET_SIZE = 38
@@ -54,11 +49,9 @@ def count_newly_received_energy(g, received, memory):
 
 @njit(cache=True)
 def fill_packet(pose, twist, wrench, packet):
-    now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
-    for i in range(7):
-        now[i] = pose[i]
-    for i in range(6):
-        velocity[i], force[i] = twist[i], wrench[i]
+    vectors.copy_into(packet, POSE.start, pose, 0, 7)
+    vectors.copy_into(packet, VELOCITY.start, twist, 0, 6)
+    vectors.copy_into(packet, WRENCH.start, wrench, 0, 6)
 
 
 @njit(cache=True)
@@ -102,8 +95,8 @@ def pose_difference_into(a, b, e):
 
     It is [p_a - p_b; log(R_a R_b^T)].
     """
-    inverse = conjugate_quaternion((b[0], b[1], b[2], b[3]))
-    turn = quaternion_logarithm(quaternion_product((a[0], a[1], a[2], a[3]), inverse))
+    inverse = vectors.conjugate_quaternion((b[0], b[1], b[2], b[3]))
+    turn = vectors.quaternion_logarithm(quaternion_product((a[0], a[1], a[2], a[3]), inverse))
     for i in range(3):
         e[i] = a[4 + i] - b[4 + i]
         e[3 + i] = turn[i]
@@ -112,9 +105,8 @@ def pose_difference_into(a, b, e):
 @njit(cache=True)
 def move_pose_into(pose, e, out):
     """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
-    turn = quaternion_exponential((e[3], e[4], e[5]))
+    turn = vectors.quaternion_exponential((e[3], e[4], e[5]))
     q = normalized_quaternion(quaternion_product(turn, (pose[0], pose[1], pose[2], pose[3])))
-    for i in range(4):
-        out[i] = q[i]
+    out[0], out[1], out[2], out[3] = q
     for i in range(3):
         out[4 + i] = pose[4 + i] + e[i]

@@ -13,19 +13,8 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    POSE,
-    VELOCITY,
-    WRENCH,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, pose_difference_into
 
 # Parameters, for translation and rotation.
 _layout = slots.own_parameters()
@@ -71,7 +60,7 @@ def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memor
     damped -= 0.5 * stiffness * (stored - before)
     ledger = memory[slots.STORED_ENERGY]
     energy = ledger[g] + damped
-    energy += count_newly_received_energy(g, received, memory)
+    energy += fields.count_newly_received_energy(g, received, memory)
     available = stored + 2.0 * energy / stiffness
     share = 1.0 if required <= max(available, 0.0) else math.sqrt(max(available, 0.0) / required)
     for i in range(3 * g, 3 * g + 3):
@@ -83,25 +72,25 @@ def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memor
     else:
         memory[slots.DISSIPATED_ENERGY][g] += surplus
     ledger[g] = energy - surplus
-    packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+    packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
-    received_wrench, K, B = received[WRENCH], p[_SPRING_STIFFNESS], p[_HAND_DAMPING]
+    received_wrench, K, B = received[fields.WRENCH], p[_SPRING_STIFFNESS], p[_HAND_DAMPING]
     for g in range(2):
         before = dot_of_group(offset, offset, g)
         for i in range(3 * g, 3 * g + 3):
             offset[i] -= dx[i]
             wrench[i] = received_wrench[i]
-        limit_group(wrench, g, limits[g])
+        fields.limit_group(wrench, g, limits[g])
         for i in range(3 * g, 3 * g + 3):
             requested[i] = wrench[i] / K[g]
         _modulate_set_position(received, g, K[g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
-        limit_group(wrench, g, limits[g])
+        fields.limit_group(wrench, g, limits[g])
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -113,14 +102,14 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
-    if has_arrived(received):
-        pose_difference_into(received[POSE], pose, requested)
-        copy_into(memory, slots.COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    if fields.has_arrived(received):
+        pose_difference_into(received[fields.POSE], pose, requested)
+        copy_into(memory, slots.COMMAND_TWIST.start, received, fields.VELOCITY.start, 6)
     for g in range(2):
         _modulate_set_position(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
-    move_pose_into(pose, offset, now)
+    fields.move_pose_into(pose, offset, now)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 

@@ -12,13 +12,8 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.packet import (
-    dot_of_group,
-    length_of_group,
-    move_pose_into,
-    pose_difference_into,
-    scale_group,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, move_pose_into
 
 STOP_TIME_S = 0.05  #: time in which a silent end comes to rest [s]
 RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
@@ -111,7 +106,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     if watch[SILENCE_TIME] <= timeout:
         watch[_TIME_SINCE_RESUME_BEGAN] = min(watch[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
     elif watch[_TIME_SINCE_RESUME_BEGAN] > 0.0:
-        pose_difference_into(last, before, velocity)
+        fields.pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         copy_into(start, 0, last, 0, 7)
@@ -128,7 +123,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
         move_pose_into(start, step, command)
         u = watch[_TIME_SINCE_RESUME_BEGAN] / RESUME_TIME_S
         if u > 0.0:
-            pose_difference_into(requested, command, step)
+            fields.pose_difference_into(requested, command, step)
             for i in range(6):
                 step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
             move_pose_into(command, step, command)
@@ -153,5 +148,5 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
             slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
             fading = 2.0 - along / p[slots.RETREAT_SPEED][g]
             share = max(fading, p[slots.SLAVE_MASS][g] * slowing / size, 0.0)
-            scale_group(wrench, g, min(share, 1.0))
+            fields.scale_group(wrench, g, min(share, 1.0))
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)

@@ -14,24 +14,8 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    MAX_HAND_WRENCH_RATE,
-    METHOD_INTEGRAL,
-    PACKET_NUMBER,
-    POSE,
-    SECOND_ENERGY_COUNTER,
-    WRENCH,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    length_of_group,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-    scale_group,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, limit_group
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
 _KEPT_HAND_INPUT_SHARE = 0.5
@@ -45,7 +29,8 @@ _STIFFNESS_AVERAGING_TRAVEL = (1e-3, 1e-2)
 _FULL_DRAG_HAND_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET, _PACKET_SLAVE_ENERGY = METHOD_INTEGRAL.start, SECOND_ENERGY_COUNTER
+_NEWEST_MASTER_PACKET = fields.METHOD_INTEGRAL.start
+_PACKET_SLAVE_ENERGY = fields.SECOND_ENERGY_COUNTER
 
 # Parameters; reserve, drag and stiffness in the master's power units.
 _layout = slots.own_parameters()
@@ -114,32 +99,32 @@ def charged_tdpa_config() -> TdpaConfig:
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     drain = min(T * p[_LEDGER_DRAIN_RATE], 1.0)
     release = T / p[_WRENCH_RELEASE_TIME] if p[_WRENCH_RELEASE_TIME] > 0.0 else 1.0
-    copy_into(wrench, 0, received, WRENCH.start, 6)
+    copy_into(wrench, 0, received, fields.WRENCH.start, 6)
     ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     withheld = memory[_WITHHELD_WRENCH_SHARE]
     for g in range(2):
-        ledger[g] += count_newly_received_energy(g, received, memory)
+        ledger[g] += fields.count_newly_received_energy(g, received, memory)
         limit_group(wrench, g, limits[g])
         share = min(1.0, 1.0 - withheld[g] + release)
         drained = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
-            max_decrease = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            max_decrease = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
             least = length_of_group(memory[slots.LAST_PORT_WRENCH], g) - max_decrease
             share = min(share, max(drain * stored / drained, least / length_of_group(wrench, g)))
             share = min(share, stored / drained)
         withheld[g] = 1.0 - share
         memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * drained
-        scale_group(wrench, g, share)
+        fields.scale_group(wrench, g, share)
         _add_drag_force(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
         _charge_hand_work_to_ledger(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
             ledger[g] -= surplus
             memory[slots.SENT_ENERGY][g] += surplus
-        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
-    fill_packet(pose, twist, wrench, packet)
-    packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
+        packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+    fields.fill_packet(pose, twist, wrench, packet)
+    packet[_NEWEST_MASTER_PACKET] = received[fields.PACKET_NUMBER]
 
 
 @njit(cache=True)
@@ -169,11 +154,11 @@ def _charge_hand_work_to_ledger(g, drained, p, memory):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     copy_into(memory, _LAST_COMMAND.start, memory, slots.COMMAND_POSE.start, 7)
     for g in range(2):
-        count_newly_received_energy(g, received, memory)
+        fields.count_newly_received_energy(g, received, memory)
         work = dot_of_group(wrench, dx, g)
         memory[_SLAVE_WORK_IN][g] += max(work, 0.0)
         memory[_SLAVE_WORK_OUT][g] += max(-work, 0.0)
-    if has_arrived(received):
+    if fields.has_arrived(received):
         _advance_command(received, wrench, T, p, memory)
     for g in range(2):
         available = _energy_available_to_slave(memory, g)
@@ -181,12 +166,12 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         # Output beyond the received energy is compensated before energy is sent.
         memory[slots.SENT_ENERGY][g] = max(memory[slots.SENT_ENERGY][g], credit)
         memory[slots.STORED_ENERGY][g] = available
-        packet[CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
+        packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
         packet[_PACKET_SLAVE_ENERGY][g] = memory[slots.STORED_ENERGY][g]
         _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
-    fill_packet(pose, twist, memory[_FILTERED_SLAVE_WRENCH], packet)
+    fields.fill_packet(pose, twist, memory[_FILTERED_SLAVE_WRENCH], packet)
 
 
 @njit(cache=True)
@@ -236,7 +221,7 @@ def _advance_command(received, wrench, T, p, memory):
     now, withheld = memory[slots.COMMAND_POSE], memory[_WITHHELD_COMMAND_MOTION]
     step = memory[slots.COMMAND_TWIST]
     remaining_share = 1.0 - min(T * p[_COMMAND_DRIFT_RATE], 1.0)
-    pose_difference_into(received[POSE], now, step)
+    fields.pose_difference_into(received[fields.POSE], now, step)
     for i in range(6):
         step[i] -= remaining_share * withheld[i]
     for g in range(2):
@@ -244,13 +229,13 @@ def _advance_command(received, wrench, T, p, memory):
         pressing = -dot_of_group(wrench, step, g)
         available = max(_energy_available_to_slave(memory, g), 0.0)
         if pressing > available:
-            scale_group(step, g, available / pressing)
+            fields.scale_group(step, g, available / pressing)
             memory[slots.DISSIPATED_ENERGY][g] += pressing - available
             pressing = available
         memory[_COMMAND_WORK_OUT][g] += max(pressing, 0.0)
         memory[_COMMAND_WORK_IN][g] += max(-pressing, 0.0)
-    move_pose_into(now, step, now)
-    pose_difference_into(received[POSE], now, withheld)
+    fields.move_pose_into(now, step, now)
+    fields.pose_difference_into(received[fields.POSE], now, withheld)
     for i in range(6):
         step[i] /= T
 
@@ -258,7 +243,7 @@ def _advance_command(received, wrench, T, p, memory):
 @njit(cache=True)
 def _add_command_work(command, sign, memory):
     step = np.empty(6)
-    pose_difference_into(command, memory[_LAST_COMMAND], step)
+    fields.pose_difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
         work = sign * dot_of_group(memory[slots.LAST_PORT_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0

@@ -10,21 +10,8 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    POSE,
-    VELOCITY,
-    WRENCH,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    length_of_group,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-    scale_group,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, length_of_group
 
 # Parameters; pairs are for translation and rotation.
 _layout = slots.own_parameters()
@@ -79,14 +66,14 @@ def _exchange_tank_energy(received, dx, T, p, memory, packet):
     held, capacity = memory[slots.LAST_PORT_WRENCH], p[_TANK_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
-        level += count_newly_received_energy(g, received, memory)
+        level += fields.count_newly_received_energy(g, received, memory)
         sent = min(T * p[_SEND_RATE], 1.0) * max(level - _TANK_RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
         memory[slots.DISSIPATED_ENERGY][g] += lost
         ledger[g] = level - lost
-        packet[CUMULATIVE_ENERGY][g] = sent_so_far[g]
+        packet[fields.CUMULATIVE_ENERGY][g] = sent_so_far[g]
 
 
 @njit(cache=True)
@@ -99,22 +86,22 @@ def _limit_wrench_to_tank(f, dx, g, acceleration, T, memory):
     cost = _max_step_work(f, dx, g, acceleration, T)
     level = max(memory[slots.STORED_ENERGY][g], 0.0)
     if cost > level:
-        scale_group(f, g, level / cost)
+        fields.scale_group(f, g, level / cost)
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     _exchange_tank_energy(received, dx, T, p, memory, packet)
-    ledger, requested = memory[slots.STORED_ENERGY], received[WRENCH]
+    ledger, requested = memory[slots.STORED_ENERGY], received[fields.WRENCH]
     for g in range(2):
         damping = p[_DAMPING_PER_MISSING_ENERGY][g] * max(p[_TARGET_TANK_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = requested[i] - damping * twist[i]
-        limit_group(wrench, g, limits[g])
+        fields.limit_group(wrench, g, limits[g])
         drained = dot_of_group(wrench, dx, g)
         drainable = min(T * p[_MAX_TANK_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
         if drained > drainable:
-            scale_group(wrench, g, drainable / drained)
+            fields.scale_group(wrench, g, drainable / drained)
         _limit_wrench_to_tank(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
     fill_packet(pose, twist, wrench, packet)
 
@@ -124,9 +111,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     spring, brake = memory[_SERVO_SPRING_WRENCH], memory[_SERVO_DAMPER_WRENCH]
     _exchange_tank_energy(received, dx, T, p, memory, packet)
     target = memory[slots.COMMAND_POSE]
-    if has_arrived(received):
-        target = received[POSE]
-    pose_difference_into(target, pose, spring)
+    if fields.has_arrived(received):
+        target = received[fields.POSE]
+    fields.pose_difference_into(target, pose, spring)
     motor_wrench, K, D = memory[slots.LAST_PORT_WRENCH], p[slots.SERVO_K], p[slots.SERVO_D]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
@@ -150,8 +137,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             _limit_wrench_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
-    move_pose_into(pose, spring, memory[slots.COMMAND_POSE])
-    copy_into(memory, slots.COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    fields.move_pose_into(pose, spring, memory[slots.COMMAND_POSE])
+    copy_into(memory, slots.COMMAND_TWIST.start, received, fields.VELOCITY.start, 6)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 
@@ -160,6 +147,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 def record_command(requested, command, pose, twist, p, memory):
     spring, held = memory[_SERVO_SPRING_WRENCH], memory[slots.LAST_PORT_WRENCH]
     K, D = p[slots.SERVO_K], p[slots.SERVO_D]
-    pose_difference_into(command, pose, spring)
+    fields.pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

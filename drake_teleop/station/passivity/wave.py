@@ -12,20 +12,8 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import memory as slots
-from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
-    MAX_HAND_WRENCH_RATE,
-    METHOD_INTEGRAL,
-    PACKET_NUMBER,
-    POSE,
-    count_newly_received_energy,
-    dot_of_group,
-    fill_packet,
-    has_arrived,
-    limit_group,
-    move_pose_into,
-    pose_difference_into,
-)
+from drake_teleop.station.passivity import packet as fields
+from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, limit_group
 
 # Parameters.
 _layout = slots.own_parameters()
@@ -72,9 +60,9 @@ class WaveConfig:
 @njit(cache=True)
 def _filter_received_wave(received, T, p, memory):
     ledger, played = memory[slots.STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
-    wave, integral = memory[_FILTERED_WAVE], received[METHOD_INTEGRAL]
+    wave, integral = memory[_FILTERED_WAVE], received[fields.METHOD_INTEGRAL]
     for g in range(2):
-        ledger[g] += count_newly_received_energy(g, received, memory)
+        ledger[g] += fields.count_newly_received_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
             wave[i] = integral[i] - played[i]
         left, store = dot_of_group(wave, wave, g), 2.0 * T * ledger[g]
@@ -91,7 +79,7 @@ def _filter_received_wave(received, T, p, memory):
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     wave, integral = memory[_FILTERED_WAVE], memory[_SENT_WAVE_INTEGRAL]
     _filter_received_wave(received, T, p, memory)
-    catching_up, newest = memory[_IS_WRENCH_CATCHING_UP], received[PACKET_NUMBER]
+    catching_up, newest = memory[_IS_WRENCH_CATCHING_UP], received[fields.PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET_NUMBER] + 1.0:
         catching_up = 1.0
     memory[_IS_WRENCH_CATCHING_UP], memory[_NEWEST_PACKET_NUMBER] = 0.0 if fresh else 1.0, newest
@@ -104,15 +92,15 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
-            most = MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            most = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
             if _limit_wrench_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
                 memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
         memory[slots.SENT_ENERGY][g] += max(left, 0.0)
-    copy_into(packet, METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
-    copy_into(packet, CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
+    copy_into(packet, fields.METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
+    copy_into(packet, fields.CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -142,16 +130,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         _reflect_wave_while_channel_fills(received, wrench, T, p, memory)
     elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE_BEFORE_HOLD]:
         _reflect_wave(received, wrench, T, p, memory)
-        if has_arrived(received):
+        if fields.has_arrived(received):
             _correct_pose_drift(received, wrench, T, p, memory)
-        move_pose_into(now, step, now)
+        fields.move_pose_into(now, step, now)
         for i in range(6):
             step[i] /= T
     else:
         step[:] = 0.0
         _reflect_wave_at_held_command(wrench, T, p, memory)
-    copy_into(packet, METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
-    copy_into(packet, CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
+    copy_into(packet, fields.METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
+    copy_into(packet, fields.CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
@@ -195,11 +183,11 @@ def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
     ledger, played = memory[slots.STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
     integral = memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
-        accounted[g] = max(accounted[g], received[CUMULATIVE_ENERGY][g])
+        accounted[g] = max(accounted[g], received[fields.CUMULATIVE_ENERGY][g])
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
             integral[i] -= T * wave[i]
-            played[i] = received[METHOD_INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
+            played[i] = received[fields.METHOD_INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
         memory[slots.SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
         ledger[g] = 0.5 * (T + p[_WAVE_FILTER_TIME]) * dot_of_group(wave, wave, g)
 
@@ -207,7 +195,7 @@ def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
 @njit(cache=True)
 def _correct_pose_drift(received, wrench, T, p, memory):
     drift, step = memory[_POSE_DRIFT], memory[slots.COMMAND_TWIST]
-    pose_difference_into(received[POSE], memory[slots.COMMAND_POSE], drift)
+    fields.pose_difference_into(received[fields.POSE], memory[slots.COMMAND_POSE], drift)
     for g in range(2):
         if dot_of_group(wrench, drift, g) >= 0.0:
             for i in range(3 * g, 3 * g + 3):

@@ -1,31 +1,22 @@
 """Force scaling, slave to master, of contact and load's wrench (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import weakref
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
+from drake_teleop.common import vectors
+from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    apply_matrix,
-    matrix_as_tuple,
-    scale_vector,
-    transposed,
-    vector_at,
-)
-from drake_teleop.load import regressor
-from drake_teleop.load.compensation import (
-    add_excess_weight_into,
-    scaled_wrench_into,
-    scales_from_eta,
-    weight_scales_and_inertia_scales,
-)
+from drake_teleop.common.vectors import apply_matrix, matrix_as_tuple, scale_vector, vector_at
+from drake_teleop.load import compensation, regressor
+from drake_teleop.load.compensation import add_excess_weight_into, scaled_wrench_into
 from drake_teleop.station.slave.arm import (
     ArmModel,
     acceleration_from_specific_force_into,
@@ -92,7 +83,8 @@ class ForceScalingConfig:
             raise DrakeTeleopError(what, where=f"{where}.gripper_phi", remedy=remedy)
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
-            weights, inertias = weight_scales_and_inertia_scales(self.sigma, self.sigma, *separate)
+            sigmas = self.sigma, self.sigma, *separate
+            weights, inertias = compensation.weight_scales_and_inertia_scales(*sigmas)
             return Scales(*inertias, self.gamma, *weights)
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
@@ -100,7 +92,7 @@ class ForceScalingConfig:
             required = "set sigma: 0, gamma: 1 and gripper_phi (section V of the paper)"
             remedy = f"{required}, and leave sigma_weight and sigma_inertia out"
             raise DrakeTeleopError(what, where=f"{where}.eta", remedy=remedy)
-        gripper, grasped, gamma = scales_from_eta(self.eta)
+        gripper, grasped, gamma = compensation.scales_from_eta(self.eta)
         return Scales(gripper, grasped, gamma, gripper, grasped)
 
 
@@ -109,27 +101,8 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
     for base in (0, 3):
         scale = torque_scale if base == 3 else force_scale
         in_W = apply_matrix(matrix_as_tuple(R_WS), vector_at(wrench_S, base))
-        in_B = scale_vector(-scale, apply_matrix(transposed(matrix_as_tuple(R_WB)), in_W))
+        in_B = scale_vector(-scale, apply_matrix(vectors.transposed(matrix_as_tuple(R_WB)), in_W))
         out[base], out[base + 1], out[base + 2] = in_B
-
-
-def wrench_to_master(
-    wrench_S: Array, R_WS: Array, R_WB: Array, force_scale: float, torque_scale: float
-) -> Array:
-    """Return the wrench to render (..., 6), the scaled reaction to the sensor's wrench: F_E_B.
-
-    It is [f; tau] on the hand at the grip E, in B [N, N m].
-
-    Args:
-        wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
-        R_WS: (..., 3, 3) orientation of the sensor.
-        R_WB: (3, 3) alignment of the master's base B with the world.
-        force_scale, torque_scale: value at the master over value at the slave.
-    """
-    R_BS = np.swapaxes(R_WB, -1, -2) @ R_WS
-    force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
-    torque = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., 3:])
-    return -np.concatenate([force_scale * force, torque_scale * torque], axis=-1)
 
 
 @njit(cache=True)
@@ -189,6 +162,22 @@ def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, ou
     scales = np.empty(_NUM_BLENDED_SCALES)
     blend_scales_at(change, time, scales)
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
+
+
+@njit(cache=True)
+def _contact_wrench_into(sample, estimate, gripper, change, time, arm, elimination, out):
+    _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out)
+
+
+@njit(cache=True)
+def _non_contact_wrench_into(sample, estimate, gripper, change, time, out):
+    motion = sample[regressor.SAMPLE_MOTION]
+    regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], estimate[6:], out)
+
+
+@njit(cache=True)
+def _fault_into(sample, estimate, gripper, change, time, valid_range, out):
+    out[0] = find_sample_fault(sample, estimate, time, valid_range)
 
 
 @njit(cache=True, omits_reference_counting=True)
@@ -255,10 +244,8 @@ class ForceScaling(LeafSystem):
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
-        self._valid_range = np.append(largest, oldest)
-        phi = config.gripper_phi
+        valid_range, phi = np.append(largest, oldest), config.gripper_phi
         self._gripper = None if phi is None else np.concatenate([np.zeros(6), phi])
-        self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
         # Old and new scales, start and length of the change; see `blend_scales_at`.
         found = config.scales()
         scales = [*found[:3], config.force_scale, *found[3:]]
@@ -266,18 +253,32 @@ class ForceScaling(LeafSystem):
         sample_size = regressor.sample_size(arm.num_joints) + 1
         self._sample = self.DeclareVectorInputPort("sample", sample_size)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
+        contact, rendered = (arm.table, _CONTACT_ONLY_SCALES), _rendered_wrench_into
+        frames = arm.table, np.ascontiguousarray(R_WB), valid_range
+        for name, size, calculate_into, constants in (
+            ("scaled_wrench_S", 6, _scaled_wrench_at_time_into, (arm.table,)),
+            ("contact_wrench_S", 6, _contact_wrench_into, contact),
+            ("non_contact_wrench_S", 6, _non_contact_wrench_into, ()),
+            ("wrench_B", 6, rendered, (*frames, 1.0)),
+            ("load_wrench_B", 6, rendered, (*frames, 0.0)),
+            ("fault", 1, _fault_into, (valid_range,)),
+            ("scaled_contact_and_fault", 13, _scaled_contact_and_fault_into,
+             (*contact, valid_range)),
+        ):  # fmt: skip
+            self._declare_output(name, size, calculate_into, constants)
+
+    def _declare_output(
+        self, name: str, size: int, calculate_into: Any, constants: tuple[Any, ...]
+    ) -> None:
+        block: Any = weakref.ref(self)
+
+        def calculate(context: Context, output: BasicVector) -> None:
+            inputs = block()._evaluate_inputs(context)
+            calculate_into(*inputs, *constants, output.get_mutable_value())
+
         # Without time: a change of scales advances with each new sample.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-        for name, size, calc in (
-            ("scaled_wrench_S", 6, self._calc_scaled),
-            ("contact_wrench_S", 6, self._calc_contact),
-            ("non_contact_wrench_S", 6, self._calc_non_contact),
-            ("wrench_B", 6, self._calc_wrench_B),
-            ("load_wrench_B", 6, self._calc_load_wrench_B),
-            ("fault", 1, self._calc_fault),
-            ("scaled_contact_and_fault", 13, self._calc_scaled_contact_and_fault),
-        ):
-            self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
+        self.DeclareVectorOutputPort(name, size, calculate, inputs)
 
     def SetScales(
         self,
@@ -305,40 +306,6 @@ class ForceScaling(LeafSystem):
         now, start = np.empty(_NUM_BLENDED_SCALES), context.get_time()
         blend_scales_at(parameter.value(), start, now)
         parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
-
-    def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        inputs = self._evaluate_inputs(context)
-        _scaled_wrench_at_time_into(*inputs, self._arm, output.get_mutable_value())
-
-    def _calc_scaled_contact_and_fault(self, context: Context, output: BasicVector) -> None:
-        inputs = self._evaluate_inputs(context)
-        constants = self._arm, _CONTACT_ONLY_SCALES, self._valid_range
-        _scaled_contact_and_fault_into(*inputs, *constants, output.get_mutable_value())
-
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        sample, estimate, _, _, time = self._evaluate_inputs(context)
-        output[0] = find_sample_fault(sample, estimate, time, self._valid_range)
-
-    def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        inputs = self._evaluate_inputs(context)[:3]
-        _scaled_wrench_into(*inputs, self._arm, _CONTACT_ONLY_SCALES, output.get_mutable_value())
-
-    def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
-        motion = self._sample.Eval(context)[regressor.SAMPLE_MOTION]
-        phi = self._estimate.Eval(context)[6:]
-        wrench = output.get_mutable_value()
-        regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, wrench)
-
-    def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        self._calc_rendered(context, 1.0, output)
-
-    def _calc_load_wrench_B(self, context: Context, output: BasicVector) -> None:
-        self._calc_rendered(context, 0.0, output)
-
-    def _calc_rendered(self, context: Context, contact: float, output: BasicVector) -> None:
-        constants = self._arm, self._R_WB, self._valid_range, contact
-        inputs = self._evaluate_inputs(context)
-        _rendered_wrench_into(*inputs, *constants, output.get_mutable_value())
 
     def _evaluate_inputs(self, context: Context) -> tuple[Any, ...]:
         sample, estimate = self._sample.Eval(context), self._estimate.Eval(context)

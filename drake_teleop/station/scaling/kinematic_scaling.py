@@ -1,4 +1,4 @@
-"""Kinematic scaling (Fig. 4 of the paper): the master's motion becomes the slave's command."""
+"""Slave's command from the master's motion: kinematic scaling (Fig. 4) or joint coupling."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -7,24 +7,14 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common import vectors
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import (
-    conjugate_quaternion,
-    copy_into,
-    minus,
-    normalized_quaternion,
-    plus,
-    quaternion_at,
-    quaternion_exponential,
-    quaternion_logarithm,
-    quaternion_product,
-    rotate_vector,
-    scale_vector,
-    vector_at,
-)
+from drake_teleop.common.vectors import quaternion_at, quaternion_product, scale_vector, vector_at
+from drake_teleop.station.slave.arm import ArmModel, pose_into
 
 
 @settings
@@ -38,11 +28,22 @@ class KinematicScalingConfig:
         [0.0] * 3, "rad", -7.0, 7.0, "R_WB as roll, pitch, yaw (Drake's RollPitchYaw)"
     )
 
+    @property
+    def R_WB(self) -> Array:
+        """Alignment (3, 3) of the master's base B with the world."""
+        return RollPitchYaw(self.alignment).ToRotationMatrix().matrix()
+
+    @property
+    def scales(self) -> Array:
+        """Scales (2,) of translation and rotation, slave over master."""
+        return np.array([self.translation_scale, self.rotation_scale])
+
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
     """Return the quaternion of the rotation about the same axis by `scale` times the angle."""
-    return quaternion_exponential(scale_vector(scale, quaternion_logarithm(rotation)))
+    turn = vectors.quaternion_logarithm(rotation)
+    return vectors.quaternion_exponential(scale_vector(scale, turn))
 
 
 @njit(cache=True)
@@ -56,14 +57,15 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
     the clutch, `alignment` is the quaternion of R_WB.
     """
     R_WB, R_BE = quaternion_at(alignment, 0), quaternion_at(pose, 0)
-    offset = rotate_vector(R_WB, minus(vector_at(pose, 4), vector_at(master, 4)))
-    turn = quaternion_product(R_BE, conjugate_quaternion(quaternion_at(master, 0)))
+    offset = vectors.rotate_vector(R_WB, vectors.minus(vector_at(pose, 4), vector_at(master, 4)))
+    turn = quaternion_product(R_BE, vectors.conjugate_quaternion(quaternion_at(master, 0)))
     turn_B = scaled_rotation(turn, rotation_scale)
-    turn_W = quaternion_product(quaternion_product(R_WB, turn_B), conjugate_quaternion(R_WB))
+    R_BW = vectors.conjugate_quaternion(R_WB)
+    turn_W = quaternion_product(quaternion_product(R_WB, turn_B), R_BW)
     orientation = quaternion_product(turn_W, quaternion_at(command, 0))
-    out[0], out[1], out[2], out[3] = normalized_quaternion(orientation)
+    out[0], out[1], out[2], out[3] = vectors.normalized_quaternion(orientation)
     scaled = scale_vector(translation_scale, offset)
-    out[4], out[5], out[6] = plus(vector_at(command, 4), scaled)
+    out[4], out[5], out[6] = vectors.plus(vector_at(command, 4), scaled)
 
 
 @njit(cache=True, omits_reference_counting=True)
@@ -72,7 +74,7 @@ def _pose_command_into(pose, references, alignment, translation_scale, rotation_
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
     else:
-        copy_into(out, 0, references, 0, 7)
+        vectors.copy_into(out, 0, references, 0, 7)
 
 
 class KinematicScaling(DoubleOnly, LeafSystem):
@@ -134,3 +136,62 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         _pose_command_into(pose, references, *self._scaling, references[:7])
         references[7:14] = pose
         references[14] = float(engage)
+
+
+class JointCoupling(LeafSystem):
+    """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
+
+    While the clutch is open the command is constant. When it closes the command jumps to
+    start + (leader's joints - home), and follows it.
+
+    .. pydrake_system::
+
+        name: JointCoupling
+        input_ports:
+        - master_state: (2 n,) [q; dq/dt] of the leader [rad, rad/s]
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        output_ports:
+        - leader_joints: (n,) commanded joint positions of the slave [rad]
+        - pose_command: (7,) X_WS for these joints
+
+    The command is `start` (n,) [rad] when the leader is at `home` (n,) [rad].
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
+        super().__init__()
+        if len(home) != len(start):
+            numbers = f"{len(home)} joints, but the slave {len(start)}"
+            what = f"the leader has {numbers} (they must agree)"
+            remedy = "set leads: pose, or give arms of the same kinematics"
+            raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
+        self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
+        self._state = self.DeclareVectorInputPort("master_state", 2 * n)
+        self._clutch = self.DeclareVectorInputPort("clutch", 1)
+        self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
+        sources = {self._state.ticket(), self.xd_ticket()}
+        joints, pose = weak_callback(self._calc_joints), weak_callback(self._calc_pose)
+        self.DeclareVectorOutputPort("leader_joints", n, joints, sources)
+        self.DeclareVectorOutputPort("pose_command", 7, pose, sources)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joints_and_clutch)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update_joints_and_clutch)
+
+    def _commanded_joint_positions(self, context: Context) -> Array:
+        memory, n = context.get_discrete_state(0).value(), len(self._offset)
+        joints: Array = memory[:n]
+        return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints
+
+    def _calc_joints(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._commanded_joint_positions(context))
+
+    def _calc_pose(self, context: Context, output: BasicVector) -> None:
+        joints = np.array(self._commanded_joint_positions(context))
+        pose_into(self._table, joints, output.get_mutable_value())
+
+    def _update_joints_and_clutch(self, context: Context, discrete_state: DiscreteValues) -> None:
+        memory = discrete_state.get_mutable_value(0)
+        joints = self._commanded_joint_positions(context)
+        if np.isfinite(joints).all():  # an opened clutch must hold a finite command
+            memory[:-1] = joints
+        memory[-1] = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5

@@ -1,4 +1,4 @@
-"""Blocks for the two ends of a passivity method; any network may connect them."""
+"""Blocks for the channel: a network, and both ends of a passivity method for any network."""
 
 from __future__ import annotations
 
@@ -6,21 +6,80 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DiscreteStateIndex
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.station.channel.channel import (
-    MIN_TIMEOUT_S,
-    PORTS_SIGNAL_SIZE,
-    initial_state_of_ends,
-    method_parameters_and_frame,
-    step_master_end,
-    step_slave_end,
-)
+from drake_teleop.station.channel import channel as steps
+from drake_teleop.station.channel import network
+from drake_teleop.station.channel.channel import MIN_TIMEOUT_S, PORTS_SIGNAL_SIZE
+from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.packet import PACKET_SIZE
+from drake_teleop.station.passivity.packet import PACKET_LOAD_WRENCH, PACKET_SIZE
 from drake_teleop.station.stepped_block import SteppedBlock
 
 _OPTIONAL_PORTS = ("hand_wrench_E", "load_wrench_B", "saturated", "contact")
+
+
+class NetworkChannel(SteppedBlock):
+    """Network that transmits a vector in every period; a packet takes at least one period.
+
+    .. pydrake_system::
+
+        name: NetworkChannel
+        input_ports:
+        - packet: (N,) numbers to send
+        output_ports:
+        - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
+        - arriving: (N + 1,) value of `received` at the next period; depends on the input
+
+    Connect `arriving` to a block that updates at the same instants and whose output is a state.
+
+    Args:
+        size: length N of the vector.
+        period: time between packets [s].
+        config: network settings; default: ideal network.
+        seed: seed of the random numbers.
+        direction: 0 or 1; each direction has its own random numbers.
+
+    Raises:
+        DrakeTeleopError: if `config.silence` requires packets of a passivity method, and `size`
+            is not the length of such a packet.
+    """
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        size: int,
+        period: float,
+        config: NetworkConfig | None = None,
+        *,
+        seed: int = 0,
+        direction: int = 0,
+    ) -> None:
+        super().__init__()
+        config = NetworkConfig() if config is None else config
+        if config.silence != "hold" and size not in (PACKET_LOAD_WRENCH.start, PACKET_SIZE):
+            raise DrakeTeleopError(
+                f"'{config.silence}' requires packets of a passivity method"
+                f" ({PACKET_LOAD_WRENCH.start} or {PACKET_SIZE} numbers), but size is {size}",
+                where="NetworkChannel.silence",
+                remedy="set silence: hold, or use a passivity method",
+            )
+        self._parameters = network.network_parameters(config, seed, direction, period, min_steps=1)
+        parts = network.initial_network_state(self._parameters, np.zeros(size))
+        state = [*parts, np.zeros(1), np.zeros(size + 1)]
+        self._packet = self.DeclareVectorInputPort("packet", size)
+        self._declare_step(state, len(state), period)
+        self.DeclareStateOutputPort("received", DiscreteStateIndex(self._states[-1]))
+        self._declare_output("arriving", 3, slice(0, size + 1))
+
+    def _advance(self, context: Context, results: list[Array]) -> None:
+        receiver, in_transit, count, received = results
+        k, line = int(count[0]), (receiver, in_transit)
+        network.send_packet(self._parameters, line, k, self._packet.Eval(context))
+        _, fresh = network.receive_packet(self._parameters, line, k + 1, received[:-1])
+        count[0], received[-1] = k + 1, fresh
 
 
 class _PassivityEndBlock(SteppedBlock):
@@ -51,11 +110,11 @@ class _PassivityEndBlock(SteppedBlock):
     ) -> None:
         super().__init__()
         start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
-        rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
-        parameters, frame = method_parameters_and_frame(passivity, rotation, scales, force_scale)
+        R = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
+        parameters, frame = steps.method_parameters_and_frame(passivity, R, scales, force_scale)
         self._method = methods.step_addresses(passivity.method)
         self._constants = period, timeout, frame, parameters
-        ends = initial_state_of_ends(passivity.method, parameters, start)
+        ends = steps.initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
@@ -103,7 +162,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         ends, _, port_energies, wrench, packet = results
         inputs, *received = self._inputs_and_packet(context)
         states = *self._constants, ends, port_energies[:2], packet, wrench
-        step_master_end(self._method, *inputs, *received, *states)
+        steps.step_master_end(self._method, *inputs, *received, *states)
 
 
 class PassivityAtSlave(_PassivityEndBlock):
@@ -140,4 +199,4 @@ class PassivityAtSlave(_PassivityEndBlock):
         (*values, saturated, contact), *received = self._inputs_and_packet(context)
         flags = bool(saturated[0] > 0.5), float(contact[0])
         states = *self._constants, ends, pose, port_energies, packet
-        step_slave_end(self._method, *values, *flags, *received, *states)
+        steps.step_slave_end(self._method, *values, *flags, *received, *states)
