@@ -45,11 +45,11 @@ from adversary_cases import FREE, STEPS, TIME, case_of, let_go_at, prepared, sil
 from numpy.typing import NDArray
 
 from drake_teleop.lab.comparison.one_dof import (
-    ACTUAL,
-    COMMAND,
-    HAND,
-    MOTOR,
-    PERIOD,
+    AT_COMMAND,
+    AT_HAND,
+    AT_MOTOR,
+    AT_SLAVE,
+    PERIOD_S,
     REFERENCE,
     OneDof,
     OneDofRun,
@@ -119,28 +119,28 @@ AIMS: dict[str, Callable[[Figures], float]] = {
 
 def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
     """Return the figures of a run."""
-    charged = round(CHARGED / PERIOD)
-    later = (run.accounts[:, HAND] + run.accounts[:, ACTUAL])[charged:]
+    charged = round(CHARGED / PERIOD_S)
+    later = (run.accounts[:, AT_HAND] + run.accounts[:, AT_SLAVE])[charged:]
     found = Figures(
-        actual=run.least_energy_sum(ACTUAL),
-        motor=run.least_energy_sum(MOTOR),
-        command=run.least_energy_sum(COMMAND),
-        hand=run.least_energy_sum(HAND),
+        actual=run.least_energy_sum(AT_SLAVE),
+        motor=run.least_energy_sum(AT_MOTOR),
+        command=run.least_energy_sum(AT_COMMAND),
+        hand=run.least_energy_sum(AT_HAND),
         actual_later=run.start_energy + float(np.nanmin(later, initial=math.inf)),
     )
     if case["wall"] != "stands":
         return found
-    over = round(let_go_at(case) / PERIOD)
+    over = round(let_go_at(case) / PERIOD_S)
     if case["end"] == "lets go":
         free = run.master_position[over - 1 : over + 2000]
-        found.speed = float(np.nanmax(np.abs(np.diff(free)), initial=0.0)) / PERIOD
+        found.speed = float(np.nanmax(np.abs(np.diff(free)), initial=0.0)) / PERIOD_S
         found.travel = float(np.nanmax(np.abs(free - free[0]), initial=0.0))
-    begin = round((case["until"] + 0.8) / PERIOD)
+    begin = round((case["until"] + 0.8) / PERIOD_S)
     still = slice(begin, None if case["end"] == "holds on" else over, 10)
     found.cycle = (
         max(_cycling(x[still].tolist()) for x in (run.master_position, run.slave_position))
         * 10
-        * PERIOD
+        * PERIOD_S
     )
     return found
 
@@ -266,13 +266,13 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     taps = begun * 0.05 * np.sin(4 * np.pi * TIME) + FREE * (1 - begun)
     swing = 0.03 * np.sin(3 * np.pi * TIME) * (begun - smooth(2.5, 0.5))
     press = FREE + swing + smooth(3.5, 1.0) * (0.0275 - FREE)
-    tap, push = (np.stack([x, np.gradient(x, PERIOD)], axis=1) for x in (taps, press))
+    tap, push = (np.stack([x, np.gradient(x, PERIOD_S)], axis=1) for x in (taps, press))
     hand = np.tile([0.2, 5.0, 300.0], (STEPS, 1))
     hand[9000:] = 0.0
     steady = NetworkConfig(delay=0.05)
     bursts = NetworkConfig(delay=0.05, jitter=0.2, distribution="gamma", loss=0.3, burst=0.08)
     usual = operator_intent()
-    times = PERIOD * np.arange(len(usual), dtype=np.float64)
+    times = PERIOD_S * np.arange(len(usual), dtype=np.float64)
 
     def outages(seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         rng = np.random.default_rng(seed)
@@ -282,7 +282,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
 
     def least(passivity: PassivityConfig, model: OneDof, line: NetworkConfig, **more: Any) -> float:
-        return run_one_dof(model, passivity, line, **more).least_energy_sum(ACTUAL)
+        return run_one_dof(model, passivity, line, **more).least_energy_sum(AT_SLAVE)
 
     for name in names:
         one = PassivityConfig(method=name)
@@ -296,7 +296,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
             ],
             "let go": [
                 abs(float(let_go.hand_force[8999])),
-                float(np.abs(np.diff(free)).max()) / PERIOD,
+                float(np.abs(np.diff(free)).max()) / PERIOD_S,
                 float(np.abs(free - free[0]).max()),
             ],
         }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE
+from drake_teleop.lab.comparison.one_dof import PERIOD_S, REFERENCE
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import NetworkConfig
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Draw = Callable[[float], Any]
 
 STEPS = 12000
-TIME = PERIOD * np.arange(STEPS, dtype=np.float64)
+TIME = PERIOD_S * np.arange(STEPS, dtype=np.float64)
 FREE = -0.04  # m, start position of the hand
 LIGHT, FIRM = (0.1, 2.0, 50.0), (0.5, 20.0, 700.0)  # kg, N s/m, N/m
 LONGEST = 4000  # longest delay of a packet in periods
@@ -128,7 +128,7 @@ def intent(case: dict[str, Any]) -> Array:
     leaving = smooth(let_go_at(case), 0.15) * (case["end"] == "jumps away")
     x = FREE + begun * (1 - over) * (case["amplitude"] * (case["centre"] + wave) - FREE)
     x += (over - leaving) * (case["depth"] - FREE)
-    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+    return np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
 
 
 def grip(case: dict[str, Any]) -> Array:
@@ -173,7 +173,7 @@ def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             loss=case["loss"],
             burst=case["burst"],
         )
-        p = network.network_parameters(line, case["seed"], way, PERIOD)
+        p = network.network_parameters(line, case["seed"], way, PERIOD_S)
         travel = network.packet_delay_steps(p, STEPS)[:, 0]
         lost = travel < 0
         turns = TIME / case["delay_pace"]
@@ -182,7 +182,7 @@ def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             "steps": rng.random(int(turns[-1]) + 1)[turns.astype(int)],
             "swings": 0.5 * (1 - np.cos(2 * np.pi * turns)),
         }[case["delay_change"]]
-        travel += np.round(case["delay_by"] / PERIOD * later).astype(int)
+        travel += np.round(case["delay_by"] / PERIOD_S * later).astype(int)
         silent = silences(rng, TIME, case["outage"], 2.0)
         if case["silent_way"] in (name, "both"):
             lost |= silent

@@ -337,7 +337,7 @@ def analyse(axis: OneAxis, omega: Array) -> None:
     absolute_stability.structured_singular_value(S)
     hands, walls = absolute_stability.impedance_range_of_grips(), WALL_RANGE
     absolute_stability.stiffness_limit(H, omega, hands)
-    absolute_stability.bounded_singular_value(H, omega, hands, walls)
+    absolute_stability.singular_value_in_ranges(H, omega, hands, walls)
     loop = cut_loop(axis, JR3)
     delay_margin(loop)
     loop_response(loop, omega, axis.delay)

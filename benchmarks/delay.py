@@ -27,7 +27,7 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     RunMeasures,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -74,7 +74,7 @@ def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task
     model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
     intent = operator_intent(task)
     run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed, intent=intent)
-    return figures_of_run(run, model, task)
+    return measures_of_run(run, model, task)
 
 
 def row(method: str, wall: float, round_trip: float, seeds: int) -> Row:

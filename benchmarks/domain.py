@@ -25,7 +25,7 @@ import numpy as np
 from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -57,7 +57,7 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
         model, PassivityConfig(method=method), NetworkConfig(delay=round_trip / 2), timeout=1.0,
         intent=operator_intent(task),
     )  # fmt: skip
-    found = figures_of_run(run, model, task)
+    found = measures_of_run(run, model, task)
     # The springs of hand, wall and servo are in series.
     felt = model.force_scale / (1.0 / wall + 1.0 / model.servo_stiffness)
     undelayed = DEPTH / (1.0 / stiffness + 1.0 / felt)

@@ -40,7 +40,7 @@ from drake_teleop.lab.analysis.analyze import (
     stiffest_stable_walls,
 )
 from drake_teleop.lab.analysis.linear_model import Linearization
-from drake_teleop.lab.analysis.linearization import hybrid_along, linearize
+from drake_teleop.lab.analysis.linearization import linearize, two_port_along
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
@@ -105,7 +105,7 @@ def figures(scenario: Scenario) -> dict[str, Any]:
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
     along, sampling = task_direction(scenario, UNIT_VECTORS["z"]), sampling_of_scenario(scenario)
     free = linearize(scenario, load_estimate=estimate)
-    with_hand = hybrid_along(
+    with_hand = two_port_along(
         close_other_directions(free, scenario, along), OMEGA, along.hand, along.tool
     )
     axis = along.axis

@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.comparison.compare_passivity import base_scenario
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND
+from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_SLAVE
 from drake_teleop.lab.comparison.whole_station import (
     start_energy,
-    station_accounts,
+    station_energies,
     work_of_displayed_load_wrench,
 )
 from drake_teleop.lab.identification import slave_arm, true_load
@@ -303,8 +303,8 @@ def measured(result: SimulationResult, scenario: Scenario, times: Times) -> dict
     held = (t >= times.judged) & (t < times.judged + HELD)
     pressed = contact[held].mean(axis=0)
     error = float(np.linalg.norm(rendered[held].mean(axis=0) - pressed))
-    accounts = station_accounts(result, scenario)
-    energy = accounts[:, HAND] + accounts[:, ACTUAL] + start_energy(scenario)
+    accounts = station_energies(result, scenario)
+    energy = accounts[:, AT_HAND] + accounts[:, AT_SLAVE] + start_energy(scenario)
     if scaling.sigma > 0.0:
         energy += work_of_displayed_load_wrench(result, scenario)
     at = int(np.searchsorted(t, times.let_go))

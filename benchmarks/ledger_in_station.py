@@ -34,13 +34,13 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from drake_teleop.lab.comparison.compare_passivity import base_scenario
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
+from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_MOTOR, AT_SLAVE
 from drake_teleop.lab.comparison.whole_station import (
     LEAF_THICKNESSES_M,
-    delayed_contact,
-    figures_of_station_run,
+    measures_of_press,
+    press_scenario,
     start_energy,
-    station_accounts,
+    station_energies,
     work_of_displayed_load_wrench,
 )
 from drake_teleop.lab.identification import true_load
@@ -123,7 +123,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     )
     estimate = true_load(base) if asked.ideal else identified_load(base, False).estimate
     passivity = PassivityConfig(method=asked.method)
-    scenario, task = delayed_contact(base, Channel(network=network), passivity, leaf)
+    scenario, task = press_scenario(base, Channel(network=network), passivity, leaf)
     scenario = replace(scenario, sheet_spring__slip_speed=SheetSpring().slip_speed)
     if asked.friction > 0.0:
         # Friction stops a joint within 0.4 ms.
@@ -140,12 +140,12 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     began = time.thread_time()
     result = simulate(station, scenario.simulation, progress=False)
     spent = time.thread_time() - began
-    found = figures_of_station_run(result, scenario, task)
-    accounts = station_accounts(result, scenario)
-    accounts[:, HAND] += start_energy(scenario)
+    found = measures_of_press(result, scenario, task)
+    accounts = station_energies(result, scenario)
+    accounts[:, AT_HAND] += start_energy(scenario)
     if sigma > 0.0:
-        accounts[:, HAND] += work_of_displayed_load_wrench(result, scenario)
-    inside, at_motors = (accounts[:, HAND] + accounts[:, place] for place in (ACTUAL, MOTOR))
+        accounts[:, AT_HAND] += work_of_displayed_load_wrench(result, scenario)
+    inside, at_motors = (accounts[:, AT_HAND] + accounts[:, k] for k in (AT_SLAVE, AT_MOTOR))
     scale = scenario.force_scaling.force_scale
     rubbed = scale * friction_work(result, scenario)
     held = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)

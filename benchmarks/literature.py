@@ -37,7 +37,7 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -131,7 +131,7 @@ def architectures() -> dict[str, Any]:
             timeout=2.0,
             intent=operator_intent(task),
         )
-        of = figures_of_run(run, model, task)
+        of = measures_of_run(run, model, task)
         swing = (run.t > task.swing_start) & (run.t < task.swing_end)
         apart = np.sqrt(np.mean((run.master_position - run.slave_position)[swing] ** 2))
         error = 100.0 * abs(of.force_error) if of.stable else np.inf

@@ -36,7 +36,7 @@ from drake_teleop.load.online.change import (
     detector_states_of_log,
     identified_or_known_load,
     initial_change_memory,
-    new_load_age,
+    new_load_age_in_samples,
 )
 from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
@@ -163,7 +163,7 @@ class Monitor:
     @property
     def changed_at(self) -> float:
         """Start of the newest load [s after the first sample]."""
-        return float(self.samples - new_load_age(self.memory)) * self.period
+        return float(self.samples - new_load_age_in_samples(self.memory)) * self.period
 
 
 def monitor(sensor: str, load: Identification) -> Monitor:

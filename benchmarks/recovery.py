@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.lab.comparison.one_dof import (
-    PERIOD,
+    PERIOD_S,
     REFERENCE,
     OneDofRun,
     Task,
@@ -62,7 +62,7 @@ class Row:
 
     def add(self, run: OneDofRun) -> None:
         """Count one run."""
-        end, felt = slice(-round(0.5 / PERIOD), None), np.abs(run.hand_force)
+        end, felt = slice(-round(0.5 / PERIOD_S), None), np.abs(run.hand_force)
         beside = float(np.abs(run.slave_position - run.master_position)[end].max())
         at_rest = float(felt[end].max())
         still = np.ptp(run.master_position[end]) < 0.5e-3
@@ -92,24 +92,24 @@ def _resuming(silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return flags of the steps up to RESUME_TIME_S after a silence."""
     steps = np.arange(len(silent))
     since = steps - np.maximum.accumulate(np.where(silent, steps, -len(silent)))
-    return (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
+    return (since > 0) & (since < round(RESUME_TIME_S / PERIOD_S))
 
 
 def rough_line(path: Path, rng: np.random.Generator) -> NetworkConfig:
     """Return a very bad line until GOOD_FROM, as a trace of every millisecond."""
-    steps = round(GOOD_FROM / PERIOD)
+    steps = round(GOOD_FROM / PERIOD_S)
     mean, jitter = rng.uniform(0.0, 0.3), rng.uniform()
     delay = mean * (1.0 + jitter * rng.uniform(-1.0, 1.0, steps))
     lost = rng.uniform(size=steps) < rng.uniform(0.0, 0.5)
     start = 0.0
     while start < GOOD_FROM:
         stop = start + rng.exponential(0.15)
-        burst = slice(round(start / PERIOD), round(stop / PERIOD))
+        burst = slice(round(start / PERIOD_S), round(stop / PERIOD_S))
         lost[burst] |= rng.uniform(size=len(lost[burst])) < rng.uniform(0.5, 1.0)
         start = stop + rng.exponential(0.5)
     cells = np.char.mod("%.6f", delay)
     cells[lost] = ""
-    times = np.char.mod("%.3f", PERIOD * np.arange(steps))
+    times = np.char.mod("%.3f", PERIOD_S * np.arange(steps))
     rows = np.char.add(np.char.add(times, ","), cells)
     text = "\n".join(["time,delay", *rows, f"{GOOD_FROM},0.01", "60,0.01"])
     path.write_text(text + "\n", encoding="utf-8")

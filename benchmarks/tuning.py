@@ -37,7 +37,7 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     is_share_accepted,
-    make_stated_set,
+    make_operating_range,
     settings_from_values,
     without_task_and_method,
 )
@@ -73,7 +73,7 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
     name, scenario, network = drawn(rng)
     row: dict[str, Any] = {"seed": seed, "station": name}
     began, cpu = time.monotonic(), time.process_time()
-    stated = make_stated_set(HANDS, WALLS, TASK)
+    stated = make_operating_range(HANDS, WALLS, TASK)
     with tempfile.TemporaryDirectory() as folder:
         try:
             found = tune(

@@ -16,7 +16,7 @@ from drake_teleop.lab.analysis.absolute_stability import (
 )
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES
-from drake_teleop.lab.analysis.linearization import hybrid_along, linearize
+from drake_teleop.lab.analysis.linearization import linearize, two_port_along
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
@@ -92,7 +92,7 @@ def diagrams():
         system = system.close_loop("pose_command", "pose_received").close_loop(
             "wrench_B", "wrench_received"
         )
-        H = hybrid_along(system, omega, along.hand, along.tool)
+        H = two_port_along(system, omega, along.hand, along.tool)
         low_pass = None if sensor == "ideal" else scenario.wrist_sensor.bandwidth_hz
         found[sensor] = omega, H, along.axis, Sampling(low_pass_hz=low_pass)
     return found

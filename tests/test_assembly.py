@@ -20,8 +20,8 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.files import models_dir
-from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
-from drake_teleop.lab.comparison.whole_station import station_accounts
+from drake_teleop.lab.comparison.one_dof import AT_COMMAND, AT_HAND, AT_MOTOR, AT_SLAVE
+from drake_teleop.lab.comparison.whole_station import station_energies
 from drake_teleop.load.contact.detection import NoiseFloor
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import STATE_OTHER_LOAD
@@ -643,26 +643,26 @@ def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
     """The first two are zero to rounding without contact; for the motors this log is too slow."""
     recorded = assembled_over_a_network
     log = recorded.log
-    accounts = station_accounts(log, recorded.scenario)
+    accounts = station_energies(log, recorded.scenario)
     wrench = in_power_units(wanted_at_the_hand(recorded, slave))
     received = steps(rotations(log["pose_received"]), log["pose_received"][:, 4:])
     for g in (0, 1):
         group = slice(3 * g, 3 * g + 3)
         # The log shows at row k + 1 what is sent at row k.
         put_in = np.cumsum(np.sum(wrench[:-1, group] * received[1:, group], axis=1))
-        np.testing.assert_allclose(accounts[:-1, COMMAND, g], put_in - put_in[0], atol=EXACT)
+        np.testing.assert_allclose(accounts[:-1, AT_COMMAND, g], put_in - put_in[0], atol=EXACT)
         assert np.ptp(put_in) > 1e-4
         counted = log["ports"][1:, g] - log["ports"][1, g]
-        np.testing.assert_allclose(accounts[:-1, HAND, g], counted, atol=EXACT)
-    np.testing.assert_array_equal(accounts[:, ACTUAL], 0.0)
-    assert np.isnan(accounts[:, MOTOR]).all()
+        np.testing.assert_allclose(accounts[:-1, AT_HAND, g], counted, atol=EXACT)
+    np.testing.assert_array_equal(accounts[:, AT_SLAVE], 0.0)
+    assert np.isnan(accounts[:, AT_MOTOR]).all()
 
 
 def test_the_motors_account_is_the_arms_speed(finely_logged, slave):
     """The motors' work beyond the weight is the arm's kinetic energy, as there is no friction."""
     log, scenario = finely_logged.log, finely_logged.scenario
     power = GAMMA * FORCE / np.array([TRANSLATION, ROTATION])
-    given = -(station_accounts(log, scenario)[:, MOTOR] / power).sum(axis=1)
+    given = -(station_energies(log, scenario)[:, AT_MOTOR] / power).sum(axis=1)
     context, rows = slave.plant.CreateDefaultContext(), slice(None, None, 16)
     moving = []
     for state in log["slave_state"][rows]:

@@ -433,7 +433,7 @@ def trajectory_of_joint_5(slave, amplitude: float) -> FourierTrajectory:
     cosine = np.zeros((6, 4))
     cosine[4, 0] = amplitude
     home = slave.plant.GetDefaultPositions(slave.instance)
-    return FourierTrajectory.at_rest(home, np.zeros((6, 4)), cosine, 0.5)
+    return FourierTrajectory.rest_to_rest(home, np.zeros((6, 4)), cosine, 0.5)
 
 
 def test_elimination_without_load_estimate_is_rejected():

@@ -17,16 +17,16 @@ feel.widget.children[0].value = 0.25
 assert drawn == [0.25]
 """,
     "02_delay_and_passivity": """
-assert figures_of_run(short, model).stable and not figures_of_run(long, model).stable
+assert measures_of_run(short, model).stable and not measures_of_run(long, model).stable
 assert created[0.05] > 1.0 and created[0.002] < 0.05
-assert passive.least_energy_sum(ACTUAL) >= 0.0
+assert passive.least_energy_sum(AT_SLAVE) >= 0.0
 assert over_internet.keys() == over_300_ms.keys() == set(METHODS)
 both_runs = (over_internet, over_300_ms)
-found = [{m: figures_of_run(r, model) for m, r in runs.items()} for runs in both_runs]
+found = [{m: measures_of_run(r, model) for m, r in runs.items()} for runs in both_runs]
 assert not found[0]["none"].stable and not found[1]["none"].stable
 assert found[0]["ledger"].stable and abs(found[0]["ledger"].force_error) < 0.01
 assert found[1]["wave"].stable and abs(found[1]["wave"].force_error) < 0.01
-assert min(over_300_ms[name].least_energy_sum(ACTUAL) for name in ("wave", "pspm", "ledger")) >= 0.0
+assert min(over_300_ms[m].least_energy_sum(AT_SLAVE) for m in ("wave", "pspm", "ledger")) >= 0.0
 assert other_hands["none"].release_speed > 1.0 > 3 * other_hands["ledger"].release_speed
 assert other_hands["ledger"].leaked == 0.0 < other_hands["tdpa"].leaked
 assert np.ptp(age["playout 150 ms"][400:]) < 1e-9 and np.ptp(age["internet"][400:]) > 0.02
@@ -40,7 +40,7 @@ assert np.ptp(covering[5100.0][:, 1:], axis=0).max() < 1e-3  # the same for ever
 assert (np.diff(longest) > 0.0).all()
 saturated = {names: result["saturated"].mean() for names, result in station_runs.items()}
 assert saturated["none", "internet"] > 0.1 and saturated["none", "with a buffer"] == 0.0
-both = {name: energy[:, [HAND, ACTUAL]].sum(axis=1) for name, energy in station_energy.items()}
+both = {k: energy[:, [AT_HAND, AT_SLAVE]].sum(axis=1) for k, energy in station_energy.items()}
 assert both["none", "internet"].min() < -0.05
 result = station_runs["two_layer", "with a buffer"]
 happened = result.t[np.argmax(result["true_contact_wrench_W"][:, 2] > 5.0)]

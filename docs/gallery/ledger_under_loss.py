@@ -9,7 +9,7 @@ energy of all lost ones.
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
+from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_SLAVE, REFERENCE, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
@@ -20,8 +20,8 @@ above.plot(run.t, REFERENCE.force_scale * run.wall_force, label="wall / 17.5", c
 above.plot(run.t, run.hand_force, label="displayed")
 above.set(ylabel="force at the hand [N]")
 above.legend()
-energy = run.start_energy + run.accounts[:, HAND] + run.accounts[:, ACTUAL]
+energy = run.start_energy + run.accounts[:, AT_HAND] + run.accounts[:, AT_SLAVE]
 below.plot(run.t, 1e3 * energy, "k")
 below.axhline(0, color="red", linewidth=0.8)
 below.set(xlabel="t [s]", ylabel="left in the station [mJ]")
-print(f"least: {1e3 * run.least_energy_sum(ACTUAL):.1f} mJ, never below zero")
+print(f"least: {1e3 * run.least_energy_sum(AT_SLAVE):.1f} mJ, never below zero")

@@ -10,7 +10,7 @@ the force scale.
 import matplotlib.pyplot as plt
 
 from drake_teleop.common.style import BLUE, GREY
-from drake_teleop.lab.comparison.one_dof import REFERENCE, figures_of_run, run_one_dof
+from drake_teleop.lab.comparison.one_dof import REFERENCE, measures_of_run, run_one_dof
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 
@@ -18,7 +18,7 @@ columns = 3
 figure, panels = plt.subplots(3, columns, figsize=(9, 6), sharex=True, sharey=True)
 for axes, method in zip(panels.flat, METHODS, strict=True):
     run = run_one_dof(REFERENCE, PassivityConfig(method=method), PRESETS["internet"])
-    found = figures_of_run(run, REFERENCE)
+    found = measures_of_run(run, REFERENCE)
     axes.plot(run.t, REFERENCE.force_scale * run.wall_force, color=GREY, linewidth=0.8)
     axes.plot(run.t, run.hand_force, color=BLUE, linewidth=0.8)
     axes.set_title(f"{method}: {'stable' if found.stable else 'unstable'}")

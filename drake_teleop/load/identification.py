@@ -31,13 +31,13 @@ PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2
 MAX_IDENTIFIED_STD_SHARE = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
-_MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
+_MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _G_M_S2 = 0.5, 0.03, 9.81
 _OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 # Names in the file that are computed from the fields.
 _DERIVED_FIELDS = ("mass", "com", "inertia_com", "physically_consistent")
 # Shapes of the numbers in the file, and those with a limit: fourth powers must not overflow.
 _SCALAR_FIELDS = ("condition_number", "delay_s", "mass", "samples")
-_SHAPES = dict(phi=(10,), offsets=(6,), residual_rms=(6,), com=(3,), inertia_com=(3, 3))
+_SHAPE_OF_FIELD = dict(phi=(10,), offsets=(6,), residual_rms=(6,), com=(3,), inertia_com=(3, 3))
 _LIMITED_FIELDS, _MAX_FILE_VALUE = ("phi", "offsets", "residual_rms", "delay_s"), 1e9
 
 
@@ -207,7 +207,7 @@ def natural_scales(phi: Array) -> Array:
     """Return typical sizes (16,) of [offsets; phi] for a load with this mass and centre of mass."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_LOAD_SIZE_M)
-    scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
+    scale: Array = m * np.repeat([_G_M_S2, _G_M_S2 * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
     return scale
 
 
@@ -228,9 +228,9 @@ def _file_error(what: str, where: str) -> DrakeTeleopError:
 
 
 def _read_field(where: str, name: str, value: Any) -> Any:
-    if name in _SHAPES or name in _SCALAR_FIELDS:
+    if name in _SHAPE_OF_FIELD or name in _SCALAR_FIELDS:
         _check_numbers(where, value)
-        array = finite_array(where, value, *_SHAPES.get(name, ()))
+        array = finite_array(where, value, *_SHAPE_OF_FIELD.get(name, ()))
         if name in _LIMITED_FIELDS and np.abs(array).max() > _MAX_FILE_VALUE:
             raise _file_error(f"has an absolute value above {_MAX_FILE_VALUE:g}", where)
         # The natural scale is proportional to the mass.

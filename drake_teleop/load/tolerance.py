@@ -13,7 +13,7 @@ from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITY_NAMES = ("mass", "com", "inertia")
 """Quantities whose accuracy a tolerance can require."""
-NAMES_OF_ENTRIES = {
+ENTRY_NAMES_OF_QUANTITY = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
@@ -47,7 +47,7 @@ class Tolerance(NamedTuple):
     @property
     def required_entry_names(self) -> tuple[str, ...]:
         """Names (k,) of the numbers that have a tolerance, such as "com x"."""
-        return sum((NAMES_OF_ENTRIES[name] for name in self.required_quantity_names), ())
+        return sum((ENTRY_NAMES_OF_QUANTITY[name] for name in self.required_quantity_names), ())
 
     def __str__(self) -> str:
         return ", ".join(
@@ -119,4 +119,4 @@ def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     names = tolerance.required_quantity_names
     sizes = [scales[name] * getattr(tolerance, name) for name in names]
-    return np.repeat(sizes, [len(NAMES_OF_ENTRIES[name]) for name in names])
+    return np.repeat(sizes, [len(ENTRY_NAMES_OF_QUANTITY[name]) for name in names])

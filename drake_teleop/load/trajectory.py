@@ -32,7 +32,7 @@ class FourierTrajectory:
     frequency: float
 
     @classmethod
-    def at_rest(
+    def rest_to_rest(
         cls, q0: ArrayLike, sine: ArrayLike, cosine: ArrayLike, frequency: float
     ) -> FourierTrajectory:
         """Return a trajectory with velocity and acceleration 0 at both ends, Eq. (T17).

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array, find_runs_of_true, width_and_cent
 from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.load.contact.noise_floor import (
-    THRESHOLD_OVER_MAX,
+    THRESHOLD_MARGIN,
     DetectorSamples,
     NoiseFloor,
     statistic_index,
@@ -122,7 +122,7 @@ def detect_contact(
         statistics=values,
         touched=touched,
         free_duration_s=len(train.contact) * (dt if free is None else free[1]),
-        force_threshold=THRESHOLD_OVER_MAX
+        force_threshold=THRESHOLD_MARGIN
         * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
         notes=() if free is not None else _notes_if_mostly_contact(floor, touched, residual_rms),
     )
@@ -168,7 +168,7 @@ def _fit_floor_and_threshold_to_log(
         if attempt > 0:
             reached = min(reached, float(values.max()))
         reached = max(_MIN_EXPECTED_MAX, reached)
-        threshold = THRESHOLD_OVER_MAX * reached
+        threshold = THRESHOLD_MARGIN * reached
         detector = detection.ContactDetector(floor, threshold, statistic=statistic, hold=hold)
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
         too_few = (selected & without_contact).sum() < MIN_NOISE_FLOOR_SAMPLES
@@ -200,7 +200,7 @@ def _remove_marginal_contacts(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in find_runs_of_true(touched):
-        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_OVER_MAX * threshold:
+        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_MARGIN * threshold:
             touched[start:stop] = False
 
 

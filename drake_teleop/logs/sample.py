@@ -166,7 +166,7 @@ def _random_motion(
     sine, cosine = (
         random.normal(size=(2, 6, harmonics - 1)) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
     )
-    path = FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period_s)
+    path = FourierTrajectory.rest_to_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period_s)
     return lambda t: sensor_motion(*path.evaluate(np.clip(t - rest_s, 0, period_s)))
 
 

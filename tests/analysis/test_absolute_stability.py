@@ -239,7 +239,7 @@ def test_disc_criterion_is_conservative_by_the_known_factor():
             return ab.ImpedanceRange((0.0, 0.0), (0.0, 0.1), (0.0, stiffness))
 
         def small(stiffness, H=H):
-            return np.all(ab.bounded_singular_value(H, omega, hand, wall(stiffness)) < 1)
+            return np.all(ab.singular_value_in_ranges(H, omega, hand, wall(stiffness)) < 1)
 
         largest, sufficient = np.min(ab.stiffness_limit(H, omega, hand)), largest_valid(small, 1e4)
         assert largest == pytest.approx(exact, rel=0.02)

@@ -8,7 +8,7 @@ import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
-from drake_teleop.lab.analysis.linearization import hybrid_along, linearize, linearize_station
+from drake_teleop.lab.analysis.linearization import linearize, linearize_station, two_port_along
 from drake_teleop.lab.analysis.one_axis import device_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
@@ -142,7 +142,7 @@ def test_one_direction_equals_the_analytical_model(servo, sigma):
     )
     task = task_direction(scenario, UP)
     system = vertical_only(linearize(scenario, load_estimate=true_load(scenario)))
-    H = hybrid_along(system, OMEGA, task.hand, task.tool)
+    H = two_port_along(system, OMEGA, task.hand, task.tool)
     assert (difference(H, exact_two_port(scenario, OMEGA)) < 1e-6).all()
 
 
@@ -156,7 +156,7 @@ def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
     )
     task = task_direction(scenario, UP)
     cut = linearize(scenario, load_estimate=true_load(scenario))
-    H = hybrid_along(wired(cut), OMEGA, task.hand, task.tool)
+    H = two_port_along(wired(cut), OMEGA, task.hand, task.tool)
     axis = changed(task.axis, device_mass=task.axis.device_mass + task.axis.hand_mass)
     sampling = Sampling(low_pass_hz=scenario.wrist_sensor.bandwidth_hz)
     assert (difference(H, sampled_two_port(axis, sampling, OMEGA)) < 0.01).all()
@@ -173,7 +173,7 @@ def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
     scenario = replace(LoadScenario("free_motion_force"), force_scaling__sigma=sigma)
     task = task_direction(scenario, UP)
     cut = linearize(scenario, load_estimate=true_load(scenario))
-    H = hybrid_along(wired(cut), OMEGA, task.hand, task.tool)
+    H = two_port_along(wired(cut), OMEGA, task.hand, task.tool)
     axis, s = task.axis, 1j * OMEGA
     held = np.exp(-s * PERIOD / 2)
     pull = axis.velocity_gain * (s + axis.position_gain) * held
@@ -198,7 +198,7 @@ def test_sideways_force_rotates_the_tool():
     cut = linearize(scenario, load_estimate=true_load(scenario))
     system = cut.close_loop(["pose_command.x"], ["pose_received.x"])
     system = system.close_loop(["wrench_B.x"], ["wrench_received.x"])
-    H = hybrid_along(system, OMEGA, task.hand, task.tool)
+    H = two_port_along(system, OMEGA, task.hand, task.tool)
     axis = changed(task.axis, device_mass=task.axis.device_mass + task.axis.hand_mass)
     assert not 0.9 < task.tool_coupling < 1.1
     turning = changed(axis, tool_mass=task.tool_coupling * axis.tool_mass)
@@ -220,7 +220,7 @@ def test_sideways_tip_compliance_includes_the_hands_wrist():
         [f"{port}.{a}" for a in others] for port in ("operator_wrench", "hand_wrench")
     )
     omega = np.array([0.5])  # rad/s
-    H = hybrid_along(system.close_loop(operator, hand), omega, task.hand, task.tool)
+    H = two_port_along(system.close_loop(operator, hand), omega, task.hand, task.tool)
     compliance = (H[0, 1, 1] / (1j * omega[0])).real
     axis = task.axis
     servo = 1 / (axis.slave_mass * axis.velocity_gain * axis.position_gain)
@@ -243,7 +243,7 @@ def test_displayed_stiffness_is_that_of_leaf_and_bodies_in_series():
     estimate, pressing = true_load(scenario), (0.0, 0.0, -0.04)
     cut = linearize(scenario, load_estimate=estimate, displacement=pressing)
     omega = np.array([0.5])  # rad/s
-    stiffness = (1j * omega * hybrid_along(wired(cut), omega, task.hand, task.tool)[:, 0, 0]).real
+    stiffness = (1j * omega * two_port_along(wired(cut), omega, task.hand, task.tool)[:, 0, 0]).real
     axis = task.axis
     servo = axis.slave_mass * axis.velocity_gain * axis.position_gain
     touch = 4e5 / 2  # two equal bodies in series, N/m

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from registers import closed_map, growth_rate, multipliers
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis import period_map
 from drake_teleop.lab.analysis.cut_loop import (
     CutLoop,
     count_unstable_multipliers,
@@ -156,6 +157,17 @@ def test_two_port_tends_to_the_continuous_one_for_short_periods() -> None:
 )
 def test_delay_is_rounded_to_hand_periods_and_at_least_one(delay: float, steps: int) -> None:
     assert one_way_delay_in_hand_periods(OneAxis(delay=delay), STATION) == steps
+
+
+def test_period_map_is_computed_once_for_all_delays_and_equal_gaps(monkeypatch):
+    gaps, slave_rows = [], period_map._slave_rows
+    monkeypatch.setattr(
+        period_map, "_slave_rows", lambda *given: gaps.append(given[2]) or slave_rows(*given)
+    )
+    delays, sigmas = np.linspace(0.0, 0.1, 7), np.array([[0.0], [1.0]])
+    M = period_map_of_cut_loop(OneAxis(delay=delays, sigma=sigmas), STATION)
+    assert M.shape[:-2] == sigmas.shape
+    assert gaps == [1 / STATION.sensor_hz]
 
 
 @pytest.mark.parametrize("sampling", [STATION, JR3])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.comparison import one_dof
-from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, covering_damping, run_one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD_S, OneDof, covering_damping, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
@@ -21,16 +21,16 @@ def hand_work(model: OneDof, round_trip: float, frequency: float, damping: float
 
     The swing is around a point in the wall, or far from it if there is no wall.
     """
-    t = np.arange(12000) * PERIOD
+    t = np.arange(12000) * PERIOD_S
     fade = np.minimum(t / 2.0, 1.0)
     rest = 0.02 if model.wall_stiffness else -0.5
     x = rest + 1e-3 * fade * np.sin(2 * np.pi * frequency * t)
-    intent = np.stack([x, np.gradient(x, PERIOD)], axis=1)
+    intent = np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2), intent=intent)
     periods = np.floor(6.0 * frequency)
-    last = slice(len(t) - 1 - round(periods / frequency / PERIOD), len(t))
+    last = slice(len(t) - 1 - round(periods / frequency / PERIOD_S), len(t))
     moved = np.diff(run.master_position[last])
-    return float(-np.sum(run.hand_force[last][:-1] * moved) + damping * np.sum(moved**2) / PERIOD)
+    return float(-np.sum(run.hand_force[last][:-1] * moved) + damping * np.sum(moved**2) / PERIOD_S)
 
 
 @pytest.mark.slow
@@ -63,4 +63,4 @@ def test_covering_damping_at_a_wall_is_stiffness_times_delay():
     """Re K e^(-j w R) / (j w) = -K R sin(w R) / (w R), which is -K R at w = 0."""
     model = OneDof(ideal_servo=True, sigma=0.0)
     needed = covering_damping(model, 0.1)
-    assert needed == pytest.approx(5100 / 17.5 * (0.1 + 1.5 * PERIOD), rel=1e-3)
+    assert needed == pytest.approx(5100 / 17.5 * (0.1 + 1.5 * PERIOD_S), rel=1e-3)

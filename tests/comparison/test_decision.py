@@ -9,7 +9,7 @@ import pytest
 
 from drake_teleop.lab.comparison import compare_passivity
 from drake_teleop.lab.comparison.compare_passivity import simulate_release_and_taps
-from drake_teleop.lab.comparison.one_dof import ACTUAL
+from drake_teleop.lab.comparison.one_dof import AT_SLAVE
 from drake_teleop.lab.comparison.report import (
     decision_table,
     draw_decision_table,
@@ -108,7 +108,7 @@ def test_impulses_count_from_the_delay_of_one_way(monkeypatch):
     monkeypatch.setattr(compare_passivity, "TAP_RATES_HZ", (1.5,))
     found = simulate_release_and_taps("none", "late")
     assert found.tap_shares == pytest.approx((1.0,), abs=1e-9)
-    assert found.leaked == pytest.approx(0.1 * ACTUAL)
+    assert found.leaked == pytest.approx(0.1 * AT_SLAVE)
 
 
 @pytest.mark.parametrize("draw", [draw_force_traces, draw_energy])

@@ -16,14 +16,14 @@ from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin
 from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis, servo_response
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.comparison.one_dof import (
-    ACTUAL,
-    HAND,
-    PERIOD,
+    AT_HAND,
+    AT_SLAVE,
+    PERIOD_S,
     REFERENCE,
     OneDof,
     Task,
-    figures_of_run,
-    figures_of_traces,
+    measures_of_run,
+    measures_of_traces,
     operator_intent,
     run_one_dof,
 )
@@ -59,8 +59,8 @@ def grows(model: OneDof, round_trip: int, rest: float) -> bool:
     run = run_one_dof(
         model,
         PassivityConfig(),
-        NetworkConfig(delay=forward * PERIOD),
-        NetworkConfig(delay=backward * PERIOD),
+        NetworkConfig(delay=forward * PERIOD_S),
+        NetworkConfig(delay=backward * PERIOD_S),
         intent=intent,
     )
     if not np.isfinite(run.master_position).all():
@@ -95,7 +95,7 @@ def contact_limit(grip: str, wall: float) -> float:
 def test_longest_delay_in_contact_equals_closed_form(grip, wall):
     model = held(grip, wall_stiffness=wall)
     # Interpolation and hold add a delay.
-    expected = contact_limit(grip, wall) / PERIOD - 1.5
+    expected = contact_limit(grip, wall) / PERIOD_S - 1.5
     found = longest_round_trip(model, 0.02, 1, round(2 * expected) + 4)
     assert found == pytest.approx(expected, abs=1.0)
 
@@ -126,7 +126,7 @@ def free_windows(grip: str) -> list[float]:
 
 def test_light_hand_has_an_unstable_window_in_free_motion():
     """The hand is unstable between 190 and 339 ms at sigma = 1."""
-    first, last = (edge / PERIOD for edge in free_windows("light"))
+    first, last = (edge / PERIOD_S for edge in free_windows("light"))
     assert (first, last) == (pytest.approx(190, abs=1), pytest.approx(339, abs=1))
     model = held("light", sigma=1.0)
     # The second difference of the interpolated command is 2 periods late; the force is held.
@@ -168,7 +168,7 @@ def test_longest_round_trip_without_a_method(model, longest):
     none, found = PassivityConfig(), {}
     for round_trip in (0.002, longest, longest + 0.002, 0.05):
         run = run_one_dof(model, none, NetworkConfig(delay=round_trip / 2))
-        found[round_trip] = figures_of_run(run, model)
+        found[round_trip] = measures_of_run(run, model)
     assert [result.stable for result in found.values()] == [True, True, False, False]
     assert abs(found[0.002].force_error) < 1e-3
     assert found[0.05].least_energy < -1.0
@@ -184,7 +184,7 @@ def test_simulation_and_linear_analysis_agree(model):
     damped = dataclasses.replace(
         model, hand_damping=model.hand_damping + DEVICE_DAMPING, device_friction=0.0
     )
-    expected = margin / PERIOD - 1.5
+    expected = margin / PERIOD_S - 1.5
     found = longest_round_trip(damped, 0.02, 1, round(2 * expected) + 4)
     assert found == pytest.approx(expected, abs=1.0)
 
@@ -216,16 +216,17 @@ def test_energy_balances_agree_with_spring_and_inertia():
     hand, command, motor, actual = run.accounts.T
     # A spring returns its energy, to rounding: the wall is not active.
     np.testing.assert_allclose(actual, -spring, rtol=0.0, atol=1e-14)
-    assert spring.max() > 0.01 and run.least_energy_sum(ACTUAL) < -0.01 and run.start_energy == 0.0
+    assert spring.max() > 0.01 and run.start_energy == 0.0
+    assert run.least_energy_sum(AT_SLAVE) < -0.01
     # Motor energy equals wall and kinetic energy; v is half a step of 50 us late.
-    speed = np.gradient(run.slave_position, PERIOD)
+    speed = np.gradient(run.slave_position, PERIOD_S)
     moving = 0.5 * scale * model.slave_mass * speed**2
     assert moving.max() > 0.1
     np.testing.assert_allclose(motor, actual - moving, rtol=0.0, atol=6e-4)
     still = np.abs(speed) < 1e-4
     np.testing.assert_allclose(motor[still], actual[still], rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(hand, run.channel_energy[:, 0])
-    assert run.least_energy_sum(HAND) == hand.min()
+    assert run.least_energy_sum(AT_HAND) == hand.min()
     # The command's balance also contains the energy in the servo's lag.
     wrench, lag = scale * run.wall_force, run.command_position - run.slave_position
     sampled = np.cumsum(wrench * np.diff(run.slave_position, prepend=run.slave_position[0]))
@@ -277,7 +278,7 @@ def test_changing_hand_wall_and_imperfections():
         run.wall_force[:599].min() == 0.0 == run.wall_force[750:].min()
         and run.wall_force[600:750].min() < -20.0
     )
-    assert run.accounts[749, ACTUAL] == run.accounts[-1, ACTUAL]
+    assert run.accounts[749, AT_SLAVE] == run.accounts[-1, AT_SLAVE]
     noise = run.hand_force[50:590] / model.force_scale
     assert noise.std() == pytest.approx(0.5, rel=0.15)
     assert run.master_position[749] < 0.019 and np.all(run.time_without_packets[-1] > 0.09)
@@ -318,7 +319,7 @@ def test_adversary_is_reproducible_and_finds_leaks_and_cycles(
     ],
 )
 def test_rise_delay_is_never_negative(share, late, drag, expected):
-    task, t = Task(), np.arange(round(Task().end / PERIOD)) * PERIOD
+    task, t = Task(), np.arange(round(Task().end / PERIOD_S)) * PERIOD_S
     middle = 0.5 * (task.press_start + task.press_end)
 
     def wall(now):
@@ -327,8 +328,8 @@ def test_rise_delay_is_never_negative(share, late, drag, expected):
     pulled = np.where((t > task.press_start) & (t < middle + 0.25), drag, 0.0)
     felt = np.minimum(wall(t - late), share) + (pulled if drag else 0.0)
     still = np.zeros_like(t)
-    found = figures_of_traces(
+    found = measures_of_traces(
         t=t, master=still, slave=still, felt=felt, pressed=wall(t), energy=still, task=task
     )
-    assert found.rise_delay == pytest.approx(expected, abs=2 * PERIOD, nan_ok=True)
+    assert found.rise_delay == pytest.approx(expected, abs=2 * PERIOD_S, nan_ok=True)
     assert not found.rise_delay < 0.0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
+from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_MOTOR, AT_SLAVE
 from drake_teleop.lab.comparison.whole_station import (
     start_energy,
-    station_accounts,
+    station_energies,
     work_of_displayed_load_wrench,
 )
 from drake_teleop.lab.identification import slave_arm, true_load
@@ -58,7 +58,7 @@ def test_spring_at_the_tool_returns_its_energy():
     result, poses = logged(lambda p: np.hstack([-stiffness @ (p - middle), np.zeros(3)]))
     offset = poses[:, 4:] - middle
     stored = 0.5 * np.einsum("ni,ij,nj->n", offset, stiffness, offset)
-    actual = station_accounts(result, SCENARIO)[:, ACTUAL]
+    actual = station_energies(result, SCENARIO)[:, AT_SLAVE]
     # Force scale times gamma over the scale of translation.
     np.testing.assert_allclose(actual[:, 0], 0.1 * 0.5 / 2.0 * (stored[0] - stored), atol=1e-12)
     assert np.ptp(actual[:, 0]) > 0.1
@@ -67,12 +67,12 @@ def test_spring_at_the_tool_returns_its_energy():
 
 def test_torque_at_the_tool_works_only_along_rotation():
     result, _ = logged(lambda p: np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.1]))
-    accounts = station_accounts(result, SCENARIO)
-    np.testing.assert_allclose(accounts[:, ACTUAL, 0], 0.0, atol=1e-12)
-    assert abs(accounts[-1, ACTUAL, 1]) > 1e-3
+    accounts = station_energies(result, SCENARIO)
+    np.testing.assert_allclose(accounts[:, AT_SLAVE, 0], 0.0, atol=1e-12)
+    assert abs(accounts[-1, AT_SLAVE, 1]) > 1e-3
     # The channel's sum of one period (0.5 ms) ago, relative to the first row.
-    np.testing.assert_allclose(accounts[:-1, HAND, 1], 2.0 * np.arange(20.0), atol=1e-9)
-    assert np.isnan(accounts[:, MOTOR]).all()
+    np.testing.assert_allclose(accounts[:-1, AT_HAND, 1], 2.0 * np.arange(20.0), atol=1e-9)
+    assert np.isnan(accounts[:, AT_MOTOR]).all()
 
 
 GRIPPER = np.array([1.2, 0.01, -0.02, 0.06, 0.008, 1e-4, -2e-4, 0.009, 3e-4, 0.005])
@@ -128,7 +128,7 @@ def test_station_without_channel_raises():
     with pytest.raises(
         DrakeTeleopError, match=r"result: .*lacks the signals .*ports, which .*; run a station with"
     ):
-        station_accounts(less, SCENARIO)
+        station_energies(less, SCENARIO)
 
 
 @pytest.mark.parametrize("sigma", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
@@ -153,9 +153,9 @@ def test_station_with_ledger_creates_no_energy(sigma):
     result = simulate(station, scenario.simulation, progress=False)
     assert np.abs(result["true_contact_wrench_W"][:, 2]).max() > 30.0, "it should have struck"
     accounts = (
-        station_accounts(result, scenario)
+        station_energies(result, scenario)
         + sigma * work_of_displayed_load_wrench(result, scenario)[:, None]
     )
-    for place in (ACTUAL, MOTOR) if sigma == 0.0 else (ACTUAL,):
-        created = accounts[:, HAND] + accounts[:, place] + start_energy(scenario)
+    for place in (AT_SLAVE, AT_MOTOR) if sigma == 0.0 else (AT_SLAVE,):
+        created = accounts[:, AT_HAND] + accounts[:, place] + start_energy(scenario)
         assert (created.min(axis=0) >= -1e-6).all()

@@ -12,7 +12,7 @@ from drake_teleop.load.trajectory import FourierTrajectory
 def random_trajectory(seed: int = 0) -> FourierTrajectory:
     rng = np.random.default_rng(seed)
     sine, cosine = rng.standard_normal((2, 6, 4))
-    return FourierTrajectory.at_rest(rng.standard_normal(6), sine, cosine, 1 / 6)
+    return FourierTrajectory.rest_to_rest(rng.standard_normal(6), sine, cosine, 1 / 6)
 
 
 def test_position_equals_equations_9_and_10():
@@ -47,7 +47,7 @@ def test_trajectory_starts_and_ends_at_rest():
 def test_rest_constraints_keep_all_other_freedom():
     """Every trajectory at rest can be reached: 2 (N - 1) independent motions of each joint."""
     unit = np.eye(8)
-    trajectory = FourierTrajectory.at_rest(np.zeros(8), unit[:, :4], unit[:, 4:], 1.0)
+    trajectory = FourierTrajectory.rest_to_rest(np.zeros(8), unit[:, :4], unit[:, 4:], 1.0)
     assert np.linalg.matrix_rank(np.hstack([trajectory.rho, trajectory.delta])) == 8
 
 

@@ -141,7 +141,7 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     training = decision.OperatorTraining(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_operator_parameters(training, Perception(), movement), []
-    monkeypatch.setattr(decision, "_hand_motion", decision._hand_motion.py_func)
+    monkeypatch.setattr(decision, "_to_hand_motion", decision._to_hand_motion.py_func)
     monkeypatch.setattr(decision, "_draw_normal_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._plan_submovement.py_func(

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.comparison.one_dof import (
-    ACTUAL,
-    MOTOR,
-    PERIOD,
+    AT_MOTOR,
+    AT_SLAVE,
+    PERIOD_S,
     REFERENCE,
     OneDofRun,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -61,11 +61,11 @@ def model(grip=MEDIUM, wall=5100.0, **imperfect):
 
 
 def times(end: float) -> np.ndarray:
-    return np.arange(round(end / PERIOD)) * PERIOD
+    return np.arange(round(end / PERIOD_S)) * PERIOD_S
 
 
 def moving(x: np.ndarray) -> np.ndarray:
-    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+    return np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
 
 
 def charging(t: np.ndarray, press: float, depth: float) -> np.ndarray:
@@ -107,7 +107,7 @@ def test_no_energy_is_created_at_the_actual_motion(seed):
     for passivity in (CHARGED_BY_DRAG, CHARGED_BEFORE):
         run = hard_taps(seed, passivity)
         assert run.start_energy == passivity.ledger.initial[0]
-        assert run.least_energy_sum(ACTUAL) >= -1e-6 and run.least_energy_sum(MOTOR) >= -1e-6
+        assert run.least_energy_sum(AT_SLAVE) >= -1e-6 and run.least_energy_sum(AT_MOTOR) >= -1e-6
         assert run.wall_force.min() < -50.0, "the wall should have been hit"
 
 
@@ -116,7 +116,7 @@ def test_no_energy_is_created_with_encoder_steps(step, known):
     """The encoder step is the configured one or larger."""
     ledger = LedgerConfig(encoder_step=[known, 0.0])
     run = hard_taps(1, PassivityConfig(method="ledger", ledger=ledger), master_resolution=step)
-    assert run.least_energy_sum(ACTUAL) >= -1e-6 and run.least_energy_sum(MOTOR) >= -1e-6
+    assert run.least_energy_sum(AT_SLAVE) >= -1e-6 and run.least_energy_sum(AT_MOTOR) >= -1e-6
     assert run.wall_force.min() < -50.0, "the wall should have been hit"
 
 
@@ -126,7 +126,7 @@ def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
     axis = model(LIGHT, 50e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
     assert run.wall_force[run.t < 4.0].min() < -50.0, "it should have hit the wall"
-    found = figures_of_run(run, axis)
+    found = measures_of_run(run, axis)
     assert found.stable and abs(found.force_error) < 0.01
 
 
@@ -138,7 +138,7 @@ def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
         "motor_lag": 3e-3,
     }
     for seed in (1, 9):
-        assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least_energy_sum(ACTUAL) >= -1e-6
+        assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least_energy_sum(AT_SLAVE) >= -1e-6
 
 
 def test_ledger_is_input_minus_output_and_keeps_its_deficit():
@@ -186,8 +186,8 @@ def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
     twist = np.array([0.06, 0.08, 0.0, 0.0, 0.0, 0.5])
     held = memory[STORED_ENERGY].copy()
     slave_step(
-        step_addresses("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
-        PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
+        step_addresses("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD_S * twist,
+        zero, PERIOD_S, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
     )  # fmt: skip
     moving = 1.05 * 0.5 * np.array([4.0 * 0.01, 0.02 * 0.25])
     np.testing.assert_allclose(memory[_AVAILABLE_MOTOR_ENERGY], held - moving, rtol=1e-12)
@@ -212,7 +212,7 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
         intent=charging(t, 2.0, rng.uniform(0.03, 0.06)),
     )  # fmt: skip
     assert run.time_without_packets.max() > 0.2 and run.wall_force.min() < -100.0
-    assert run.least_energy_sum(ACTUAL) >= -1e-6
+    assert run.least_energy_sum(AT_SLAVE) >= -1e-6
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     pressing = operator_intent(task)
     axis = model(grip, wall)
     run = run_one_dof(axis, CHARGED_BY_DRAG, network, timeout=PATIENT, intent=pressing)
-    found = figures_of_run(run, axis, task)
+    found = measures_of_run(run, axis, task)
     assert found.stable and abs(found.force_error) < 0.01
     assert abs(found.drift) < 1e-4 and found.chatter < 0.05 * found.felt_force
     free = np.abs(run.hand_force[(run.t > 0.5) & (run.t < 3.5)])
@@ -253,9 +253,9 @@ def test_rendered_force_is_right_with_damped_wall_and_joint_friction(grip, delay
     """Damping that counted as stiffness would be rendered without contact force."""
     axis = model(grip, 2.5e3, wall_damping=300.0, slave_friction=30.0)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
-    found = figures_of_run(run, axis)
+    found = measures_of_run(run, axis)
     assert found.stable and abs(found.force_error) < 0.05
-    assert run.least_energy_sum(ACTUAL) >= -1e-6
+    assert run.least_energy_sum(AT_SLAVE) >= -1e-6
 
 
 @pytest.mark.parametrize("grip", [MEDIUM, FIRM])
@@ -264,7 +264,7 @@ def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
     axis = model(grip, 20e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=0.15), timeout=PATIENT)
     found, hard = (
-        figures_of_run(run, axis),
+        measures_of_run(run, axis),
         axis.force_scale * 20e3 / (1.0 + 20e3 / axis.servo_stiffness),
     )
     assert found.stable and abs(found.force_error) < 0.01
@@ -309,7 +309,7 @@ def test_released_hand_is_not_accelerated(delay):
     )  # fmt: skip
     start = np.searchsorted(t, 8.0)
     assert abs(run.hand_force[start - 1]) == pytest.approx(4.0, rel=0.1)
-    assert np.abs(np.diff(run.master_position[start:])).max() < 0.3 * PERIOD
+    assert np.abs(np.diff(run.master_position[start:])).max() < 0.3 * PERIOD_S
     assert np.ptp(run.master_position[start:]) < 0.04
 
 
@@ -347,7 +347,7 @@ def test_removed_wall_is_rendered_to_a_pressing_hand_for_one_delay(grip, delay):
     felt = np.abs(run.hand_force)
     assert felt[(t > 5.8) & (t < 6.0)].min() > 1.0
     assert felt[t > 6.0 + delay + 0.02].max() < 0.05
-    assert run.least_energy_sum(ACTUAL) >= -1e-6
+    assert run.least_energy_sum(AT_SLAVE) >= -1e-6
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,7 @@ def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
     felt = np.abs(run.hand_force)
     assert felt[(t > 5.8) & (t < 6.0)].min() > 1.0
     assert felt[t > 6.0065].max() < 0.3
-    assert run.least_energy_sum(ACTUAL) >= -1e-6
+    assert run.least_energy_sum(AT_SLAVE) >= -1e-6
 
 
 @pytest.mark.parametrize("rate", [0.7, 1.5])

@@ -13,7 +13,7 @@ from drake_teleop.common.vectors import normalized_quaternion, quaternion_produc
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -301,7 +301,7 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
     def figures_of(method):
         passivity = PassivityConfig(method=method)
         run = run_one_dof(model, passivity, network, intent=operator_intent(task))
-        return figures_of_run(run, model, task)
+        return measures_of_run(run, model, task)
 
     charged, strict = figures_of("charged_tdpa"), figures_of("tdpa")
     assert charged.stable and abs(charged.force_error) < 0.01

@@ -14,14 +14,14 @@ import pytest
 from test_methods import START, energy_balance, line, poses, run, wrenches
 
 from drake_teleop.lab.comparison.one_dof import (
-    ACTUAL,
-    COMMAND,
-    MOTOR,
-    PERIOD,
+    AT_COMMAND,
+    AT_MOTOR,
+    AT_SLAVE,
+    PERIOD_S,
     REFERENCE,
     OneDofRun,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -37,13 +37,13 @@ MEDIUM = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_s
 
 
 def press_deeply(method: str, seed: int, timeout: float) -> OneDofRun:
-    t = np.arange(6000) * PERIOD
+    t = np.arange(6000) * PERIOD_S
     x = 0.055 * (0.45 + 1.5 * np.sin(0.9 * np.pi * t + 1.0))
     x = -0.04 + np.minimum(t / 0.5, 1.0) * (x + 0.04)
     found = run_one_dof(
         MEDIUM, PassivityConfig(method=method),
         NetworkConfig(delay=0.05, jitter=0.5, loss=0.4, burst=0.3),
-        seed=seed, timeout=timeout, intent=np.stack([x, np.gradient(x, PERIOD)], axis=1),
+        seed=seed, timeout=timeout, intent=np.stack([x, np.gradient(x, PERIOD_S)], axis=1),
     )  # fmt: skip
     assert found.wall_force.min() < -10.0, "the wall should have been touched"
     return found
@@ -89,8 +89,8 @@ def test_tdpa_creates_at_most_the_kinetic_energy_at_the_slave(method, seed, time
     """A jump of the command, and one by the safe state, released 0.96 to 1.2 J."""
     found = press_deeply(method, seed, timeout)
     moving = 0.5 * MEDIUM.force_scale * MEDIUM.slave_mass * TdpaConfig().speed[0] ** 2
-    assert found.least_energy_sum(ACTUAL) > -moving
-    assert found.least_energy_sum(COMMAND) > -1e-3  # the hand's pair is the held one here
+    assert found.least_energy_sum(AT_SLAVE) > -moving
+    assert found.least_energy_sum(AT_COMMAND) > -1e-3  # the hand's pair is the held one here
 
 
 def test_wave_end_releases_only_received_energy():
@@ -118,14 +118,14 @@ def test_wave_end_releases_only_received_energy():
 
 def test_tdpa_repays_the_energy_of_a_tap():
     """Taps of 50 mm at 2 Hz over 100 ms: 0.16 J in 4 s if it sends before it repays."""
-    t = np.arange(4000) * PERIOD
+    t = np.arange(4000) * PERIOD_S
     x = 0.05 * np.sin(4.0 * np.pi * t) * np.minimum(t / 0.5, 1.0)
     found = run_one_dof(
         REFERENCE, PassivityConfig(method="tdpa"), NetworkConfig(delay=0.05),
-        intent=np.stack([x, np.gradient(x, PERIOD)], axis=1),
+        intent=np.stack([x, np.gradient(x, PERIOD_S)], axis=1),
     )  # fmt: skip
     assert found.wall_force.min() < -10.0, "the wall should have been touched"
-    assert found.least_energy_sum(ACTUAL) > -0.06
+    assert found.least_energy_sum(AT_SLAVE) > -0.06
 
 
 @pytest.mark.parametrize("method", ["tdpa", "charged_tdpa"])
@@ -153,18 +153,18 @@ def test_tdpa_repays_a_deficit_before_it_sends(method):
 def test_tanks_cover_a_jump_of_the_command(seed):
     """Energy of 0.18 and 0.33 J was created without the servo's own acceleration."""
     found = press_deeply("two_layer", seed, 1.0)
-    assert found.least_energy_sum(ACTUAL) >= 0.0 and found.least_energy_sum(MOTOR) >= 0.0
+    assert found.least_energy_sum(AT_SLAVE) >= 0.0 and found.least_energy_sum(AT_MOTOR) >= 0.0
 
 
 @pytest.mark.parametrize(("seed", "timeout"), [(3, 0.1), (4, 1.0)])
 def test_set_position_modulation_creates_no_energy_at_motor_and_slave(seed, timeout):
     found = press_deeply("pspm", seed, timeout)
-    assert found.least_energy_sum(ACTUAL) >= 0.0 and found.least_energy_sum(MOTOR) >= 0.0
+    assert found.least_energy_sum(AT_SLAVE) >= 0.0 and found.least_energy_sum(AT_MOTOR) >= 0.0
 
 
 @pytest.mark.parametrize(("seed", "timeout"), [(2, 0.1), (4, 1.0)])
 def test_waves_create_no_energy_at_the_command(seed, timeout):
-    assert press_deeply("wave", seed, timeout).least_energy_sum(COMMAND) >= -1e-9
+    assert press_deeply("wave", seed, timeout).least_energy_sum(AT_COMMAND) >= -1e-9
 
 
 def test_force_limit_bounds_the_rendered_force():
@@ -173,7 +173,7 @@ def test_force_limit_bounds_the_rendered_force():
     limit = ForceLimitConfig().force
     assert MEDIUM.force_scale * np.abs(found.wall_force).max() > 2.0 * limit
     assert np.abs(found.hand_force).max() == pytest.approx(limit, rel=1e-12)
-    assert found.least_energy_sum(ACTUAL) < -0.01
+    assert found.least_energy_sum(AT_SLAVE) < -0.01
 
 
 def test_four_channels_are_transparent_without_delay():
@@ -185,7 +185,7 @@ def test_four_channels_are_transparent_without_delay():
         MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),
         intent=operator_intent(task), timeout=1.0,
     )  # fmt: skip
-    assert abs(figures_of_run(found, MEDIUM, task).force_error) < 0.02
+    assert abs(measures_of_run(found, MEDIUM, task).force_error) < 0.02
     held = slice(3500, 3900)
     assert found.wall_force[held].mean() / MEDIUM.servo_stiffness < -2e-4
     np.testing.assert_allclose(found.slave_position[held], found.master_position[held], atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operator_intent, run_one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD_S, REFERENCE, operator_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import LAST_PORT_WRENCH, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, method_parameters
@@ -26,7 +26,7 @@ def test_released_hand_stays_slow(method, delay):
         REFERENCE, PassivityConfig(method=method), NetworkConfig(delay=delay), intent=intent,
         grip=grip, timeout=1.0,
     )  # fmt: skip
-    speed = np.abs(np.diff(run.master_position[LET_GO - 1 :])) / PERIOD
+    speed = np.abs(np.diff(run.master_position[LET_GO - 1 :])) / PERIOD_S
     assert speed.max() < 0.3
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.comparison.one_dof import (
-    PERIOD,
+    PERIOD_S,
     OneDof,
     Task,
-    figures_of_run,
+    measures_of_run,
     operator_intent,
     run_one_dof,
 )
@@ -107,7 +107,8 @@ def test_motion_during_silence_is_not_replayed(tmp_path, method):
     # The speed is at most that of the hand plus that of the missed displacement on the ramp of the
     # resumption, whose steepest rate is 15/8.
     missed = np.ptp(result.master_position)
-    fast = np.abs(np.diff(result.master_position)).max() + 15 / 8 * missed / RESUME_TIME_S * PERIOD
+    fast = np.abs(np.diff(result.master_position)).max()
+    fast += 15 / 8 * missed / RESUME_TIME_S * PERIOD_S
     back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME_S))[:-1]
     assert np.abs(np.diff(result.slave_position))[back].max() < fast
     if not METHODS[method].balance_at_motors:  # there the command is a force, written as a pose
@@ -120,20 +121,20 @@ def rough_network(path: Path, rng: np.random.Generator, until: float = 9.0) -> N
 
     Its delays are a recorded trace at 1 ms.
     """
-    steps = round(until / PERIOD)
+    steps = round(until / PERIOD_S)
     mean, jitter = rng.uniform(0.0, 0.15), rng.uniform()
     delay = mean * (1.0 + jitter * rng.uniform(-1.0, 1.0, steps))
     lost = rng.uniform(size=steps) < rng.uniform(0.0, 0.5)
     start = 0.0
     while start < until:  # some bursts exceed the watchdog's time-out
         stop = start + rng.exponential(0.15)
-        burst = slice(round(start / PERIOD), round(stop / PERIOD))
+        burst = slice(round(start / PERIOD_S), round(stop / PERIOD_S))
         lost[burst] |= rng.uniform(size=len(lost[burst])) < rng.uniform(0.5, 1.0)
         start = stop + rng.exponential(0.5)
     rows = ["time,delay"]
     for k in range(steps):
-        rows.append(f"{k * PERIOD:.3f}," + ("" if lost[k] else f"{delay[k]:.6f}"))
-    rows += [f"{k * PERIOD:.3f},0.01" for k in range(steps, 20000)]
+        rows.append(f"{k * PERIOD_S:.3f}," + ("" if lost[k] else f"{delay[k]:.6f}"))
+    rows += [f"{k * PERIOD_S:.3f},0.01" for k in range(steps, 20000)]
     path.write_text("\n".join(rows) + "\n")
     return NetworkConfig(trace=str(path))
 
@@ -157,7 +158,7 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
         result = run_one_dof(model, config, forward, backward, timeout=TIMEOUT)
         assert np.isfinite(result.hand_force).all() and np.isfinite(result.command_position).all()
         assert np.abs(result.hand_force).max() <= 5.0 + 1e-12
-        found = figures_of_run(result, model)
+        found = measures_of_run(result, model)
         assert found.stable, found
         assert abs(found.drift) < 2e-3, found
         assert np.abs(result.hand_force[-1000:]).max() < 0.1
@@ -174,10 +175,10 @@ def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
         result = run_one_dof(OneDof(), config, forward, backward, timeout=TIMEOUT)
         silent, steps = result.time_without_packets[:, 0] > TIMEOUT, np.arange(len(result.t))
         since = steps - np.maximum.accumulate(np.where(silent, steps, -len(steps)))
-        resuming = (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
+        resuming = (since > 0) & (since < round(RESUME_TIME_S / PERIOD_S))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())
         growth = np.diff(np.abs(result.hand_force), prepend=0.0)[resuming]
-        assert growth.max(initial=0.0) < 1.001 * PEAK_FORCE_N * PERIOD / RESUME_TIME_S
+        assert growth.max(initial=0.0) < 1.001 * PEAK_FORCE_N * PERIOD_S / RESUME_TIME_S
     assert resumptions >= 5
 
 
@@ -195,5 +196,5 @@ def test_packet_does_not_contain_old_memory(method):
         memory = initial_method_memory(method, p, pose)
         received = np.zeros(PACKET_SIZE)
         motion = (pose, still, still, still, *limits)
-        step(number, received, False, *motion, PERIOD, p, memory, out, packet)
+        step(number, received, False, *motion, PERIOD_S, p, memory, out, packet)
         assert np.isfinite(packet).all()

@@ -34,7 +34,7 @@ from drake_teleop import AddWristSensor
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG, non_contact_wrench
 from drake_teleop.station.sensor.presets import PRESETS
-from drake_teleop.station.sensor.sensor_chain import PARTS, WristSensorConfig, without_parts
+from drake_teleop.station.sensor.sensor_chain import SENSOR_PARTS, WristSensorConfig, without_parts
 
 ARM = Path(__file__).parents[2] / "docs" / "gallery" / "arm.urdf"
 TOOL = SpatialInertia.MakeFromCentralInertia(
@@ -329,7 +329,7 @@ def test_saturation_is_flagged_and_limited():
 
 def test_latencies_of_all_paths_meet_in_one_instant():
     """V phi equals the wrench in motion, although the accelerations are 3 samples late."""
-    config = without_parts(WristSensorConfig(), *PARTS)
+    config = without_parts(WristSensorConfig(), *SENSOR_PARTS)
     config.acceleration_latency = 3e-3
     run = moving(config=config)
     run.simulator.AdvanceTo(0.0405)

@@ -142,7 +142,7 @@ def swinging(rate: float) -> SimulationResult:
     )
     start = [0.4, -0.3, -1.6, 0.7, -0.5, 2.0]
     swing = np.outer([0.1, -0.1, 0.15, 0.3, -0.3, 0.5], [1.0])
-    trajectory = FourierTrajectory.at_rest(start, np.zeros((6, 1)), swing, 2.0)
+    trajectory = FourierTrajectory.rest_to_rest(start, np.zeros((6, 1)), swing, 2.0)
     return simulate(MakeIdentificationStation(scenario, trajectory), scenario.simulation)
 
 

@@ -14,8 +14,8 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.comparison.one_dof import RunMeasures
 from drake_teleop.lab.comparison.whole_station import (
     _slave_height_and_rotation,
-    delayed_contact,
     leaf_thickness,
+    press_scenario,
 )
 from drake_teleop.lab.tuning import press_trial
 from drake_teleop.lab.tuning import tune as search
@@ -23,7 +23,7 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
-    make_stated_set,
+    make_operating_range,
     renderable_press_depth,
     rms_above_5_hz,
     without_task_and_method,
@@ -44,8 +44,8 @@ from drake_teleop.station.slave.plant import NominalSlave
 GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, "contact_N": 5.0}
 
 
-def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_ends():
-    stated = make_stated_set(["firm", "light"], [20.0, 0.5, 3.0], "press")
+def test_operating_range_has_all_grips_between_the_given_ones_and_walls_between_the_ends():
+    stated = make_operating_range(["firm", "light"], [20.0, 0.5, 3.0], "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [
@@ -58,7 +58,7 @@ def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_e
         (1.1, ["medium", "firm"], walls),
         (1.0, ["light", "firm"], [20000.0]),
     ]
-    assert make_stated_set(["light"], [3.0], "press").tested_parts == [
+    assert make_operating_range(["light"], [3.0], "press").tested_parts == [
         *(2 * [(1.1, ["light"], [3000.0])]),
         (1.0, ["light"], [3000.0]),
     ]
@@ -77,7 +77,7 @@ def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_e
 )
 def test_invalid_sets_are_refused(arguments, where):
     with pytest.raises(DrakeTeleopError, match=f"^{where}"):
-        make_stated_set(*arguments)
+        make_operating_range(*arguments)
 
 
 @pytest.mark.parametrize("network", [None, "ideal"])
@@ -100,7 +100,7 @@ def test_leaf_of_a_stiffness_has_this_stiffness():
 def test_press_reaches_the_leaf_and_the_depth_at_the_masters_scale():
     scaled = replace(LoadScenario("contact_transition"), kinematic_scaling__translation_scale=2.0)
     settings = UNEQUAL, PassivityConfig(method="ledger")
-    setup, task = delayed_contact(scaled, *settings, 3000.0, depth=0.01)
+    setup, task = press_scenario(scaled, *settings, 3000.0, depth=0.01)
     swing, press, retreat = setup.operator.intent
     assert press.translation == pytest.approx([0.0, 0.0, -(0.03 / 2.0 + 0.01)])
     np.testing.assert_allclose(retreat.translation, np.negative(press.translation))
@@ -197,7 +197,7 @@ def trial(walls=(0.5, 20.0), task: str = "press") -> StationPressTrial:
     given = LoadScenario("contact_transition")
     base = without_task_and_method(given, "internet")
     return StationPressTrial(
-        given, base, make_stated_set(["light", "firm"], walls, task), np.ones(16)
+        given, base, make_operating_range(["light", "firm"], walls, task), np.ones(16)
     )
 
 
@@ -242,7 +242,8 @@ UNEQUAL = Channel(delay=0.02, backward=NetworkConfig(delay=0.05))
 def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
     monkeypatch.setattr(press_trial.one_dof, "run_one_dof", capture_arguments)
     one = trial()
-    search_ = OneAxisGammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
+    unequal = replace(one.base_scenario, channel=UNEQUAL)
+    search_ = OneAxisGammaSearch(unequal, one.operating_range, {})
     tuned = TunedSettings("ledger", 1.5, 0.3, 100.0)
     with pytest.raises(CapturedArguments) as found:
         search_.share_in_one_axis(OneAxis(), tuned, "firm", 3000.0, 4)
@@ -253,7 +254,7 @@ def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
 
 
 def test_trial_waits_for_both_directions_and_presses_as_deep_as_the_device_can(monkeypatch):
-    monkeypatch.setattr(press_trial, "delayed_contact", capture_arguments)
+    monkeypatch.setattr(press_trial, "press_scenario", capture_arguments)
     one = trial()
     one = replace_fields(one, base_scenario=replace(one.base_scenario, channel=UNEQUAL))
     values = {"method": "as given", "hand": "firm", "wall": 3000.0}
@@ -274,7 +275,7 @@ def test_smallest_detected_force_is_that_at_the_tool(monkeypatch, free_force):
     for name, value in (
         ("MakeTeleopStation", None),
         ("simulate", SimulationResult(t, signals, [SIGNALS[name] for name in signals])),
-        ("figures_of_station_run", measures),
+        ("measures_of_press", measures),
     ):
         monkeypatch.setattr(press_trial, name, lambda *_, value=value, **__: value)
     tuned = {"method": "ledger", "gamma": 2.0, "sigma_inertia": 0.3, "low_pass_hz": 100.0}
@@ -339,7 +340,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 
 def test_settings_change_method_scales_and_filter_alone():
     base = without_task_and_method(LoadScenario("contact_transition"), "internet")
-    stated = make_stated_set(["light", "firm"], [1.0], "press")
+    stated = make_operating_range(["light", "firm"], [1.0], "press")
     tuned = TunedSettings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)
     assert tuned.force_scaling.scales().gamma == 2.0

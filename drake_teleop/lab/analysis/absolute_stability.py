@@ -40,10 +40,10 @@ def llewellyn_parameter(H: Complex) -> Array:
 def is_absolutely_stable(H: Complex) -> BooleanArray:
     """Return, for each frequency, whether any passive hand and environment are stable."""
     h11, h12, h21, h22 = matrix_entries(H)
-    return _is_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
+    return _is_criterion_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
 
 
-def _is_met(H: Complex, criterion: Array, criterion_size: Array) -> BooleanArray:
+def _is_criterion_met(H: Complex, criterion: Array, criterion_size: Array) -> BooleanArray:
     met = criterion >= -_RELATIVE_ROUNDING_ERROR * criterion_size
     for port in (H[..., 0, 0], H[..., 1, 1]):
         met &= port.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(port)
@@ -77,7 +77,7 @@ def is_passive(H: Complex) -> BooleanArray:
     """Return, for each frequency of H, whether the station absorbs power for every input."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
-    return _is_met(H, raisbeck_criterion(H), size)
+    return _is_criterion_met(H, raisbeck_criterion(H), size)
 
 
 def scattering_norm(S: Complex) -> Array:
@@ -176,7 +176,7 @@ def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     return np.where(hand.contains(-H[..., 0, 0], omega), 0.0, limit)
 
 
-def bounded_singular_value(
+def singular_value_in_ranges(
     H: Complex, omega: Array, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Array:
     """Return mu; below 1, no hand and environment in the ranges can oscillate at omega [rad/s]."""

@@ -16,7 +16,7 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
-from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
+from drake_teleop.lab.analysis.linearization import close_network, linearize, two_port_along
 from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
@@ -97,7 +97,7 @@ def _analyze_in_stages(
 
     progress = stage("Two-port, margins, transparency")
     one_loop_open = close_other_directions(free, linear, along)
-    with_hand = hybrid_along(one_loop_open, OMEGA, along.hand, along.tool)
+    with_hand = two_port_along(one_loop_open, OMEGA, along.hand, along.tool)
     H = two_port.absorb_impedances(with_hand, hand=-S_AT_OMEGA * axis.hand_mass)
     progress(0.3)
     summary: dict[str, Any] = {
@@ -213,13 +213,13 @@ def summarise_diagram_stability(
     return {
         "point": name,
         "states": system.num_states,
-        **_slowest_motion(system, stable),
+        **_slowest_mode(system, stable),
         # The count of unstable multipliers also includes those far from the unit circle.
-        "one_axis": _slowest_motion(closed_axis_model(axis, sampling), stable) | {"stable": stable},
+        "one_axis": _slowest_mode(closed_axis_model(axis, sampling), stable) | {"stable": stable},
     }
 
 
-def _slowest_motion(system: Linearization, stable: bool) -> dict[str, Any]:
+def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
     # `stable` replaces the multipliers of a model with too many states.
     if system.num_states > MAX_STATES:
         return {"stable": stable, "decay_1_per_s": None, "frequency_Hz": None}
@@ -376,7 +376,7 @@ def measure_free_impedance(
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
     # The hand's mass moves with the stylus and belongs to the hand.
     felt = held - 1j * found.omega * along.axis.hand_mass
-    ratio = held / hybrid_along(system, found.omega, along.hand, along.tool)[:, 0, 0]
+    ratio = held / two_port_along(system, found.omega, along.hand, along.tool)[:, 0, 0]
     return {
         "frequency_Hz": found.omega / (2 * np.pi),
         "felt_re": felt.real,

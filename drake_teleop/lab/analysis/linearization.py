@@ -114,7 +114,7 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     return ahead, back
 
 
-def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
+def two_port_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
     """Return the hybrid matrix H (n, 2, 2) along one direction at omega (n,) [rad/s], not zero.
 
     In `system` the hand's loop is cut in this direction. H includes the hand's mass. `hand` and

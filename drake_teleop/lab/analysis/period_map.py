@@ -57,15 +57,17 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
     n = FIRST_FILTER_STATE + 2 * sections.shape[-2]
-    parameters = *vars(axis).values(), *vars(sampling).values()
-    shape = np.broadcast_shapes(*map(np.shape, parameters))
+    # Without the delay, which may be another array, and does not change the map.
+    parameters = vars(axis) | vars(sampling) | {"delay": 0.0}
+    shape = np.broadcast_shapes(*map(np.shape, parameters.values()))
     zeros = np.zeros((*shape, n + 3, n + 3))
-    hand = _hand_rows(zeros[..., :2, :], axis, hand_period)
+    two_rows = zeros[..., :2, :]
+    hand = _hand_rows(two_rows, axis, hand_period)
     servo = _servo_row(zeros[..., :1, :], axis)
     sensor = _sensor_rows(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
-    slave = {gap: _slave_rows(zeros[..., :2, :], axis, float(gap) * hand_period) for gap in gaps}
+    slave = {gap: _slave_rows(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)}
     M = zeros + np.eye(n + 3)
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()

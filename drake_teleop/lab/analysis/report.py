@@ -55,12 +55,12 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
         pictures,
         s=summary,
         wall=curves.axis.wall_stiffness,
-        axis_rows=axis_rows(summary["axis"]),
+        axis_rows=axis_parameter_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
     )
 
 
-def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
+def axis_parameter_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the parameters of the one-axis model as rows (name, value with unit)."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
     hand = f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m"
@@ -144,7 +144,7 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
     _, S = two_port.power_scaled_matrices(curves.H, curves.axis)
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, stiffest))
     hands = absolute_stability.impedance_range_of_grips()
-    bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
+    bounded = absolute_stability.singular_value_in_ranges(curves.H, curves.omega, hands, wall)
     with plot_style():
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)

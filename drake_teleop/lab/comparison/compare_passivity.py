@@ -21,7 +21,7 @@ from drake_teleop.common.files import make_folder, output_folder, write_json, wr
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison import one_dof, whole_station
-from drake_teleop.lab.comparison.one_dof import PERIOD, TAP_RATES_HZ, OneDof, RunMeasures, Task
+from drake_teleop.lab.comparison.one_dof import PERIOD_S, TAP_RATES_HZ, OneDof, RunMeasures, Task
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
@@ -128,7 +128,7 @@ def longest_round_trip(
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
         for seed in seeds if jitter or loss else seeds[:1]:
             run = one_dof.run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
-            if not one_dof.figures_of_run(run, model).stable:
+            if not one_dof.measures_of_run(run, model).stable:
                 return longest
         longest = round_trip
     return longest
@@ -152,7 +152,7 @@ def simulate_press(
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     channel, passivity = Channel(network=network), PassivityConfig(method=method)
-    setup, task = whole_station.delayed_contact(scenario, channel, passivity, leaf)
+    setup, task = whole_station.press_scenario(scenario, channel, passivity, leaf)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)
@@ -184,7 +184,7 @@ def _run_while_stable(
         end = 1e-3 * round(1e3 * (settle + part.end))  # exactly at the event
         simulation.advance_without_garbage_collection(simulator, end)
         result = simulation.read_recorded_signals(simulator, settle)
-        found = whole_station.figures_of_station_run(result, scenario, part)
+        found = whole_station.measures_of_press(result, scenario, part)
         if not found.stable:
             break
     # Without rest in the hold the drift is not defined.
@@ -211,7 +211,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
             PassivityConfig(method=method),
             PRESETS[network],
             seed=seed,
-            timeout=Channel(network=network).timeout_s(PERIOD),
+            timeout=Channel(network=network).timeout_s(PERIOD_S),
             intent=intent,
             grip=grip,
         )
@@ -220,7 +220,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     end = release_time + 2.0
     task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, rest_window=0.1)
     pressing = one_dof.operator_intent(task)
-    release_row = round(release_time / PERIOD)
+    release_row = round(release_time / PERIOD_S)
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
     grip[release_row:] = 0.0
     released = simulate_hand(pressing, grip)
@@ -229,30 +229,30 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     scale = model.force_scale * model.gamma
     return ReleaseAndTaps(
         release_force=float(np.abs(released.hand_force[release_row - 100 : release_row]).mean()),
-        release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
+        release_speed=float(np.abs(np.diff(after)).max() / PERIOD_S),
         release_way=float(np.abs(after - after[0]).max()),
         tap_shares=tuple(
             _tap_impulse_share(found, scale, rate, 0.5 * round_trip)
             for found, rate in zip(tapping, TAP_RATES_HZ, strict=True)
         ),
-        leaked=max(0.0, *(-run.least_energy_sum(one_dof.ACTUAL) for run in (released, *tapping))),
+        leaked=max(0.0, *(-r.least_energy_sum(one_dof.AT_SLAVE) for r in (released, *tapping))),
     )
 
 
 def _intended_tap_motion(rate: float, round_trip: float) -> Array:
-    t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
+    t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD_S)) * PERIOD_S - 0.5
     moving = (t > 0.0) & (t < _NUM_TAPS / rate)
     x = np.where(moving, -_TAP_AMPLITUDE_ABOUT_WALL_M * np.sin(2 * np.pi * rate * t), 0.0)
-    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+    return np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
 
 
 def _tap_impulse_share(
     run: one_dof.OneDofRun, scale: float, rate: float, one_way_delay_s: float
 ) -> float:
     first = int(np.argmax(run.wall_force < 0.0))
-    second = first + round(0.75 / rate / PERIOD)  # between first and second contact
+    second = first + round(0.75 / rate / PERIOD_S)  # between first and second contact
     pressed = scale * run.wall_force[second:].sum()
-    felt = run.hand_force[second + round(one_way_delay_s / PERIOD) :].sum()
+    felt = run.hand_force[second + round(one_way_delay_s / PERIOD_S) :].sum()
     return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0
 
 
@@ -319,7 +319,7 @@ def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
-        row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.ACTUAL))
+        row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.AT_SLAVE))
         row["damping_Ns_per_m"] = one_dof.covering_damping(model, round_trip)
         rows.append(row)
         progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))

@@ -30,13 +30,13 @@ from drake_teleop.station.passivity.memory import STORED_ENERGY
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
-PERIOD = 1e-3  #: period of the channel [s]
+PERIOD_S = 1e-3  #: period of the channel [s]
 _SUBSTEPS_PER_CHANNEL_PERIOD = 20
 # Speeds that regularise the Coulomb friction.
 _DEVICE_FRICTION_SPEED_M_S, _SLAVE_FRICTION_SPEED_M_S = 5e-3, 1e-3
-HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
+AT_HAND, AT_COMMAND, AT_MOTOR, AT_SLAVE = range(4)  #: places of the energy balances
 
-_RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
+_RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD_S, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
 TAP_RATES_HZ = (1.0, 1.5)  #: Hz
 WRIST_TO_TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
@@ -100,13 +100,13 @@ class OneDofRun:
     """Time series (N,) of a run.
 
     `accounts` (N, 4) is the energy [J] that entered the station so far at four places, at the
-    master's scale. In a passive station, HAND plus any other place never falls below
+    master's scale. In a passive station, AT_HAND plus any other place never falls below
     -start_energy::
 
-        HAND      -sum f_(k-1) (x_k - x_(k-1))   held force
-        COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port
-        MOTOR     -integral k_f gamma f_m dx_s   servo's force
-        ACTUAL     integral k_f gamma f_w dx_s   wall's force
+        AT_HAND     -sum f_(k-1) (x_k - x_(k-1))   held force
+        AT_COMMAND   sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port
+        AT_MOTOR    -integral k_f gamma f_m dx_s   servo's force
+        AT_SLAVE   integral k_f gamma f_w dx_s   wall's force
     """
 
     t: Array  #: s
@@ -121,12 +121,12 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
-        """Return the least sum over time of start energy and `accounts` at HAND and `place` [J].
+        """Return the least sum over time of start energy and `accounts` at AT_HAND and `place` [J].
 
         A negative sum means that the station is active.
         """
-        other = 0.0 if place == HAND else self.accounts[:, place]
-        return self.start_energy + float(np.nanmin(self.accounts[:, HAND] + other))
+        other = 0.0 if place == AT_HAND else self.accounts[:, place]
+        return self.start_energy + float(np.nanmin(self.accounts[:, AT_HAND] + other))
 
 
 @dataclass(frozen=True)
@@ -184,11 +184,11 @@ def run_one_dof(
     intent = operator_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The channel's command belongs to the next step; here it is used at once.
-    playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
-    forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD, playout=playout)
+    playout = forward.playout + PERIOD_S if forward.playout > 0 else 0.0
+    forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD_S, playout=playout)
     ahead, back = (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
     lines = [
-        network.network_parameters(line, seed, direction, PERIOD, min_steps=1, delays=travels)
+        network.network_parameters(line, seed, direction, PERIOD_S, min_steps=1, delays=travels)
         for line, direction, travels in (
             (forward_line, network.FORWARD, ahead),
             (backward or forward, network.BACKWARD, back),
@@ -214,7 +214,7 @@ def run_one_dof(
         methods.step_addresses(passivity.method), tuple(map(float, numbers)), held, p, *lines,
         *states, ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
-    t = np.arange(len(intent), dtype=np.float64) * PERIOD
+    t = np.arange(len(intent), dtype=np.float64) * PERIOD_S
     master, slave, command, felt, pushed = rows.T[:5]
     rest = rows[:, 5:7], rows[:, 7:9], rows[:, 9:], stored
     return OneDofRun(t, master, slave, command, felt, pushed, *rest)
@@ -222,7 +222,7 @@ def run_one_dof(
 
 def operator_intent(task: Task = Task()) -> Array:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
-    t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
+    t = np.arange(round(task.end / PERIOD_S), dtype=np.float64) * PERIOD_S
     x = np.full_like(t, _REST_POSITION_M)
     fading_out = _smooth_ramp(t, task.swing_end - 0.5, 0.5)
     fade = np.minimum(_smooth_ramp(t, task.swing_start, 0.5), 1 - fading_out)
@@ -230,7 +230,7 @@ def operator_intent(task: Task = Task()) -> Array:
     pressing = _smooth_ramp(t, task.press_start, task.press_end - task.press_start)
     releasing = _smooth_ramp(t, task.release_start, task.release_end - task.release_start)
     x += (_PRESS_DEPTH_M - _REST_POSITION_M) * (pressing - releasing)
-    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+    return np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
 
 
 def _smooth_ramp(t: Array, start: float, length: float) -> Array:
@@ -238,9 +238,9 @@ def _smooth_ramp(t: Array, start: float, length: float) -> Array:
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
-def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
+def measures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
     """Return the measures of a run with the intended motion of `task`."""
-    return figures_of_traces(
+    return measures_of_traces(
         t=run.t,
         master=run.master_position,
         slave=run.slave_position,
@@ -251,7 +251,7 @@ def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMea
     )
 
 
-def figures_of_traces(
+def measures_of_traces(
     *,
     t: Array,
     master: Array,
@@ -312,7 +312,7 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
     closed_loop = 1.0 if model.ideal_servo else K / slave
     # The command's interpolation and the held force add 1.5 periods.
-    delay_factor = np.exp(-s * (round_trip + 1.5 * PERIOD))
+    delay_factor = np.exp(-s * (round_trip + 1.5 * PERIOD_S))
     contact = model.gamma * model.wall_stiffness / s
     inertia = model.sigma * model.tool_mass * s
     displayed = model.force_scale * (contact + inertia) * closed_loop * delay_factor
@@ -352,11 +352,11 @@ def _simulate_steps(
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
-    dt = PERIOD / _SUBSTEPS_PER_CHANNEL_PERIOD
+    dt = PERIOD_S / _SUBSTEPS_PER_CHANNEL_PERIOD
     for k in range(course.shape[0]):
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
-        v_w = (course[following, 5] - x_w) / PERIOD
+        v_w = (course[following, 5] - x_w) / PERIOD_S
         push = _wall_force(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
@@ -365,14 +365,14 @@ def _simulate_steps(
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
         hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
         pose_m[4], pose_s[4] = _quantise(x, master_resolution), _quantise(x_s, slave_resolution)
-        accounts[HAND] -= felt[0] * (x - x_before)
+        accounts[AT_HAND] -= felt[0] * (x - x_before)
         before, x_before = received[4], x
         # A literal False would compile the whole channel once more.
         step_channel(
-            steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout,
+            steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S, timeout,
             frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
-        command, accounts[COMMAND] = received[4], ports[6]
+        command, accounts[AT_COMMAND] = received[4], ports[6]
         copy_into(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
         copy_into(rows[k], 7, ports, 4, 2)
         copy_into(rows[k], 9, accounts, 0, 4)
@@ -387,8 +387,8 @@ def _simulate_steps(
             x_then, v_then = x_s, v_s
             if ideal > 0.0:
                 x_s = before + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * (command - before)
-                v_new = (command - before) / PERIOD
-                a_s, v_s = (v_new - v_s) / PERIOD if i == 0 else a_s, v_new
+                v_new = (command - before) / PERIOD_S
+                a_s, v_s = (v_new - v_s) / PERIOD_S if i == 0 else a_s, v_new
             else:
                 if not held:
                     servo_force = K * (before + share * (command - before) - x_s) - D * v_s
@@ -398,15 +398,15 @@ def _simulate_steps(
                     a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVE_FRICTION_SPEED_M_S)
                 v_s += dt * a_s
                 x_s += dt * v_s
-            beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * PERIOD * v_w)
+            beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * PERIOD_S * v_w)
             push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
             work = -_mean_of_positive_part(push_then, push) * (x_s - x_then)
-            accounts[ACTUAL] += scale * gamma * work
+            accounts[AT_SLAVE] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
             if ideal == 0.0:
                 work = -motor * 0.5 * (v_then + v_s) * dt
-            accounts[MOTOR] += scale * gamma * work
+            accounts[AT_MOTOR] += scale * gamma * work
         if not abs(x) + abs(x_s) < 1e3:
             rows[k + 1 :] = np.nan
             break

@@ -1,7 +1,7 @@
 """The whole station: task (swing, press on a sheet spring, rest), measures and energy balances.
 
 The balances are those of `one_dof.OneDofRun.accounts`, at the master's scale, positive inwards [J],
-by translation and rotation. MOTOR is from the motor torque minus weight, as a wrench at So.
+by translation and rotation. AT_MOTOR is from the motor torque minus weight, as a wrench at So.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.comparison import one_dof
-from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR, RunMeasures, Task
+from drake_teleop.lab.comparison.one_dof import AT_COMMAND, AT_HAND, AT_MOTOR, AT_SLAVE
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.channel.channel import Channel
@@ -38,9 +38,9 @@ _LEAF_SLIP_SPEED_M_S = 1e-3
 LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
-def task_for_round_trip(round_trip: float) -> Task:
+def task_for_round_trip(round_trip: float) -> one_dof.Task:
     """Return the times of the task; longer round trips [s] have longer waits."""
-    return Task(
+    return one_dof.Task(
         swing_start=0.3,
         swing_end=1.8,
         press_start=2.3 + round_trip,
@@ -52,15 +52,15 @@ def task_for_round_trip(round_trip: float) -> Task:
     )
 
 
-def delayed_contact(
+def press_scenario(
     base: Scenario,
     channel: Channel,
     passivity: PassivityConfig,
     leaf: str | float,
     *,
-    task: Task | None = None,
+    task: one_dof.Task | None = None,
     depth: float = _PRESS_DEPTH_M,
-) -> tuple[Scenario, Task]:
+) -> tuple[Scenario, one_dof.Task]:
     """Return the scenario with this task and the task's times.
 
     `leaf` is a key of `LEAF_THICKNESSES_M` or a stiffness [N/m]; `depth` [m] is the hand's intended
@@ -110,12 +110,14 @@ def leaf_thickness(stiffness: float) -> float:
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 
-def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
+def measures_of_press(
+    result: SimulationResult, scenario: Scenario, task: one_dof.Task
+) -> one_dof.RunMeasures:
     """Return the measures of a station's run of the task, along z of the world."""
     traces = force_and_energy_traces(result, scenario)
     traces |= {"master": result["pose_command"][:, 6]}
     traces["slave"], traces["turned"] = _slave_height_and_rotation(result, scenario)
-    return one_dof.figures_of_traces(**traces, task=task)
+    return one_dof.measures_of_traces(**traces, task=task)
 
 
 def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
@@ -134,7 +136,7 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
-    accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
+    accounts = station_energies(result, scenario)[:, [AT_HAND, AT_SLAVE]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
         accounts += work_of_displayed_load_wrench(result, scenario)
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
@@ -149,10 +151,10 @@ def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> 
     return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
 
 
-def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energies (N, 4, 2) [J] at `HAND` to `ACTUAL`, for translation and rotation.
+def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
+    """Return the energies (N, 4, 2) [J] at `AT_HAND` to `AT_SLAVE`, for translation and rotation.
 
-    `MOTOR` is NaN if the log is slower than the joint control.
+    `AT_MOTOR` is NaN if the log is slower than the joint control.
     """
     needed = ("ports", "slave_state", "joint_torque")
     if missing := [name for name in needed if name not in result]:
@@ -172,11 +174,11 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     accounts = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
     has_torques = rates.log_hz >= rates.joint_control_hz
-    accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
-    accounts[:, ACTUAL] = power * port_work(contact, poses, "mean")
+    accounts[:, AT_MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
+    accounts[:, AT_SLAVE] = power * port_work(contact, poses, "mean")
     # A row contains the channel's sum of one period ago.
     channel_times = t - 1 / rates.hand_hz
-    for place, first in ((HAND, 0), (COMMAND, 6)):
+    for place, first in ((AT_HAND, 0), (AT_COMMAND, 6)):
         for g in range(2):
             so_far = np.interp(t, channel_times, result["ports"][:, first + g])
             accounts[:, place, g] = so_far - so_far[0]

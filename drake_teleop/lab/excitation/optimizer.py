@@ -43,7 +43,7 @@ class Evaluation:
 
 
 class DesignProblem:
-    """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`.
+    """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.rest_to_rest`.
 
     Args:
         robot: arm, whose home posture is the centre of half of the candidates.
@@ -58,7 +58,7 @@ class DesignProblem:
         self._table, self._limits, self._home = robot.arm.table, robot.limits, robot.home_posture
         free, samples = 2 * (num_harmonics - 1), _SAMPLES_PER_PERIOD_AND_HARMONIC * num_harmonics
         sine, cosine = np.hsplit(np.eye(free), 2)
-        basis = FourierTrajectory.at_rest(np.zeros(free), sine, cosine, 1 / period_s)
+        basis = FourierTrajectory.rest_to_rest(np.zeros(free), sine, cosine, 1 / period_s)
         #: (3, T, free): q, qd, qdd of unit coefficients.
         self._basis = np.stack(basis.evaluate(np.arange(samples) * period_s / samples))
         self._gradients = np.empty((1 + len(limits.LIMIT_NAMES), 3, samples, len(self._home)))
@@ -66,7 +66,7 @@ class DesignProblem:
     def trajectory(self, x: Array) -> FourierTrajectory:
         n = len(self._home)
         sine, cosine = x[n:].reshape(2, n, -1)
-        return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self._period_s)
+        return FourierTrajectory.rest_to_rest(x[:n], sine, cosine, 1 / self._period_s)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
         """Return the unknowns of a random motion, near or far from the home posture."""

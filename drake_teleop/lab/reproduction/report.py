@@ -95,11 +95,11 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
                        s["free_force.half_ratio"], "", 0.48, 0.52),
         _compare_range("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
                        s["free_force.residual_max_N"], "N", 0, 5),
-        _show_unrated("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
+        _row_without_verdict("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
                       s["free_torque.peak_raw_Nm"], "N m"),
         _compare_range("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
                        s["free_torque.half_ratio"], "", 0.48, 0.52),
-        _show_unrated("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
+        _row_without_verdict("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
                       s["free_torque.residual_max_Nm"], "N m"),
         _compare_range("found", "All axes, ideal sensor, true φ: force left", _NOT_REPORTED,
                        s["ideal.residual_max_N"], "N", 0, 1e-9),
@@ -237,7 +237,7 @@ def _compare_yes_no(what: str, paper: str, value: bool, expected: bool) -> Compa
     return Comparison(what, paper, words[bool(value)], "found", words[expected], holds)
 
 
-def _show_unrated(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
+def _row_without_verdict(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
     return Comparison(what, paper, _format_value(value, unit), origin, "", None)
 
 

@@ -19,7 +19,7 @@ from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.comparison import one_dof
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
-from drake_teleop.lab.comparison.whole_station import delayed_contact, figures_of_station_run
+from drake_teleop.lab.comparison.whole_station import measures_of_press, press_scenario
 from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
@@ -71,7 +71,7 @@ REQUIREMENTS_OF_TASK = {
 
 
 @dataclass(frozen=True)
-class StatedSet:
+class OperatingRange:
     """Hands, walls and task for which the settings must hold."""
 
     hands: tuple[str, ...]  #: names of all grips from the softest to the firmest
@@ -101,7 +101,7 @@ class StatedSet:
         return REQUIREMENTS_OF_TASK[self.task]
 
 
-def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
+def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str) -> OperatingRange:
     """Return the set of these grips, walls [kN/m] and this task."""
     _check_names("hands", hands, tuple(GRIP_IMPEDANCES))
     _check_names("task", [task], tuple(REQUIREMENTS_OF_TASK))
@@ -118,7 +118,7 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
     grips = list(GRIP_IMPEDANCES)
     places = list(map(grips.index, hands))
     between = tuple(grips[min(places) : max(places) + 1])
-    return StatedSet(between, (1e3 * min(walls), 1e3 * max(walls)), task)
+    return OperatingRange(between, (1e3 * min(walls), 1e3 * max(walls)), task)
 
 
 def _check_names(where: str, names: Sequence[str], known: tuple[str, ...]) -> None:
@@ -163,14 +163,14 @@ class TunedSettings:
     sigma_inertia: float
     low_pass_hz: float
 
-    def passivity(self, stated: StatedSet) -> PassivityConfig:
+    def passivity(self, stated: OperatingRange) -> PassivityConfig:
         """Return the method's settings; `charged_tdpa` assumes the firmest stated hand."""
         hand = GRIP_IMPEDANCES[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
         return PassivityConfig(method=self.method, charged_tdpa=known)
 
-    def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
+    def apply(self, base: Scenario, stated: OperatingRange) -> Scenario:
         sensor = base.wrist_sensor
         low_pass_hz = sensor.bandwidth_hz if sensor.ideal else self.low_pass_hz
         return replace(
@@ -196,25 +196,25 @@ class StationPressTrial:
 
     user_scenario: Scenario  #: with the user's passivity and scales
     base_scenario: Scenario  #: the same without environment, task and passivity method
-    stated_set: StatedSet
+    operating_range: OperatingRange
     load_estimate: Array  #: (16,) [offsets, phi]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.user_scenario
         if values["method"] != GIVEN_SETTINGS_NAME:
-            scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
+            scenario = settings_from_values(values).apply(self.base_scenario, self.operating_range)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel, passivity = self.base_scenario.channel, scenario.passivity
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         depth = renderable_press_depth(self.base_scenario, grip)
-        setup, _ = delayed_contact(scenario, channel, passivity, wall, task=task, depth=depth)
+        setup, _ = press_scenario(scenario, channel, passivity, wall, task=task, depth=depth)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
             return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
-        found = figures_of_station_run(result, setup, task)
+        found = measures_of_press(result, setup, task)
         hold = task.is_held(result.t)
         scaling = scenario.force_scaling
         gain = scaling.force_scale * scaling.scales().gamma
@@ -240,7 +240,7 @@ class OneAxisGammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners."""
 
     base_scenario: Scenario
-    stated_set: StatedSet
+    operating_range: OperatingRange
     gamma_upper_bounds: dict[float, float]  #: low-pass [Hz] -> largest tried gamma
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
@@ -255,7 +255,7 @@ class OneAxisGammaSearch:
 
         def stability_sign(log_gamma: float) -> float:
             tried, found = dataclasses.replace(settings, gamma=float(np.exp(log_gamma))), []
-            for corner in self.stated_set.corners:
+            for corner in self.operating_range.corners:
                 found.append(self.share_in_one_axis(axis, tried, *corner, seed))
                 if not is_share_accepted(found[-1], MAX_TUNED_FORCE_ERROR):
                     return -1.0
@@ -273,7 +273,7 @@ class OneAxisGammaSearch:
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_TESTED_GAMMAS), dtype=bool)
-        for grip, wall in [*self.stated_set.corners, (self.stated_set.hands[0], 0.0)]:
+        for grip, wall in [*self.operating_range.corners, (self.operating_range.hands[0], 0.0)]:
             grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _TESTED_GAMMAS}
             held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
@@ -290,11 +290,11 @@ class OneAxisGammaSearch:
         ideal = self.base_scenario.wrist_sensor.ideal
         added = 0.0 if ideal else _FILTER_DELAY_TIMES_BANDWIDTH / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
-        passivity, intent = settings.passivity(self.stated_set), one_dof.operator_intent(task)
+        passivity, intent = settings.passivity(self.operating_range), one_dof.operator_intent(task)
         filtered = dataclasses.replace(backward, delay=backward.delay + added)
         run = one_dof.run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
-        found, force = one_dof.figures_of_run(run, model, task), run.hand_force[task.is_held(run.t)]
-        noise = rms_above_5_hz(force, run.t[1] - run.t[0])
+        found = one_dof.measures_of_run(run, model, task)
+        noise = rms_above_5_hz(run.hand_force[task.is_held(run.t)], run.t[1] - run.t[0])
         return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 
 

@@ -1,6 +1,6 @@
 """`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
 
-The search of settings that hold for all stated hands and walls (`StatedSet`) has three stages:
+The search of settings that hold for all stated hands and walls (`OperatingRange`) has three stages:
 limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
 its softest and stiffest wall and between them, with several seeds.
 """
@@ -79,7 +79,7 @@ def tune(
         DrakeTeleopError: for an invalid set, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
-    out, stated = Path(out), press_trial.make_stated_set(hands, walls, task)
+    out, stated = Path(out), press_trial.make_operating_range(hands, walls, task)
     if not isinstance(scenario, Scenario):
         files.refuse_to_replace_inputs(out / "tuned.yaml", scenario)
     base = press_trial.without_task_and_method(given, network)
@@ -130,7 +130,7 @@ class SearchResult:
 
 def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest force."""
-    base, stated = trial.base_scenario, trial.stated_set
+    base, stated = trial.base_scenario, trial.operating_range
     margin = stated.requirements.loop_gain_margin
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
@@ -191,7 +191,7 @@ def _find_station_gamma(
     inside: list[Row] = []
     while gamma >= smallest:
         rows: list[Row] = []
-        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
+        for seed, (factor, hands, walls) in enumerate(trial.operating_range.tested_parts):
             tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
             rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
@@ -241,10 +241,10 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
 def _add_predicted_threshold(
     row: Row, trial: StationPressTrial, noise_N_by_low_pass_hz: dict[float, float]
 ) -> Row:
-    gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
+    gamma = row["gamma_limit"] / trial.operating_range.requirements.loop_gain_margin
     human = trial.base_scenario.operator.perception
     scale = trial.base_scenario.force_scaling.force_scale
-    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # of the swing, as `delayed_contact`
+    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # of the swing, as `press_scenario`
     rms_load_force = float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
     masked = row["sigma_inertia"] * scale * rms_load_force
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
@@ -265,7 +265,7 @@ def _study_of_settings(
 
 
 def _make_tuning_summary(
-    found: SearchResult, tuned: Scenario, stated: press_trial.StatedSet, network: str | None
+    found: SearchResult, tuned: Scenario, stated: press_trial.OperatingRange, network: str | None
 ) -> dict[str, Any]:
     scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
     failed = [row for row in found.beyond_runs if not meets_requirements(row)]

@@ -51,7 +51,7 @@ def _scales_of_phi(phi: Array) -> Array:
 
 
 def _solve_consistent_fit(H: Array, b: Array) -> Array:
-    program, x, cone, solver = _cone_program(get_ident())
+    program, x, cone, solver = _cone_program_of_thread(get_ident())
     cone.UpdateCoefficients(*_distance_cone_coefficients(H, b))
     result = solver.Solve(program)
     if not result.is_success():
@@ -65,7 +65,7 @@ def _solve_consistent_fit(H: Array, b: Array) -> Array:
 
 
 @cache
-def _cone_program(thread: int) -> tuple[Any, Any, Any, Any]:
+def _cone_program_of_thread(thread: int) -> tuple[Any, Any, Any, Any]:
     # Imported here because the rest of the package starts ten times faster without Drake.
     from pydrake.solvers import ClarabelSolver, MathematicalProgram
 

@@ -74,10 +74,10 @@ def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorF
 
 
 def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_total(record, replace(options, noise=NoiseStd(options.noise.wrench)))
+    return _fit_total_least_squares(record, replace(options, noise=NoiseStd(options.noise.wrench)))
 
 
-def _fit_total(
+def _fit_total_least_squares(
     record: SampleRecord, options: EstimatorOptions, moments: SecondMoments | None = None
 ) -> EstimatorFit:
     moments = moments or record.moments
@@ -112,7 +112,7 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
 
 
 def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    whole = _fit_total(record, options)
+    whole = _fit_total_least_squares(record, options)
     n = len(record.s)
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
@@ -127,7 +127,7 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
             return replace(whole, note=_NOTHING_REJECTED_NOTE)
-        fit = _fit_total(record, options, moments)
+        fit = _fit_total_least_squares(record, options, moments)
         form = fit.form
         if (rejected == previous).all():
             break
@@ -138,7 +138,7 @@ def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> SolvedNormalE
     moments, weights = record.moments, np.ones(len(record.s))
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
-        form = _fit_total(record, options, moments).form
+        form = _fit_total_least_squares(record, options, moments).form
         distances = _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
         weights = np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
@@ -172,7 +172,7 @@ METHODS = Registry(
         "ordinary": Method("batch least squares", _fit_ordinary),
         "whitened": Method("whitened least squares", _fit_whitened),
         "robust": Method("robust least squares", _fit_robust),
-        "total": Method("total least squares", _fit_total),
+        "total": Method("total least squares", _fit_total_least_squares),
         "consistent": Method("physically consistent least squares", _fit_consistent),
     },
     Method,

@@ -122,7 +122,7 @@ def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
 
 
 @njit(cache=True)
-def update_hysteresis(memory, statistic, enter, leave, hold, widths):
+def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
     """Update the contact flag in the memory after `update_statistics`, and return it.
 
     Contact begins at `enter`, ends at `leave`; `widths` are `NoiseFloor.sum_widths`.
@@ -147,11 +147,11 @@ def update_contact_flag(memory, contact, s, omega, alpha, acceleration, paramete
     slack, following, statistic, enter, leave, hold = decision
     sample = contact, s, omega, alpha, acceleration
     update_statistics(memory, *sample, parameters, slack, following, leave)
-    return update_hysteresis(memory, statistic, enter, leave, hold, parameters[5])
+    return update_flag_with_hysteresis(memory, statistic, enter, leave, hold, parameters[5])
 
 
 @njit(cache=True)
-def _process_rows(memory, rows, settings, statistics, flags):
+def _detect_contact_in_rows(memory, rows, settings, statistics, flags):
     contact, s, omega, alpha, acceleration = rows
     for k in range(contact.shape[0]):
         sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
@@ -172,7 +172,7 @@ def _statistics_and_flags(
 ) -> tuple[Array, NDArray[np.bool_]]:
     rows = validate_detector_samples(*samples)
     statistics, flags = np.empty((len(rows[0]), 3)), np.empty(len(rows[0]), np.bool_)
-    _process_rows(memory, tuple(rows), settings, statistics, flags)
+    _detect_contact_in_rows(memory, tuple(rows), settings, statistics, flags)
     return statistics, flags
 
 

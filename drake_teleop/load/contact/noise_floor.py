@@ -27,7 +27,7 @@ NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
-THRESHOLD_OVER_MAX = 1.25
+THRESHOLD_MARGIN = 1.25
 """Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
 less often than that value, which is reached about once in a record of the same length."""
 
@@ -100,7 +100,7 @@ class NoiseFloor:
             if is_wrong:
                 raise DrakeTeleopError(what, where=where, remedy="call fit_noise_floor")
 
-    def threshold(self, statistic: str, margin: float = THRESHOLD_OVER_MAX) -> float:
+    def threshold(self, statistic: str, margin: float = THRESHOLD_MARGIN) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
         maxima = positive_array("free_maxima", self.free_maxima, 3)
         return margin * float(maxima[statistic_index(statistic)])

@@ -335,7 +335,7 @@ def current_change_state(memory):
 
 
 @njit(cache=True)
-def new_load_age(memory):
+def new_load_age_in_samples(memory):
     """Return the number of samples since the estimate of a new load started."""
     return memory[_SAMPLE_COUNT_INDEX] - memory[_NEW_LOAD_START_INDEX]
 

@@ -21,7 +21,7 @@ LOAD_STATE_NAMES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning": the load is not identified yet."""
 STATE_LEARNING, STATE_SETTLED, STATE_DISTURBED, STATE_OTHER_LOAD = range(4)
 
-LOAD_FADE_TIME_S, MIN_OFFSET_REST_S, OFFSET_TRACKING_S, MIN_EXPLAINED_CHANGE_S = 0.1, 0.3, 3.0, 0.1
+LOAD_FADE_TIME_S, MIN_REST_TIME_S, OFFSET_TIME_CONSTANT_S, MIN_CHANGE_TIME_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
 MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
@@ -66,7 +66,7 @@ def _update_and_test_rest(memory, sample, period):
         memory[_REST_SAMPLES_INDEX] = 0.0
         copy_into(memory, _REST_FORCE_START, memory, _SPECIFIC_FORCE_START, 3)
     memory[_REST_SAMPLES_INDEX] += 1.0
-    return memory[_REST_SAMPLES_INDEX] * period > MIN_OFFSET_REST_S
+    return memory[_REST_SAMPLES_INDEX] * period > MIN_REST_TIME_S
 
 
 @njit(cache=True)
@@ -84,7 +84,7 @@ def _update_and_test_force_change(memory, residual, age, period):
     copy_into(highest, 0, np.maximum(highest, low_passed), 0, 3)
     differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
     memory[_CHANGED_SAMPLES_INDEX] = memory[_CHANGED_SAMPLES_INDEX] + 1.0 if differs else 0.0
-    return memory[_CHANGED_SAMPLES_INDEX] * period > MIN_EXPLAINED_CHANGE_S
+    return memory[_CHANGED_SAMPLES_INDEX] * period > MIN_CHANGE_TIME_S
 
 
 @njit(cache=True)
@@ -108,14 +108,14 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
     at_rest = _update_and_test_rest(memory, sample, period)
-    verdict, age = change.current_change_state(watch), change.new_load_age(watch)
+    verdict, age = change.current_change_state(watch), change.new_load_age_in_samples(watch)
     force_changed = _update_and_test_force_change(memory, residual, age, period)
     if verdict == change.STATE_KNOWN:
         memory[STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
         if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
-                known[i] += period / OFFSET_TRACKING_S * residual[i]
+                known[i] += period / OFFSET_TIME_CONSTANT_S * residual[i]
     elif memory[STATE_INDEX] != STATE_OTHER_LOAD:
         near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD])
         other = verdict == change.STATE_CHANGED and force_changed and near

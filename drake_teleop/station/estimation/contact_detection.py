@@ -14,7 +14,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load import regressor
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import CONTACT_INDEX, ContactDetector, update_contact_flag
-from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_OVER_MAX, NoiseFloor
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_MARGIN, NoiseFloor
 from drake_teleop.station.slave.arm import ArmModel, acceleration_from_specific_force_into
 
 
@@ -25,7 +25,7 @@ class ContactDetectionConfig:
 
     statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
     margin: float = quantity(
-        THRESHOLD_OVER_MAX, "1", 1.0, 10.0, "threshold over the largest value during identification"
+        THRESHOLD_MARGIN, "1", 1.0, 10.0, "threshold over the largest value during identification"
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
     drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the offset in free motion")

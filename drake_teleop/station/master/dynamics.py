@@ -150,6 +150,6 @@ class HapticDevice:
         With `include_coulomb_slope`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
-            slope = self.parameters.dry_friction / phantom.FRICTION_TANH_RAD_S
+            slope = self.parameters.dry_friction / phantom.FRICTION_TANH_SPEED_RAD_S
             return np.diag(include_coulomb_slope * slope + self.parameters.damping)
         return task_space.damping_matrix(q, self.parameters, include_coulomb_slope)

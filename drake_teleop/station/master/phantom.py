@@ -51,8 +51,8 @@ PEAK_WRIST_TORQUES_N_M = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5,
 #: Posture with R_BE = identity, in the middle of the workspace.
 HOME_POSTURE_RAD = np.zeros(6)
 
-# Coulomb friction is proportional to tanh(velocity / FRICTION_TANH_RAD_S): a slower device creeps.
-FRICTION_TANH_RAD_S = 0.01  # rad/s, estimate
+# Coulomb friction is proportional to tanh(velocity / this): a slower device creeps.
+FRICTION_TANH_SPEED_RAD_S = 0.01  # rad/s, estimate
 # End stops of main axes and wrist: spring [N m/rad] and damper [N m s/rad] that never pull,
 # estimate: 7 kN/m at the tip.
 _STOP_STIFFNESSES, _STOP_DAMPINGS = np.repeat([300.0, 5.0], 3), np.repeat([1.5, 0.01], 3)
@@ -61,8 +61,8 @@ _STOP_STIFFNESSES, _STOP_DAMPINGS = np.repeat([300.0, 5.0], 3), np.repeat([1.5, 
 _LINK_1_INERTIA = L1**2 * (MASS_A + MASS_C / 4)
 _LINK_2_INERTIA, _LINK_3_INERTIA = L2**2 * MASS_A / 4, L3**2 * MASS_C
 # M11 = _M11_CONSTANT + _M11_COS2Q2 cos 2 q2 + _M11_COS2Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
-_bodies = sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
-_constant_terms = _bodies + _LINK_1_INERTIA + _LINK_2_INERTIA + _LINK_3_INERTIA
+_inertia_sum = sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
+_constant_terms = _inertia_sum + _LINK_1_INERTIA + _LINK_2_INERTIA + _LINK_3_INERTIA
 _M11_CONSTANT = INERTIA_BASE_YY + 0.5 * _constant_terms
 _cosine_terms = INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + _LINK_1_INERTIA
 _M11_COS2Q2 = 0.5 * _cosine_terms
@@ -174,7 +174,7 @@ def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
 @njit(cache=True)
 def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
-        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_TANH_RAD_S) + viscous[i] * v[i]
+        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_TANH_SPEED_RAD_S) + viscous[i] * v[i]
         limits = JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i]
         torque[i] += end_stop_force(q[i], v[i], *limits, _STOP_STIFFNESSES[i], _STOP_DAMPINGS[i])
     stop = _STOP_STIFFNESSES[0], _STOP_DAMPINGS[0]

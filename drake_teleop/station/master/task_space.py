@@ -18,8 +18,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross, plus, quaternion_product, scale_vector
 from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 
-# Coulomb friction is proportional to tanh(speed / FRICTION_TANH_M_S): a slower device creeps.
-FRICTION_TANH_M_S, FRICTION_TANH_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
+# Coulomb friction is proportional to tanh(speed / FRICTION_TANH_SPEED_M_S): a slower device creeps.
+FRICTION_TANH_SPEED_M_S, FRICTION_TANH_SPEED_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
 # End stops: spring and damper that never pull, estimate.
 _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M = 5000.0, 20.0  # N/m, N s/m
 _STOP_STIFFNESS_N_M_RAD, _STOP_DAMPING_N_M_S_RAD = 5.0, 0.01  # N m/rad, N m s/rad
@@ -60,7 +60,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     jacobian_into(q, J)
     mass = device.mass + device.hand_mass
     drag = _friction_force_per_speed(
-        v[:3], device.dry_friction[0], device.damping[0], FRICTION_TANH_M_S
+        v[:3], device.dry_friction[0], device.damping[0], FRICTION_TANH_SPEED_M_S
     )
     for i in range(3):
         x, half = q[i] - device.workspace_centre[i], device.half_workspace[i]
@@ -75,7 +75,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
     drag = _friction_force_per_speed(
-        omega, device.dry_friction[3], device.damping[3], FRICTION_TANH_RAD_S
+        omega, device.dry_friction[3], device.damping[3], FRICTION_TANH_SPEED_RAD_S
     )
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)
@@ -109,7 +109,7 @@ def pose_into(q, pose):
 def damping_matrix(q: Array, device: DeviceParameters, include_coulomb_slope: bool) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
-    of_tanh = np.array([FRICTION_TANH_M_S, FRICTION_TANH_RAD_S])
+    of_tanh = np.array([FRICTION_TANH_SPEED_M_S, FRICTION_TANH_SPEED_RAD_S])
     drag = device.damping[[0, 3]] + include_coulomb_slope * device.dry_friction[[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 

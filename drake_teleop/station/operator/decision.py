@@ -19,7 +19,7 @@ from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.vectors import apply_matrix, dot, matrix_as_tuple, transposed
 from drake_teleop.station.operator import task as tasks
 from drake_teleop.station.operator.minimum_jerk import (
-    PLAN,
+    PLAN_SLICE,
     STOP_DURATION_S,
     evaluate_plan,
     plan_move,
@@ -115,7 +115,7 @@ search for the slot; finished or given up."""
 # searches; plan.
 _STEP_COUNT, _NEXT_MOVE_TIME, _CRITERION_MET_SINCE, _ASSUMED_CONTACT_STIFFNESS = range(4)
 _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
-MEMORY_SIZE = PLAN.stop
+MEMORY_SIZE = PLAN_SLICE.stop
 
 _EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
 _MOVE_END_TO_EFFECT_S = 0.05  # s, without network and perception, estimate
@@ -138,16 +138,16 @@ def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
     memory[_CRITERION_MET_SINCE] = -1.0
     memory[_ASSUMED_CONTACT_STIFFNESS] = _INITIAL_ASSUMED_STIFFNESS
-    memory[PLAN.start + 1] = 1.0
+    memory[PLAN_SLICE.start + 1] = 1.0
     return memory
 
 
 @njit(cache=True)
-def _hand_motion(person, vector_W):
+def _to_hand_motion(person, tool_motion_W):
     motion = np.zeros(3)
     for i in range(3):
         for k in range(3):
-            motion[i] += person.R_WB[k, i] * vector_W[k] / person.translation_scale
+            motion[i] += person.R_WB[k, i] * tool_motion_W[k] / person.translation_scale
     return motion
 
 
@@ -169,7 +169,7 @@ def observe_tool_into(person, step, displacement_W, seen_W):
 
 @njit(cache=True)
 def _plan_submovement(person, memory, step, time, error_W):
-    change = _hand_motion(person, error_W)
+    change = _to_hand_motion(person, error_W)
     length = math.sqrt(dot(change, change))
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person.acceleration)
@@ -301,9 +301,9 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
-        speed, change = _hand_motion(person, speed_W * task.approach_axis), np.empty(3)
+        speed, change = _to_hand_motion(person, speed_W * task.approach_axis), np.empty(3)
         for i in range(3):
-            now = evaluate_plan(memory[PLAN], time, i)[1]
+            now = evaluate_plan(memory[PLAN_SLICE], time, i)[1]
             change[i] = 0.5 * _APPROACH_UPDATE_S * (now + speed[i])
         plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
         memory[_NEXT_MOVE_TIME] = time + _APPROACH_UPDATE_S

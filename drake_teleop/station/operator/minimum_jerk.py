@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 
-PLAN = slice(7, 27)  #: place of the plan in the operator's memory
+PLAN_SLICE = slice(7, 27)  #: place of the plan in the operator's memory
 STOP_DURATION_S = 0.15  # s, stopping time of the hand, estimate
 
 
@@ -33,7 +33,7 @@ def evaluate_plan(plan, time, i):
 def add_planned_motion_into(memory, time, pose, twist):
     """Add the plan's displacement and velocity at `time` [s] to a pose (7,) and twist (6,)."""
     for i in range(3):
-        x, v, _ = evaluate_plan(memory[PLAN], time, i)
+        x, v, _ = evaluate_plan(memory[PLAN_SLICE], time, i)
         pose[4 + i] += x
         twist[i] += v
 
@@ -45,7 +45,7 @@ def plan_move(memory, time, duration, change, end_speed):
     It continues the present motion and ends with the velocity `end_speed` (3,), without
     acceleration.
     """
-    plan, h = memory[PLAN], duration
+    plan, h = memory[PLAN_SLICE], duration
     for i in range(3):
         x, v, a = evaluate_plan(plan, time, i)
         v, a, w, d = v * h, a * h * h, end_speed[i] * h, change[i]
@@ -62,5 +62,5 @@ def plan_stop(memory, time):
     """Plan a stop of the hand within `STOP_DURATION_S`."""
     change = np.empty(3)
     for i in range(3):
-        change[i] = 0.5 * STOP_DURATION_S * evaluate_plan(memory[PLAN], time, i)[1]
+        change[i] = 0.5 * STOP_DURATION_S * evaluate_plan(memory[PLAN_SLICE], time, i)[1]
     plan_move(memory, time, STOP_DURATION_S, change, np.zeros(3))

@@ -29,7 +29,7 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.load import regressor
 from drake_teleop.station.sensor.sensor_chain import (
-    LOST_READING_FLAG_SAMPLES,
+    NUM_FLAGGED_SAMPLES_AFTER_LOSS,
     READ_ANGLES,
     READ_SATURATED,
     WristSensorConfig,
@@ -47,7 +47,7 @@ from drake_teleop.station.slave import arm as serial_arm
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
 #: gains depend on its square root at most.
-_SENSOR_RMS_LEVER_M_PER_RAD = 0.4
+_RMS_SENSOR_DISPLACEMENT_M_PER_RAD = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
 _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
@@ -148,7 +148,7 @@ def fusion_gains(
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std = _sensor_rotation_std_by_encoders(sensor, num_joints)
-    linear_std = angle_std * _SENSOR_RMS_LEVER_M_PER_RAD
+    linear_std = angle_std * _RMS_SENSOR_DISPLACEMENT_M_PER_RAD
     drifts = config.angular_acceleration_drift, config.acceleration_drift
     angular = steady_state_kalman_gains(angle_std, alpha_std.mean(), drifts[0], period)
     return angular, steady_state_kalman_gains(linear_std, s_std.mean(), drifts[1], period)
@@ -171,7 +171,7 @@ def estimated_motion_std(
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
     alpha = _sensor_rotation_std_by_encoders(sensor, num_joints) * np.sqrt(power)
-    return np.repeat([alpha * _SENSOR_RMS_LEVER_M_PER_RAD, 0.0, alpha], 3)
+    return np.repeat([alpha * _RMS_SENSOR_DISPLACEMENT_M_PER_RAD, 0.0, alpha], 3)
 
 
 def _sensor_rotation_std_by_encoders(sensor: WristSensorConfig, num_joints: int) -> float:
@@ -265,7 +265,7 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX
     if not are_values_plausible(chain, truth):  # keeps it out of the filters
-        sample[flag] = regressor.LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        sample[flag] = regressor.LOST_SAMPLE_FLAG + NUM_FLAGGED_SAMPLES_AFTER_LOSS
         return
     lost = sample[flag] - 1.0
     if ideal:

@@ -62,7 +62,7 @@ _PLANT_PORT_TYPES |= {"reaction_forces": SpatialForce}
 # Configuration: R_WB (9), angular velocity of B in W (3), joint positions.
 _BODY_ROTATION_AND_RATE_SIZE = 12
 # Groups of the discrete state: held configuration; sample; sensor chain and motion estimator.
-_HELD_GROUP, _SAMPLE_GROUP, _FILTER_GROUPS = 0, 1, (2, 3)
+_POSTURE_GROUP_INDEX, _SAMPLE_GROUP_INDEX, _FILTER_GROUP_INDICES = 0, 1, (2, 3)
 
 
 def AddWristSensor(
@@ -186,11 +186,11 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         """Sampling period [s]."""
         return self._step_s * self._steps_per_sample
 
-    def _declare_output(self, name: str, places: NDArray[np.intp]) -> None:
+    def _declare_output(self, name: str, indices: NDArray[np.intp]) -> None:
         def calc_part_of_sample(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(context.get_discrete_state(_SAMPLE_GROUP).value()[places])
+            output.SetFromVector(context.get_discrete_state(_SAMPLE_GROUP_INDEX).value()[indices])
 
-        self.DeclareVectorOutputPort(name, len(places), calc_part_of_sample, {self.xd_ticket()})
+        self.DeclareVectorOutputPort(name, len(indices), calc_part_of_sample, {self.xd_ticket()})
 
     def _rotation_rate_and_joints(self, context: Context) -> Array:
         _, body, _ = self._weld
@@ -201,11 +201,11 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
     def _store_rotation_rate_and_joints(
         self, context: Context, discrete_state: DiscreteValues
     ) -> None:
-        discrete_state.set_value(_HELD_GROUP, self._rotation_rate_and_joints(context))
+        discrete_state.set_value(_POSTURE_GROUP_INDEX, self._rotation_rate_and_joints(context))
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
-        configuration = discrete_state.value(_HELD_GROUP).copy()
+        configuration = discrete_state.value(_POSTURE_GROUP_INDEX).copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
             self._store_rotation_rate_and_joints(context, discrete_state)
@@ -219,8 +219,8 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
         truth = np.empty(TRUE_JOINT_ANGLES.start + 3 + self._n)
         _true_values_into(geometry, configuration, acceleration, force, truth)
-        sample = discrete_state.get_mutable_value(_SAMPLE_GROUP)
-        filters = (discrete_state.get_mutable_value(group) for group in _FILTER_GROUPS)
+        sample = discrete_state.get_mutable_value(_SAMPLE_GROUP_INDEX)
+        filters = (discrete_state.get_mutable_value(group) for group in _FILTER_GROUP_INDICES)
         measure_sample_into(self._sensor, self._no_arm, noise, truth, *filters, sample[:-1])
         sample[-1] = context.get_time()
 

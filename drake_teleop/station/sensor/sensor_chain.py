@@ -47,7 +47,7 @@ _NUM_CHANNELS = 12
 NOISE_BLOCK_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
 
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
-LOST_READING_FLAG_SAMPLES = 40
+NUM_FLAGGED_SAMPLES_AFTER_LOSS = 40
 
 #: Keys of `drake_teleop.station.sensor.presets.PRESETS`.
 PRESET_NAMES = (
@@ -129,11 +129,11 @@ class WristSensorConfig:
 
     def noise_std(self) -> Array:
         """Return the standard deviations (12,) of white noise in raw samples, in SI units."""
-        return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
+        return np.repeat([getattr(self, name) for name in SENSOR_PARTS["noise"]], 3)
 
     def random_walk(self) -> Array:
         """Return the standard deviations (12,) of the random walks after 1 s, in SI units."""
-        return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
+        return np.repeat([getattr(self, name) for name in SENSOR_PARTS["random_walk"]], 3)
 
     def ranges(self) -> Array:
         """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
@@ -201,7 +201,7 @@ _CALIBRATION_FIELDS = (
 )
 _NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
-PARTS: dict[str, dict[str, Any]] = {
+SENSOR_PARTS: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
     "place": {"p_SoAo_S": [0.0] * 3, "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
     "low_pass": {"low_pass": "none"},
@@ -216,12 +216,12 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
-    """Return a copy of the configuration without some parts of the sensor (keys of `PARTS`).
+    """Return a copy of the configuration without some parts of the sensor (keys of `SENSOR_PARTS`).
 
     >>> without_parts(WristSensorConfig(), "noise", "offset").force_noise
     0.0
     """
-    changes = {name: value for part in parts for name, value in PARTS[part].items()}
+    changes = {name: value for part in parts for name, value in SENSOR_PARTS[part].items()}
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 

@@ -64,7 +64,7 @@ _EQUAL_TIME_TOLERANCE_PERIODS, _MAX_QUEUED_PLANT_STEPS = 1e-6, 16
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
 #: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
-_USE_COMPILED_CONTACT = np.zeros(0)
+_NO_DRAKE_CONTACT_WRENCH = np.zeros(0)
 
 
 @njit(cache=True)
@@ -119,28 +119,28 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 
 @njit(cache=True)
-def append_step_to_queue(tail, time, state, surroundings):
-    """Append time and state of a step's end to the queue `tail`, see `take_due_samples`."""
+def append_step_to_queue(queue, time, state, surroundings):
+    """Append time and state of a step's end to the queue, `tail` of `take_due_samples`."""
     width = state.shape[0] + 1 + surroundings.shape[0]
-    entry = tail[2 + int(tail[1]) * width :][:width]
+    entry = queue[2 + int(queue[1]) * width :][:width]
     entry[0] = time
     assemble_plant_state(state, surroundings, entry[1:])
-    tail[1] += 1.0
+    queue[1] += 1.0
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _try_queue_step(memory, tail, longest, time, state, surroundings):
-    if memory[tail + 1] >= longest:
+def _try_queue_step(memory, queue_start, max_steps, time, state, surroundings):
+    if memory[queue_start + 1] >= max_steps:
         return False
-    append_step_to_queue(memory[tail:], time, state, surroundings)
+    append_step_to_queue(memory[queue_start:], time, state, surroundings)
     return True
 
 
 @njit(cache=True)
-def _extrapolate_torque_into(held, after, torque):
-    copy_into(torque, 0, held[0], 0, torque.shape[0])
-    for i in range(held[1].shape[0]):
-        torque[i] += after * held[1][i]
+def _extrapolate_torque_into(torque_and_rate, elapsed_s, torque):
+    copy_into(torque, 0, torque_and_rate[0], 0, torque.shape[0])
+    for i in range(torque_and_rate[1].shape[0]):
+        torque[i] += elapsed_s * torque_and_rate[1][i]
 
 
 @njit(cache=True, omits_reference_counting=True)
@@ -387,7 +387,7 @@ class WristSensor(LeafSystem):
 
     def _take_samples(self, context: Context, until_now: bool, result: Array) -> None:
         seen = self._states_of_arm_and_environment(context)
-        near, touching_W = self._tool_proximity(*seen), _USE_COMPILED_CONTACT
+        near, touching_W = self._tool_proximity(*seen), _NO_DRAKE_CONTACT_WRENCH
         if until_now and near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
         elif until_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
