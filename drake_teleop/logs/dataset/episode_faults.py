@@ -20,6 +20,8 @@ _MIN_WRENCH_ROTATION_DEG, _MIN_UNUSUAL_LAG_FRAMES, _MIN_SATURATED_FRAMES = 4.0, 
 
 
 class EpisodeFault(NamedTuple):
+    """Named fault with its description and figures."""
+
     name: str
     message: str
     value: Any
