@@ -106,5 +106,5 @@ def _limit_norm(a: Array, longest: float) -> Array:
     return a if length <= longest else longest / length * a
 
 
-def _limit_slew(last: Array, wanted: Array, max_change: float) -> Array:
-    return last + _limit_norm(wanted - last, max_change)
+def _limit_slew(last: Array, requested: Array, max_change: float) -> Array:
+    return last + _limit_norm(requested - last, max_change)

@@ -35,7 +35,7 @@ _GRIP_CHANGE_POLE_RAD_S = _ROTATION_POLE_RAD_S = 2 * math.pi * 5.0
 TARGET_LEAD_TIME_S = 2.5 / _TRANSLATION_POLE_RAD_S
 # Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
 # target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
-_HELD_INDEX, _START_TIME_INDEX, _POLE_INDEX, _TARGET_POSE_INDEX, _PATH_SIZE = 0, 1, 2, 3, 25
+_IS_HELD_INDEX, _START_TIME_INDEX, _POLE_INDEX, _TARGET_POSE_INDEX, _PATH_SIZE = 0, 1, 2, 3, 25
 _OFFSET_INDEX, _VELOCITY_INDEX, _ACCELERATION_INDEX = 10, 13, 16
 _ROTATION_INDEX, _RATE_INDEX = 19, 22
 _INTENDED_MOTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
@@ -54,7 +54,7 @@ _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 @njit(cache=True)
 def _intended_motion_into(path, time, pose, out):
     """Write intended X_BE (7,), twist (6,), acceleration (3,) of a smooth path to the target."""
-    if path[_HELD_INDEX] < 0.5:
+    if path[_IS_HELD_INDEX] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
         return
@@ -110,17 +110,17 @@ def _rotation_vector_rate(r, omega):
 
 
 @njit(cache=True)
-def _start_path_into(path, time, now, target, poles):
-    path[_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, poles
+def _start_path_into(path, time, motion, target, poles):
+    path[_IS_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, poles
     vectors.copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
     rotation = vectors.quaternion_logarithm(
-        vectors.quaternion_product(now, vectors.conjugate_quaternion(target))
+        vectors.quaternion_product(motion, vectors.conjugate_quaternion(target))
     )
-    rate = _rotation_vector_rate(rotation, vectors.vector_at(now, 10))
-    vectors.copy_into(path, _VELOCITY_INDEX, now, 7, 3)
-    vectors.copy_into(path, _ACCELERATION_INDEX, now, 13, 3)
+    rate = _rotation_vector_rate(rotation, vectors.vector_at(motion, 10))
+    vectors.copy_into(path, _VELOCITY_INDEX, motion, 7, 3)
+    vectors.copy_into(path, _ACCELERATION_INDEX, motion, 13, 3)
     for k in range(3):
-        path[_OFFSET_INDEX + k] = now[4 + k] - target[4 + k]
+        path[_OFFSET_INDEX + k] = motion[4 + k] - target[4 + k]
         path[_ROTATION_INDEX + k], path[_RATE_INDEX + k] = rotation[k], rate[k]
 
 
@@ -154,7 +154,7 @@ class LiveHand(operator.Operator):
 
     def _declare_intended_motion_inputs(self) -> set[framework.DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
-        path[_HELD_INDEX], path[_POLE_INDEX] = 1.0, _TRANSLATION_POLE_RAD_S
+        path[_IS_HELD_INDEX], path[_POLE_INDEX] = 1.0, _TRANSLATION_POLE_RAD_S
         path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = self._intent[1]
         self._path = self.DeclareNumericParameter(BasicVector(path))
         return {self.all_parameters_ticket(), self._pose.ticket()}
@@ -163,8 +163,8 @@ class LiveHand(operator.Operator):
         """Start a smooth path to the pose X_BE `target` (7,); None: the hand lets go."""
         path = np.zeros(_PATH_SIZE)
         if target is not None:
-            now = self._current_motion(context)
-            _start_path_into(path, context.get_time(), now, target, _TRANSLATION_POLE_RAD_S)
+            motion = self._current_motion(context)
+            _start_path_into(path, context.get_time(), motion, target, _TRANSLATION_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def KeepWrench(
@@ -172,7 +172,7 @@ class LiveHand(operator.Operator):
     ) -> None:
         """Shift the intended motion so that the new impedance causes no step of the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
-        if path[_HELD_INDEX] < 0.5:
+        if path[_IS_HELD_INDEX] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._current_motion(context)
@@ -235,25 +235,25 @@ def _pose_and_twist_on_path_into(path, time, out):
 
 
 @njit(cache=True)
-def _update_displayed_wrench(wrench, held, period, limits, last, now):
+def _update_displayed_wrench(wrench, is_device_held, period, limits, last_state, state):
     fault = 0.0
     if not are_finite_and_in_range(wrench):
         fault = _WRENCH_FAULT_NUMBER
-    enabled = held and fault == 0.0
+    enabled = is_device_held and fault == 0.0
     change = _LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S
-    allowed = min(max(last[_ALLOWED_SHARE_INDEX] + period * change, 0.0), 1.0)
+    allowed = min(max(last_state[_ALLOWED_SHARE_INDEX] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
     if enabled:
         target[:] = wrench
     for g in range(2):
         limit_group(target, g, allowed * limits[g])
     for i in range(6):
-        step[i] = target[i] - last[i]
+        step[i] = target[i] - last_state[i]
     for g in range(2):
         limit_group(step, g, _RELATIVE_WRENCH_SLEW_PER_S * period * limits[g])
     for i in range(6):
-        now[i] = last[i] + step[i]
-    now[_FAULT_INDEX], now[_ALLOWED_SHARE_INDEX] = fault, allowed
+        state[i] = last_state[i] + step[i]
+    state[_FAULT_INDEX], state[_ALLOWED_SHARE_INDEX] = fault, allowed
 
 
 def _copy_state(part: slice, sign: float = 1.0) -> Callable[[Context, BasicVector], None]:
@@ -340,10 +340,10 @@ class ExternalMaster(framework.LeafSystem):
         output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])
 
     def _update_display(self, context: Context, discrete_state: framework.DiscreteValues) -> None:
-        held = context.get_numeric_parameter(self._path).value()[_HELD_INDEX] > 0.5
-        last, now = context.get_discrete_state_vector().value(), discrete_state.get_mutable_value(0)
+        held = context.get_numeric_parameter(self._path).value()[_IS_HELD_INDEX] > 0.5
+        last, new = context.get_discrete_state_vector().value(), discrete_state.get_mutable_value(0)
         wrench = self._command.Eval(context)
-        _update_displayed_wrench(wrench, held, self._period, self._limits, last, now)
+        _update_displayed_wrench(wrench, held, self._period, self._limits, last, new)
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:

@@ -113,13 +113,13 @@ def _payload_phi(scenario: Scenario) -> Array:
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
-def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the estimate (16,) of `load` for `before`, adapted to payload, sensor of `now`."""
+def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenario) -> Array | None:
+    """Return the estimate (16,) of `load` for `before`, adapted to payload, sensor of `after`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
-    estimate[:6] += _wrist_sensor_offset(now) - _wrist_sensor_offset(before)
-    arms = (NominalSlave(scenario.slave).arm for scenario in (now, before))
+    estimate[:6] += _wrist_sensor_offset(after) - _wrist_sensor_offset(before)
+    arms = (NominalSlave(scenario.slave).arm for scenario in (after, before))
     estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
     return estimate
 

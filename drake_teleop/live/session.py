@@ -137,32 +137,32 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def take_over_state(self, other: _Station, new_channel: bool) -> float:
-        """Take over another station's state and fade to this station's force.
+    def take_over_state(self, replaced: _Station, new_channel: bool) -> float:
+        """Take over the replaced station's state and fade to this station's force.
 
         With a new channel, open the clutch and return how long it must stay open [s]; else 0.
         """
         excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
             excluded.add("load_estimator")  # its configured load differs
-        copy_station_state(other.station, other.context, self.station, self.context, excluded)
-        if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
+        copy_station_state(replaced.station, replaced.context, self.station, self.context, excluded)
+        if replaced.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block_and_context("wrist_sensor")
             sensor.reset_queue(context)
         wait_s = channel_fill_time_s(self.scenario) if new_channel else 0.0
         cross_fade, context = self.block_and_context("cross_fade")
-        rendered = other.signal_value("force_to_master")
+        rendered = replaced.signal_value("force_to_master")
         cross_fade.StartFade(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
         if new_channel:
             cross_fade.LimitForce(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
-        impedances = other.scenario.operator.hand, self.scenario.operator.hand
+        impedances = replaced.scenario.operator.hand, self.scenario.operator.hand
         if impedances[0] != impedances[1]:
             hand, context = self.block_and_context("live_hand")
             hand.KeepWrench(context, *impedances)
         if not new_channel:
             return 0.0
-        name = "pose_command" if other.scenario.has_no_network_or_passivity else "pose_received"
-        command = other.signal_value(name)
+        name = "pose_command" if replaced.scenario.has_no_network_or_passivity else "pose_received"
+        command = replaced.signal_value(name)
         scaling, context = self.block_and_context("kinematic_scaling")
         scaling.OpenClutch(context, command)
         if not self.scenario.has_no_network_or_passivity:
@@ -231,9 +231,8 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.take_over_state(
-            self._station, inputs.channel_choices != self.inputs.channel_choices
-        )
+        has_new_channel = inputs.channel_choices != self.inputs.channel_choices
+        wait_s = station.take_over_state(self._station, has_new_channel)
         if wait_s:
             self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:

@@ -45,7 +45,7 @@ _LINK_OFFSETS_M = 0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996
 _LINK_LENGTHS_M = 0.0, -0.425, -0.3922, 0.0, 0.0, 0.0
 _LINK_TWISTS_RAD = np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0
 HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
-_JOINT_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])
+_FOURIER_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])
 _NUM_RECORD_HARMONICS = 6
 TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 """Load phi (10,) of the gripper."""
@@ -164,7 +164,7 @@ def _random_motion(
 ) -> Callable[[Array], _Motion]:
     """Return `sensor_motion` between two rests over times [s]; `scale` is that of joint angles."""
     sine, cosine = (
-        random.normal(size=(2, 6, harmonics - 1)) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
+        random.normal(size=(2, 6, harmonics - 1)) * scale * _FOURIER_AMPLITUDES_RAD[:, np.newaxis]
     )
     path = FourierTrajectory.rest_to_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period_s)
     return lambda t: sensor_motion(*path.evaluate(np.clip(t - rest_s, 0, period_s)))

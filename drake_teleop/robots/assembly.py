@@ -354,7 +354,7 @@ class ReadingAssembler(Source):
         return [each for sample in arrived for each in self.readings_completed_by(sample)]
 
     def readings_completed_by(self, sample: Reading) -> list[Reading]:
-        """Add a wrench or motion; return the readings that became complete."""
+        """Add a wrench or motion; return readings of the wrenches whose motion is complete."""
         if sample.stream == WRENCH:
             self._clocks[0].update(sample.t, sample.arrival)
             self._pending.append(sample)

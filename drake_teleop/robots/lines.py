@@ -32,7 +32,7 @@ _MAX_LINE_BYTES, _READ_BLOCK_BYTES = 4096, 65536
 
 
 def reading_of_json_line(line: bytes, number: int) -> Reading:
-    """Return the reading in a line, flagged as damaged if it is invalid."""
+    """Return the reading in a JSON line; `DAMAGED_READING` if a field is missing or invalid."""
     if len(line) > _MAX_LINE_BYTES:
         return DAMAGED_READING
     try:

@@ -194,9 +194,9 @@ def parse_ros2_address(text: str, allowed: tuple[str, ...]) -> Address:
     return address
 
 
-def message_class(kind: str, where: str) -> Any:
+def message_class(message_type: str, where: str) -> Any:
     """Return the class of a message type such as "sensor_msgs/msg/Imu"."""
-    package, _, name = kind.split("/")
+    package, _, name = message_type.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError:

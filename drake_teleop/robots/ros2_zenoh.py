@@ -68,20 +68,20 @@ def open_session(address: Address) -> Any:
         raise DrakeTeleopError(what, where=address.text, remedy=remedy) from error
 
 
-def topic_key(domain: int, topic: str, kind: str, type_hash: str = "*") -> str:
+def topic_key(domain: int, topic: str, message_type: str, type_hash: str = "*") -> str:
     """Return the zenoh key of a topic, by default for any hash of the type."""
-    return f"{domain}/{topic}/{_dds_type_name(kind)}/{type_hash}"
+    return f"{domain}/{topic}/{_dds_type_name(message_type)}/{type_hash}"
 
 
 def liveliness_tokens(
-    domain: int, session: str, node: str, topic: str, kind: str, type_hash: str
+    domain: int, session: str, node: str, topic: str, message_type: str, type_hash: str
 ) -> list[str]:
     """Return the Zenoh liveliness tokens by which ROS 2 finds a node with one publisher."""
     here = f"@ros2_lv/{domain}/{session}/0"
     name = "%" + topic.replace("/", "%")
     return [
         f"{here}/0/NN/%/%/{node}",
-        f"{here}/1/MP/%/%/{node}/{name}/{_dds_type_name(kind)}/{type_hash}/::,10:,:,:,,",
+        f"{here}/1/MP/%/%/{node}/{name}/{_dds_type_name(message_type)}/{type_hash}/::,10:,:,:,,",
     ]
 
 
@@ -99,8 +99,8 @@ def number_in_attachment(attached: bytes) -> int | None:
     return None
 
 
-def _dds_type_name(kind: str) -> str:
-    package, _, name = kind.split("/")
+def _dds_type_name(message_type: str) -> str:
+    package, _, name = message_type.split("/")
     return f"{package}::msg::dds_::{name}_"
 
 
@@ -201,12 +201,12 @@ class ZenohSink:
 
     def wrench_message(self, wrench: Array, ns: int) -> bytes:
         """Return a WrenchStamped in CDR; `wrench` (6,) [N, N m], `ns`: its time stamp [ns]."""
-        kinds = self._types.types
-        vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
-        header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)
+        types = self._types.types
+        vector, stamp = types["geometry_msgs/msg/Vector3"], types["builtin_interfaces/msg/Time"]
+        header = types["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)
         parts = (vector(*map(float, part)) for part in np.split(wrench, 2))
-        both = kinds["geometry_msgs/msg/Wrench"](*parts)
-        return bytes(self._types.serialize_cdr(kinds[WRENCH_STAMPED](header, both), WRENCH_STAMPED))
+        both = types["geometry_msgs/msg/Wrench"](*parts)
+        return bytes(self._types.serialize_cdr(types[WRENCH_STAMPED](header, both), WRENCH_STAMPED))
 
     def close(self) -> None:
         self._session.close()

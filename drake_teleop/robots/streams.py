@@ -46,7 +46,7 @@ IMU, JOINTS, ACCELERATION = "imu", "joints", "acceleration"
 
 
 class Reading(NamedTuple):
-    """Sample of a stream: number, time [s] on the source's clock, values, flags.
+    """Sample of the stream `stream`: number, time [s] on the source's clock, values, flags.
 
     Attributes:
         values: in S, of WRENCH_AND_MOTION (15,): wrench of sensor on load [N, N m], specific force,

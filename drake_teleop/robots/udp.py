@@ -40,7 +40,7 @@ def pack_reading(reading: Reading) -> bytes:
 
 
 def unpack_reading(packet: bytes) -> Reading:
-    """Return the reading in a packet, flagged as damaged if it is invalid."""
+    """Return the reading in a packet, flagged as damaged if its length or tag is wrong."""
     if len(packet) != READING_FORMAT.size or packet[:4] != _READING_TAG:
         return DAMAGED_READING
     _, flags, number, t = _PACKET_HEADER.unpack_from(packet)

@@ -209,7 +209,7 @@ def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw the energy from hand and environment over time."""
+    """Draw the energy that hand and environment have put in, for each method and network."""
 
     def draw_run_energy(axes: Any, shown: Mapping[str, Array]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)

@@ -246,7 +246,7 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
     T, K = len(motions), len(limits.capsule_pairs)
     use, ends = np.empty((T, K)), np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
-        _transform_capsules(motions[t], limits.capsule_links, limits.capsule_ends, ends[t])
+        _transform_capsules_to_world(motions[t], limits.capsule_links, limits.capsule_ends, ends[t])
         for k in range(K):
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
@@ -287,7 +287,7 @@ def capsule_distances(motions, capsule_links, capsule_ends, capsule_radius, caps
     distances = np.empty((len(motions), len(capsule_pairs)))
     placed = np.empty(capsule_ends.shape)
     for t in range(len(motions)):
-        _transform_capsules(motions[t], capsule_links, capsule_ends, placed)
+        _transform_capsules_to_world(motions[t], capsule_links, capsule_ends, placed)
         for k in range(len(capsule_pairs)):
             a, b = capsule_pairs[k]
             distance = _nearest_points_of_segments(placed[a], placed[b])[0]
@@ -296,7 +296,7 @@ def capsule_distances(motions, capsule_links, capsule_ends, capsule_radius, caps
 
 
 @njit(cache=True)
-def _transform_capsules(motions, rows, ends, placed):
+def _transform_capsules_to_world(motions, rows, ends, placed):
     for k in range(len(rows)):
         for e in range(2):
             p = vector_at(ends[k, e], 0)

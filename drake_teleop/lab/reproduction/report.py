@@ -247,7 +247,7 @@ def _format_value(value: float, unit: str) -> str:
 
 
 def scaling_figure(run: experiments.MotionRun, component: int, symbol: str, unit: str) -> Figure:
-    """Draw Fig. 6 or 7: one component at the slave for each sigma; right axes at the master.
+    """Draw Fig. 6 or 7: a wrench component at the slave for each sigma; right axes at the master.
 
     `symbol` is matplotlib text.
     """

@@ -296,7 +296,7 @@ def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return all points with their means of `PARETO_MEASURES`; None if one is missing."""
+    """Return mean, `_half` width, `complete`, `front` by point; None without `PARETO_MEASURES`."""
     import polars as pl
 
     if not set(PARETO_MEASURES) <= set(study.measures) or rows.is_empty():

@@ -74,7 +74,7 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
         for axes, factor in zip(grid[-1], factors, strict=True):
             axes.set_xlabel(factor.field)
         figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
-        _draw_reason_legend(figure, reasons)
+        _draw_hatch_legend(figure, reasons)
     return figure
 
 
@@ -112,8 +112,8 @@ def _hatched_cell_without_value(why: str, corner: tuple[float, float]) -> Rectan
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_OF_REASON[why], fc="white", ec=GREY, lw=0)
 
 
-def _draw_reason_legend(figure: Figure, reasons: Iterable[str]) -> None:
-    names = [why for why in _HATCH_OF_REASON if why in reasons and why != TOO_FEW_POINTS]
+def _draw_hatch_legend(figure: Figure, missing_reasons: Iterable[str]) -> None:
+    names = [why for why in _HATCH_OF_REASON if why in missing_reasons and why != TOO_FEW_POINTS]
     if names:
         patches = [_hatched_cell_without_value(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
@@ -145,7 +145,7 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
         figure.colorbar(drawn, ax=grid, label=measure)
         words = ", fitted: levels of each, and products" if maps[0].is_fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
-        _draw_reason_legend(figure, set().union(*(found.missing_reasons.ravel() for found in maps)))
+        _draw_hatch_legend(figure, set().union(*(found.missing_reasons.ravel() for found in maps)))
     return figure
 
 

@@ -86,7 +86,7 @@ class OperatingRange:
 
     @property
     def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
-        """Factor of gamma, grips and walls of each part of the tests; each has its own seed.
+        """Factor of gamma, grips, wall stiffnesses of each part of the tests, with its own seed.
 
         The softest grip fails first: it is tested twice. The last part has no margin.
         """
@@ -192,7 +192,7 @@ def settings_from_values(values: FactorValues) -> TunedSettings:
 
 @dataclass(frozen=True)
 class StationPressTrial:
-    """Function that a study runs: one press in the whole station."""
+    """Function that a study runs: one press on a wall, with the whole station."""
 
     user_scenario: Scenario  #: with the user's passivity and scales
     base_scenario: Scenario  #: the same without environment, task and passivity method

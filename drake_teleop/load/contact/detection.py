@@ -70,8 +70,8 @@ def update_statistics(
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
-    noise, held = (variances, P, growth, fade), memory[HELD_SQUARES_START:CONTACT_INDEX]
-    noise_variances_into(held, s, omega, alpha, acceleration, *noise, V, scaled)
+    noise, peaks = (variances, P, growth, fade), memory[HELD_SQUARES_START:CONTACT_INDEX]
+    noise_variances_into(peaks, s, omega, alpha, acceleration, *noise, V, scaled)
     for c in range(6):
         scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(scaled[c])
     count = int(memory[SAMPLE_COUNT_INDEX])
@@ -142,9 +142,9 @@ def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
 
 
 @njit(cache=True)
-def update_contact_flag(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Process one sample with `ContactDetector.settings`; return whether there is contact."""
-    slack, following, statistic, enter, leave, hold = decision
+def update_contact_flag(memory, contact, s, omega, alpha, acceleration, parameters, flag_settings):
+    """Process a row of `DetectorSamples` with `ContactDetector.settings`; return if in contact."""
+    slack, following, statistic, enter, leave, hold = flag_settings
     sample = contact, s, omega, alpha, acceleration
     update_statistics(memory, *sample, parameters, slack, following, leave)
     return update_flag_with_hysteresis(memory, statistic, enter, leave, hold, parameters[5])
@@ -162,8 +162,8 @@ def _detect_contact_in_rows(memory, rows, settings, statistics, flags):
 def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUSUM_SLACK) -> Array:
     """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
     # Without contact, which would reset the sums.
-    decision = float(positive_array("slack", slack)), 0.0, 0, np.inf, CONTACT_END_LEVEL, 0
-    settings = floor.compiled_parameters, decision
+    flag_settings = float(positive_array("slack", slack)), 0.0, 0, np.inf, CONTACT_END_LEVEL, 0
+    settings = floor.compiled_parameters, flag_settings
     return _statistics_and_flags(np.zeros(MEMORY_SIZE), samples, settings)[0]
 
 
@@ -202,9 +202,9 @@ class ContactDetector:
         if not 0.0 <= following < 1.0:
             what = f"{following} is outside the range 0 <= following < 1"
             raise DrakeTeleopError(what, where="following", remedy="give 0 to subtract no mean")
-        decision = CUSUM_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
+        flag_settings = CUSUM_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
         #: Last arguments of `update_contact_flag`.
-        self.settings = (floor.compiled_parameters, decision)
+        self.settings = (floor.compiled_parameters, flag_settings)
         self._memory = self.initial_memory()
 
     @staticmethod

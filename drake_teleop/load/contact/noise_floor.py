@@ -121,14 +121,14 @@ class NoiseFloor:
 
 
 @njit(cache=True)
-def noise_variances_into(held, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
+def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
     """Write the variances (6,) of a sample's contact wrench into `out`.
 
-    It updates the `held` squares of acceleration and alpha; `V` (6, 10) is scratch memory;
+    `peaks` (2,) are held squares of acceleration and alpha, updated; `V` (6, 10) is scratch memory;
     others: `NoiseFloor.compiled_parameters`.
     """
-    held[0] = max(dot(acceleration, acceleration), fade * held[0])
-    held[1] = max(dot(alpha, alpha), fade * held[1])
+    peaks[0] = max(dot(acceleration, acceleration), fade * peaks[0])
+    peaks[1] = max(dot(alpha, alpha), fade * peaks[1])
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -139,16 +139,16 @@ def noise_variances_into(held, s, omega, alpha, acceleration, variances, P, grow
             for j in range(10):
                 row += V[c, j] * P[6 + i, 6 + j]
             value += V[c, i] * row
-        moving = growth[c, 0] * held[0] + growth[c, 1] * held[1]
+        moving = growth[c, 0] * peaks[0] + growth[c, 1] * peaks[1]
         out[c] = variances[c] + max(value, 0.0) + moving
 
 
 @njit(cache=True)
 def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, out):
     """Write the noise sigma (N, 6) of contact wrenches, as `noise_variances_into`, to `out`."""
-    held, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, growth, fade)
+    peaks, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, growth, fade)
     for k in range(s.shape[0]):
-        noise_variances_into(held, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])
+        noise_variances_into(peaks, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])
         out[k] = np.sqrt(out[k])
 
 

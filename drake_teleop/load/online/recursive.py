@@ -142,6 +142,7 @@ class RecursiveEstimator(ABC):
         return self.is_state_settled(self._theta, self._memory)
 
     def is_state_settled(self, theta: Array, memory: Array) -> bool:
+        """Return `is_settled` for a given estimate and memory."""
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))

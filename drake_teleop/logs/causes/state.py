@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes import instants
@@ -254,10 +254,10 @@ def regularized_inverse(gram: Array) -> Array:
     return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)
 
 
-def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
+def score_statistic(gram: Array, right: Array, min_diagonal: ArrayLike = 0.0) -> tuple[float, int]:
     """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
-    used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
+    used = diagonal > np.maximum(min_diagonal, 1e-12 * diagonal.max())
     if not used.any():
         return 0.0, 0
     scale = 1.0 / np.sqrt(diagonal[used])

@@ -308,11 +308,11 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     )
 
 
-def _is_frame_wrong(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
+def _is_frame_wrong(x: Array, covariance: Array, min_size: float, largest_deviation: float) -> bool:
     if not np.isfinite(np.diag(covariance)).all():
         return False
     length = np.linalg.norm(x)
     direction = x / (length + 1e-300)
     deviation = float(np.sqrt(direction @ covariance @ direction))
-    significant = length > max(least, _MIN_FRAME_ERROR_OVER_STD * deviation)
+    significant = length > max(min_size, _MIN_FRAME_ERROR_OVER_STD * deviation)
     return bool(significant and deviation < largest_deviation)

@@ -25,7 +25,7 @@ MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
 # Length of the taper's ramps at the ends of the record, and beside excluded samples [s].
 _TAPER_RAMP_S, _EXCLUSION_RAMP_S = 1.0, 0.2
-_GRID_RATE_HZ = 100.0
+_WRENCH_GRID_RATE_HZ = 100.0
 DELAY_SEARCH_HALF_RANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
@@ -55,7 +55,7 @@ class WrenchGrid:
         t = finite_array("t", t, np.size(t))
         wrench = finite_array("wrench", wrench, len(t), 6)
         dt = (t[-1] - t[0]) / (len(t) - 1)
-        stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
+        stride = max(1, int(1.0 / (_WRENCH_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
         return cls(t[0] + stride * dt * np.arange(rows), wrench[: rows * stride], stride, load)
 
@@ -260,7 +260,7 @@ class Spectra:
 
 
 def real_and_imaginary_rows(y: ComplexArray) -> Array:
-    """Return the real and the imaginary part (2 K, k) of each row of y (K, k)."""
+    """Return real rows (2 K, k): the real, then the imaginary part of each row of y (K, k)."""
     parts = y.view(np.float64).reshape(*y.shape, 2)
     return parts.transpose(0, 2, 1).reshape(-1, y.shape[1])
 

@@ -244,7 +244,7 @@ class SplineCache:
 
     @property
     def rate(self) -> float:
-        """Rate of the fitted poses and IMU data together [Hz]."""
+        """Sum of the rates of the fitted poses and IMU data [Hz]."""
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def splines_with_spacing(self, spacing: float) -> PoseSplines:

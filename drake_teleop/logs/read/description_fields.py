@@ -160,21 +160,21 @@ class Torque(_VectorColumns):
 
 
 class Acceleration(_VectorColumns):
-    """Columns of a linear acceleration, their unit and bias."""
+    """Columns of a linear acceleration, their unit, and bias to subtract."""
 
     unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularVelocity(_VectorColumns):
-    """Columns of an angular velocity, their unit and bias."""
+    """Columns of an angular velocity, their unit, and bias to subtract."""
 
     unit: Literal["rad/s", "deg/s"] = "rad/s"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularAcceleration(_VectorColumns):
-    """Columns of an angular acceleration, their unit and bias."""
+    """Columns of an angular acceleration, their unit, and bias to subtract."""
 
     unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
     bias: Vector = (0.0, 0.0, 0.0)

@@ -24,7 +24,7 @@ SignalPairs = list[tuple[Array, Array]]
 
 
 def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
-    """Return pairs of specific force, and omega if `gyroscope`: pose at `t`, IMU on its clock."""
+    """Return pairs of specific force, and omega if `gyroscope`: pose at `t`, IMU at `imu.t`."""
     signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
     return [(resample(t, pose.t, x), y) for x, y in signals]
 

@@ -33,7 +33,7 @@ def _zero_vector_of_type(T: Any, size: int) -> Any:
 
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
-    class Impl(LeafSystem_[T]):
+    class NonContactWrenchT(LeafSystem_[T]):
         """Block that outputs the wrench V phi of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
@@ -64,7 +64,7 @@ def NonContactWrench_(T: Any) -> Any:
             self.DeclareVectorOutputPort("non_contact_wrench_S", 6, calculate, inputs)
 
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
-            Impl._construct(self, other._phi, converter=converter)
+            NonContactWrenchT._construct(self, other._phi, converter=converter)
 
         def _calc_non_contact_wrench(self, context: Any, output: Any) -> None:
             if self._load.HasValue(context):
@@ -76,7 +76,7 @@ def NonContactWrench_(T: Any) -> Any:
             _compiled_or_python(non_contact_wrench_into, T)(*motion, phi, wrench)
             output.SetFromVector(wrench)
 
-    return Impl
+    return NonContactWrenchT
 
 
 NonContactWrench = NonContactWrench_[float]
@@ -84,7 +84,7 @@ NonContactWrench = NonContactWrench_[float]
 
 @TemplateSystem.define("WrenchScaling_")
 def WrenchScaling_(T: Any) -> Any:
-    class Impl(LeafSystem_[T]):
+    class WrenchScalingT(LeafSystem_[T]):
         """Block that outputs contact wrench F_c (Eq. 13) and scaled wrench F' (Eq. T7).
 
         .. pydrake_system::
@@ -134,7 +134,7 @@ def WrenchScaling_(T: Any) -> Any:
                 self.DeclareVectorOutputPort(name, 6, weak_callback(calc), tickets | more)
 
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
-            Impl._construct(self, other._config, other._R_WB, other._gravity_W, converter=converter)
+            WrenchScalingT._construct(self, other._config, other._R_WB, other._gravity_W, converter)
 
         def _scaled_wrench(self, context: Any, scales: Scales) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
@@ -173,7 +173,7 @@ def WrenchScaling_(T: Any) -> Any:
             to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)
 
-    return Impl
+    return WrenchScalingT
 
 
 WrenchScaling = WrenchScaling_[float]

@@ -79,7 +79,7 @@ TASK_MEASURE_NAMES = (
 @settings
 @dataclass
 class Movement:
-    """Parameters of the operator's movements; see docs/operator.md."""
+    """Speed, accuracy and contact force of the operator's movements; see docs/operator.md."""
 
     acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak acceleration in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")

@@ -130,7 +130,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     memory[_HAND_WALL_DEPTH] += work_along(memory[_DIRECTION_INTO_WALL], steady)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
-        _update_hand_ledger(g, dx, inside or memory[shared.IN_CONTACT_FLAG] > 0.0, p, memory)
+        _update_hand_group_ledger(g, dx, inside or memory[shared.IN_CONTACT_FLAG] > 0.0, p, memory)
         memory[slots.STORED_ENERGY][g] += fields.count_newly_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
     if fields.has_packet_arrived(received):
@@ -145,16 +145,16 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[_IS_WRENCH_CROSS_FADING] = 1.0
     memory[_LAST_RECEIVED_PACKET_NUMBER] = newest
     for g in range(2):
-        _cross_fade_wrench(g, T, p, memory, wrench)
+        _cross_fade_wrench_of_group(g, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
-        _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
+        _limit_wrench_to_energy_of_group(g, dx, T, p, memory, wrench)
         level = p[shared.MASTER_RESERVE][g]
         if memory[shared.IN_CONTACT_FLAG] > 0.0:
             level += shared.RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
         surplus = max(memory[slots.STORED_ENERGY][g] - level, 0.0)
         memory[slots.SENT_ENERGY][g] += surplus
         memory[slots.STORED_ENERGY][g] -= surplus
-        _add_drag_force(g, received, dx, T, p, memory, wrench)
+        _add_group_drag(g, received, dx, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
         packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
         packet[shared.PACKET_LEDGER_LEVEL][g] = memory[slots.STORED_ENERGY][g]
@@ -181,7 +181,7 @@ def _store_hand_step_beyond_deadband(dx, p, memory):
 
 
 @njit(cache=True)
-def _update_hand_ledger(g, dx, in_contact, p, memory):
+def _update_hand_group_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g), memory[slots.STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
     sending_level = _HAND_INPUT_SENDING_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
@@ -330,7 +330,7 @@ def _remove_normal_component(wrench, p, memory):
 
 
 @njit(cache=True)
-def _cross_fade_wrench(g, T, p, memory, wrench):
+def _cross_fade_wrench_of_group(g, T, p, memory, wrench):
     last, fading = memory[_LAST_UNLIMITED_WRENCH], memory[_IS_WRENCH_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
@@ -346,7 +346,7 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
+def _limit_wrench_to_energy_of_group(g, dx, T, p, memory, wrench):
     size, cost = length_of_group(wrench, g), 0.0
     if size > 0.0:
         displacement = dot_of_group(wrench, memory[shared.FILTERED_OWN_VELOCITY], g) / size * T
@@ -360,12 +360,12 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         share = most / cost
     memory[_WITHHELD_WRENCH_SHARE][g] = 1.0 - share
     if not cost > 0.0:
-        share *= _permitted_braking_share(g, dx, T, p, memory)
+        share *= _permitted_braking_share_of_group(g, dx, T, p, memory)
     fields.scale_group(wrench, g, share)
 
 
 @njit(cache=True)
-def _permitted_braking_share(g, dx, T, p, memory):
+def _permitted_braking_share_of_group(g, dx, T, p, memory):
     unused = _UNUSED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     if memory[slots.STORED_ENERGY][g] >= unused:
         return 1.0
@@ -375,7 +375,7 @@ def _permitted_braking_share(g, dx, T, p, memory):
 
 
 @njit(cache=True)
-def _add_drag_force(g, received, dx, T, p, memory, wrench):
+def _add_group_drag(g, received, dx, T, p, memory, wrench):
     velocity, drag, active = memory[shared.FILTERED_OWN_VELOCITY], 0.0, memory[_IS_DRAG_ACTIVE]
     speed = length_of_group(velocity, g)
     own_level = memory[slots.STORED_ENERGY][g] / p[shared.MASTER_RESERVE][g]
@@ -396,6 +396,6 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
         excess = speed / shared.ANGLE_PER_LENGTH[g] - _NO_BRAKE_HAND_SPEED
         share = excess / (_FULL_BRAKE_HAND_SPEED - _NO_BRAKE_HAND_SPEED)
         drag = max(drag, _HAND_BRAKE_FORCE_N * shared.TORQUE_PER_FORCE[g] * min(share, 1.0))
-    drag *= _permitted_braking_share(g, dx, T, p, memory)
+    drag *= _permitted_braking_share_of_group(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= drag * velocity[i] / max(speed, full_drag_speed)

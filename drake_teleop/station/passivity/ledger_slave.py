@@ -151,7 +151,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for i in range(6):
         filtered[i] += share * (load[i] - filtered[i])
     for g in range(2):
-        _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
+        _update_group_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
     _identify_contact(received, in_contact, dx, contact, T, p, memory)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
@@ -185,7 +185,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 
 @njit(cache=True)
-def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
+def _update_group_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g))
     new = fields.count_newly_received_energy(g, received, memory)
@@ -355,7 +355,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_command_to_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) so that the motors' energy suffices; return whether it moved."""
+    """Move the command (7,) towards `pose` until the motors' energy suffices; return if moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     fields.pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
@@ -363,7 +363,7 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
         D = _SERVO_DAMPING_FACTOR * p[slots.SERVO_D][g]
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = K * motor_wrench[i] - D * twist[i]
-        if _limit_motor_wrench(g, D, twist, p, memory):
+        if _limit_motor_wrench_of_group(g, D, twist, p, memory):
             changed = True
             velocity = memory[slots.COMMAND_TWIST]
             is_faster = length_of_group(velocity, g) > length_of_group(twist, g)
@@ -378,7 +378,7 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
 
 
 @njit(cache=True)
-def _limit_motor_wrench(g, damping, twist, p, memory):
+def _limit_motor_wrench_of_group(g, damping, twist, p, memory):
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[FILTERED_OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed = length_of_group(motor_wrench, g), length_of_group(twist, g)

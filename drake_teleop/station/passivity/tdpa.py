@@ -116,8 +116,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         withheld[g] = 1.0 - share
         memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * drained
         fields.scale_group(wrench, g, share)
-        _add_drag_force(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
-        _charge_hand_work_to_ledger(g, dot_of_group(wrench, dx, g), p, memory)
+        _add_group_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
+        _charge_hand_work_to_ledger_of_group(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
             ledger[g] -= surplus
@@ -128,7 +128,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
+def _add_group_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
     drag = p[_DRAG_WRENCH][g]
     level = memory[slots.STORED_ENERGY][g] + memory[_MASTER_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_TARGET_RESERVE][g]:
@@ -139,7 +139,7 @@ def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _charge_hand_work_to_ledger(g, drained, p, memory):
+def _charge_hand_work_to_ledger_of_group(g, drained, p, memory):
     ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
@@ -161,25 +161,25 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     if fields.has_packet_arrived(received):
         _advance_command(received, wrench, T, p, memory)
     for g in range(2):
-        available = _energy_available_to_slave(memory, g)
+        available = _available_slave_energy_of_group(memory, g)
         credit = min(memory[_SLAVE_WORK_IN][g], memory[_COMMAND_WORK_IN][g]) + min(available, 0.0)
         # Output beyond the received energy is compensated before energy is sent.
         memory[slots.SENT_ENERGY][g] = max(memory[slots.SENT_ENERGY][g], credit)
         memory[slots.STORED_ENERGY][g] = available
         packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
         packet[_PACKET_SLAVE_ENERGY][g] = memory[slots.STORED_ENERGY][g]
-        _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
+        _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     fields.fill_packet(pose, twist, memory[_FILTERED_SLAVE_WRENCH], packet)
 
 
 @njit(cache=True)
-def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
+def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
     filtered, hand = memory[_FILTERED_SLAVE_WRENCH], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
-        gain = max(_estimate_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
+        gain = max(_estimate_contact_stiffness_of_group(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
         round_trip = max(memory[slots.STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
         lag = round_trip + p[slots.SERVO_D][g] / p[slots.SERVO_K][g]
@@ -201,7 +201,7 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _estimate_contact_stiffness(g, dx, wrench, T, memory):
+def _estimate_contact_stiffness_of_group(g, dx, wrench, T, memory):
     size, stiffness = length_of_group(dx, g), memory[_CONTACT_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_AVERAGING_TRAVEL[g] * T:
         change = dot_of_group(wrench, dx, g) - dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
@@ -211,7 +211,7 @@ def _estimate_contact_stiffness(g, dx, wrench, T, memory):
 
 
 @njit(cache=True)
-def _energy_available_to_slave(memory, g):
+def _available_slave_energy_of_group(memory, g):
     used = max(memory[_SLAVE_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g])
     return memory[slots.RECEIVED_ENERGY][g] - used
 
@@ -227,7 +227,7 @@ def _advance_command(received, wrench, T, p, memory):
     for g in range(2):
         limit_group(step, g, p[_MAX_COMMAND_SPEED][g] * T)
         pressing = -dot_of_group(wrench, step, g)
-        available = max(_energy_available_to_slave(memory, g), 0.0)
+        available = max(_available_slave_energy_of_group(memory, g), 0.0)
         if pressing > available:
             fields.scale_group(step, g, available / pressing)
             memory[slots.DISSIPATED_ENERGY][g] += pressing - available

@@ -93,7 +93,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
             most = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
-            if _limit_wrench_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
+            if _limit_group_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
                 memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
@@ -105,18 +105,18 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _limit_wrench_change(g, energy, dx, max_change, held, wrench):
+def _limit_group_change(g, energy, dx, max_change, last_wrench, wrench):
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
-        size += (wrench[i] - held[i]) ** 2
+        size += (wrench[i] - last_wrench[i]) ** 2
     if size <= max_change * max_change:
         return False
     share = max_change / math.sqrt(size)
-    now, last = energy - dot_of_group(wrench, dx, g), energy - dot_of_group(held, dx, g)
+    now, last = energy - dot_of_group(wrench, dx, g), energy - dot_of_group(last_wrench, dx, g)
     if (1.0 - share) * last + share * now < 0.0:
         share = last / (last - now) if now > 0.0 else 1.0
     for i in range(3 * g, 3 * g + 3):
-        wrench[i] = held[i] + share * (wrench[i] - held[i])
+        wrench[i] = last_wrench[i] + share * (wrench[i] - last_wrench[i])
     return True
 
 
@@ -137,7 +137,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             step[i] /= T
     else:
         step[:] = 0.0
-        _reflect_wave_at_held_command(wrench, T, p, memory)
+        _reflect_wave_during_silence(wrench, T, p, memory)
     copy_into(packet, fields.METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
     copy_into(packet, fields.CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
@@ -162,7 +162,7 @@ def _reflect_wave(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _reflect_wave_at_held_command(wrench, T, p, memory):
+def _reflect_wave_during_silence(wrench, T, p, memory):
     wave, ledger = memory[_FILTERED_WAVE], memory[slots.STORED_ENERGY]
     played, integral = memory[_FILTERED_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):

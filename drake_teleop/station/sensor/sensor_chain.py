@@ -128,11 +128,11 @@ class WristSensorConfig:
     encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "encoder latency, whole samples")
 
     def noise_std(self) -> Array:
-        """Return the standard deviations (12,) of white noise in raw samples, in SI units."""
+        """Return the standard deviations (12,) of noise in raw samples, ordered as `ranges`."""
         return np.repeat([getattr(self, name) for name in SENSOR_PARTS["noise"]], 3)
 
     def random_walk(self) -> Array:
-        """Return the standard deviations (12,) of the random walks after 1 s, in SI units."""
+        """Return the standard deviations (12,) of random walks after 1 s, ordered as `ranges`."""
         return np.repeat([getattr(self, name) for name in SENSOR_PARTS["random_walk"]], 3)
 
     def ranges(self) -> Array:

@@ -191,7 +191,7 @@ def set_one_actuator_per_joint(
     """Give each of the joints `moving` one actuator, in this order.
 
     `limits` contains effort limits by joint; joints without an entry are unlimited. None keeps
-    the limits of existing actuators.
+    the limits of existing actuators. Actuators of other joints remain.
     """
     data = {joint.index(): (np.inf, 0.0, 1.0) for joint in moving}
     for motor in list(map(plant.get_joint_actuator, plant.GetJointActuatorIndices())):

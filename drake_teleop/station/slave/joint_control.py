@@ -309,7 +309,7 @@ class JointControl(LeafSystem):
 class HeldTorque(LeafSystem):
     """Block that holds a requested motor torque for a period, within the limits.
 
-    An invalid request keeps the last torque; the first torque holds the posture `q_start`.
+    An invalid request keeps the last torque; the first torque holds `q_start` against gravity.
     """
 
     __slots__ = NO_EXTRA_SLOTS

@@ -42,7 +42,7 @@ def repair_mjcf(model: ModelRepair) -> None:
     if is_complete or not purpose.sensor_name:
         world = _split_into_one_joint_bodies(reader.read_world())
     else:
-        world = _read_world_with_arm(mjcf, reader)
+        world = _read_world_with_only_arm(mjcf, reader)
     bodies, sensor = world.with_descendants(), purpose.sensor_name
     if is_complete:
         moving = [joint for body in bodies for joint in body.joints]
@@ -69,7 +69,7 @@ def repair_mjcf(model: ModelRepair) -> None:
     model.raise_faults()
 
 
-def _read_world_with_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
+def _read_world_with_only_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
     """Return the world with only the tree of bodies that carries the sensor; report the others."""
     model, sensor = mjcf.model, mjcf.model.purpose.sensor_name
     worlds = mjcf.root.findall("worldbody")

@@ -196,7 +196,7 @@ def _remove_references_to_missing_parts(model: ModelRepair) -> None:
 
 
 def _repair_included_file(uri: Element, model: ModelRepair) -> None:
-    """Let an include refer to a repaired copy of its file, if that is one file."""
+    """Let an include refer to its file by absolute path, repaired if URDF or SDF; raise if none."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, model)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
