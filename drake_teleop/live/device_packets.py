@@ -54,7 +54,7 @@ def pack_state(state: DeviceState) -> bytes:
 
 
 def unpack_state(packet: bytes) -> DeviceState | None:
-    """Return the device state in a packet, or None if it is invalid or implausible."""
+    """Return the state in a packet; None for a wrong length or tag, or implausible values."""
     if len(packet) != _STATE_FORMAT.size or packet[:4] != _STATE_TAG:
         return None
     _, flags, number, t, *numbers = _STATE_FORMAT.unpack(packet)
@@ -98,7 +98,7 @@ def pack_force(command: ForceCommand) -> bytes:
 
 
 def unpack_force(packet: bytes) -> ForceCommand | None:
-    """Return the force command in a packet, or None if it is invalid."""
+    """Return the command in a packet; None for a wrong length or tag, or implausible values."""
     if len(packet) != _FORCE_FORMAT.size or packet[:4] != _FORCE_TAG:
         return None
     _, _, number, t, *wrench = _FORCE_FORMAT.unpack(packet)

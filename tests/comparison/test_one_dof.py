@@ -329,7 +329,7 @@ def test_rise_delay_is_never_negative(share, late, drag, expected):
     felt = np.minimum(wall(t - late), share) + (pulled if drag else 0.0)
     still = np.zeros_like(t)
     found = measures_of_traces(
-        t=t, master=still, slave=still, felt=felt, pressed=wall(t), energy=still, task=task
+        t=t, master=still, slave=still, hand_force=felt, pressed=wall(t), energy=still, task=task
     )
     assert found.rise_delay == pytest.approx(expected, abs=2 * PERIOD_S, nan_ok=True)
     assert not found.rise_delay < 0.0

@@ -103,8 +103,8 @@ def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike 
     h11, h12, h21, h22 = matrix_entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)
-    felt = h11 + np.asarray(hand) - h12 * h21 * z * reduction
-    return two_port_matrix(felt, h12 * reduction, h21 * reduction, h22 * reduction)
+    rendered = h11 + np.asarray(hand) - h12 * h21 * z * reduction
+    return two_port_matrix(rendered, h12 * reduction, h21 * reduction, h22 * reduction)
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
@@ -114,8 +114,8 @@ def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
     """Return the ideal displayed impedance, set by the scales of force and motion (T52)."""
-    felt = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
-    return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * felt
+    rendered = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
+    return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * rendered
 
 
 class ApparentImpedance(NamedTuple):
@@ -126,15 +126,15 @@ class ApparentImpedance(NamedTuple):
     stiffness: Array  #: N/m
 
 
-def fit_apparent_impedance(felt: Complex, omega: Array) -> ApparentImpedance:
+def fit_apparent_impedance(impedance: Complex, omega: Array) -> ApparentImpedance:
     """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
     basis = np.stack([omega, -1 / omega], axis=-1)
-    flat = felt.imag.reshape(len(omega), -1)
+    flat = impedance.imag.reshape(len(omega), -1)
     # Normalised columns: from 0.1 to 1000 rad/s they differ by eight orders of magnitude.
     size = np.linalg.norm(basis, axis=0)
     parts, *_ = np.linalg.lstsq(basis / size, flat, rcond=None)
-    mass, stiffness = (parts / size[:, None]).reshape(2, *felt.shape[1:])
-    return ApparentImpedance(mass, felt.real.mean(axis=0), stiffness)
+    mass, stiffness = (parts / size[:, None]).reshape(2, *impedance.shape[1:])
+    return ApparentImpedance(mass, impedance.real.mean(axis=0), stiffness)
 
 
 class ZWidth(NamedTuple):
@@ -162,9 +162,9 @@ def transmitted_z_width(H: Complex) -> ZWidth:
 WEBER_FRACTION = 0.23
 
 
-def is_difference_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
+def is_difference_noticed(rendered: Complex, ideal: Complex) -> NDArray[np.bool_]:
     """Return, for each frequency, whether a human notices the difference of the impedances."""
-    return np.abs(felt / ideal - 1) > WEBER_FRACTION
+    return np.abs(rendered / ideal - 1) > WEBER_FRACTION
 
 
 def smallest_stiffness_change(H: Complex, omega: Array, stiffness: ArrayLike) -> Array:

@@ -244,7 +244,7 @@ def measures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMe
         t=run.t,
         master=run.master_position,
         slave=run.slave_position,
-        felt=run.hand_force,
+        hand_force=run.hand_force,
         pressed=model.force_scale * model.gamma * run.wall_force,
         energy=run.channel_energy.sum(axis=1),
         task=task,
@@ -256,7 +256,7 @@ def measures_of_traces(
     t: Array,
     master: Array,
     slave: Array,
-    felt: Array,
+    hand_force: Array,
     pressed: Array,
     energy: Array,
     task: Task,
@@ -266,7 +266,7 @@ def measures_of_traces(
 
     Args:
         master, slave: positions in the direction of pressing [m].
-        felt, pressed: forces on the hand and of the environment, at the hand's scale [N].
+        hand_force, pressed: forces on the hand and of the environment, at the hand's scale [N].
         energy: from both ends into the channel [J].
         turned: (N, 3) rotation vector of the slave's tool [rad], if it can rotate.
     """
@@ -281,7 +281,7 @@ def measures_of_traces(
     parts, angles = (hold, rest), () if turned is None else turned.T
     hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in parts)
     turning = max((_range_about_parabola(x[part]) for x in angles for part in parts), default=0.0)
-    steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
+    steady, goal = float(hand_force[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
     return RunMeasures(
@@ -292,11 +292,11 @@ def measures_of_traces(
         hunting=hunting,
         turning=turning,
         felt_force=abs(steady),
-        chatter=float(felt[hold].std()),
+        chatter=float(hand_force[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(np.sqrt(np.mean(felt[swing] ** 2))),
-        rise_delay=_rise_delay_in_samples(felt[start:], pressed[start:], steady) * dt,
+        free_force=float(np.sqrt(np.mean(hand_force[swing] ** 2))),
+        rise_delay=_rise_delay_in_samples(hand_force[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
 
@@ -326,9 +326,9 @@ def _range_about_parabola(x: Array) -> float:
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_delay_in_samples(felt: Array, pressed: Array, steady: float) -> float:
+def _rise_delay_in_samples(hand_force: Array, pressed: Array, steady: float) -> float:
     level, sign = 0.5 * abs(steady), np.sign(steady)
-    exceeds, displayed = pressed * sign > level, felt * sign > level
+    exceeds, displayed = pressed * sign > level, hand_force * sign > level
     start = int(np.argmax(exceeds))
     if not exceeds.any() or displayed[max(start - 1, 0)] or not displayed[start:].any():
         return float("nan")

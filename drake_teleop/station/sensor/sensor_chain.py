@@ -128,7 +128,7 @@ class WristSensorConfig:
     encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "encoder latency, whole samples")
 
     def noise_std(self) -> Array:
-        """Return the standard deviations (12,) of noise in raw samples, ordered as `ranges`."""
+        """Return standard deviations (12,) of white noise in raw samples, ordered as `ranges`."""
         return np.repeat([getattr(self, name) for name in SENSOR_PARTS["noise"]], 3)
 
     def random_walk(self) -> Array:
@@ -136,7 +136,7 @@ class WristSensorConfig:
         return np.repeat([getattr(self, name) for name in SENSOR_PARTS["random_walk"]], 3)
 
     def ranges(self) -> Array:
-        """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
+        """Return the ranges (12,) of force, torque, specific force, angular acceleration in SI."""
         motion = [self.acceleration_range] * 3 + [self.angular_acceleration_range] * 3
         return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
