@@ -71,7 +71,7 @@ class NetFtSource(Source):
         return found
 
     def reading_of_packet(self, packet: bytes, now: float) -> Reading:
-        """Return the wrench in a packet received at `now` [s], with flags for saturation, error, age."""
+        """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
         if len(packet) != RECORD_FORMAT.size:
             return DAMAGED_WRENCH_READING
         rdt_sequence, ft_sequence, status, *counts = RECORD_FORMAT.unpack(packet)
