@@ -64,7 +64,7 @@ class LoadFitQuality:
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
-    """Fit load and offsets to the best fitting share of a log, after a low-pass of 15 Hz."""
+    """Fit load and offsets to the best fitting share of a log, below 15 Hz unless it is static."""
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_FITTED_SAMPLES))

@@ -25,7 +25,7 @@ def jacobian_into(q, device, J):
 
 @njit(cache=True)
 def gravity_compensation_torque_into(q, device, out):
-    """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
+    """Write joint torques or forces (6,) that cancel the weight into `out`; 0 in task space."""
     if device.in_task_space:
         out[:6] = 0.0
     else:
