@@ -118,7 +118,7 @@ class PostureShapes:
         return np.vstack([np.zeros((0, 3)), *hulls])
 
     def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return hull points (k, 3) in W [m] of the collision (or, if any, `visual`) shapes."""
+        """Return hull points (k, 3) in W [m] of a body's collision or, if any, `visual` shapes."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [hull_points_of(self._scene_graph.model_inspector(), each) for each in shapes]
