@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib.metadata
 import importlib.util
+import inspect
 import json
 import os
 import re
@@ -22,6 +24,7 @@ pytestmark = pytest.mark.checks
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 README = (FOLDER / "README.md").read_text(encoding="utf-8")
+SCRIPTS = [*sorted(FOLDER.glob("*.py")), *sorted((FOLDER.parent / "docs/gallery").glob("*.py"))]
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +41,52 @@ def test_the_readme_has_a_section_for_scripts_that_exist() -> None:
     scripts = re.findall(r"^## (\w+\.py)\n\n.+\?$", README, re.M)
     assert {"identification.py", "station.py", "utias.py"} <= set(scripts)
     assert [name for name in scripts if not (FOLDER / name).is_file()] == []
+
+
+def named_objects(tree: ast.Module) -> dict[str, Any]:
+    """Return what a script imports from the package, by its name in the script."""
+    found: dict[str, Any] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("drake_teleop"):
+            module = importlib.import_module(node.module or "")
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
+                found[alias.asname or alias.name] = getattr(module, alias.name)
+    return found
+
+
+def accepts_keyword(function: Any, keyword: str) -> bool:
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return True
+    any_keyword = inspect.Parameter.VAR_KEYWORD
+    return any(p.name == keyword or p.kind == any_keyword for p in parameters)
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_calls_of_the_package_have_keywords_that_exist(path):
+    """Imports, attributes of modules, and keywords of calls and of `partial`."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    objects = named_objects(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            module = objects.get(node.value.id)
+            if isinstance(module, ModuleType):
+                assert hasattr(module, node.attr), ast.unparse(node)
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.args[0] if ast.unparse(node.func) == "partial" else node.func)
+            first, _, rest = called.partition(".")
+            function = objects.get(first)
+            if isinstance(function, ModuleType) and rest.isidentifier():
+                function = getattr(function, rest)
+            elif rest:
+                continue
+            if callable(function):
+                given = [keyword.arg for keyword in node.keywords if keyword.arg]
+                wrong = [name for name in given if not accepts_keyword(function, name)]
+                assert not wrong, f"{called}: {wrong}"
 
 
 def test_the_stacked_baselines_are_right_and_the_batch_agrees(identification: ModuleType) -> None:

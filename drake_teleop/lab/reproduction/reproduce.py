@@ -92,10 +92,10 @@ def _measure_simulation_speed(progress: UpdateProgress) -> experiments.NamedValu
     }
 
 
-def MakeBarePlantSimulator(scenario: Scenario) -> Simulator:
-    """Return a simulator of arm and tool under constant holding torque."""
+def MakeBarePlantSimulator(scenario: Scenario, *, touching: bool = False) -> Simulator:
+    """Return a simulator of arm and tool under constant torque; `touching` adds the environment."""
     builder = DiagramBuilder()
-    slave = AddSlavePlant(builder, scenario.slave, None)
+    slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings if touching else None)
     step = 1 / scenario.rates.sensor_hz
     simulation = Simulation(integrator="runge_kutta2", max_step=step)
     simulator = MakeSimulator(builder.Build(), simulation)
