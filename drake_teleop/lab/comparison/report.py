@@ -201,7 +201,7 @@ def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
 def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
     def draw_run(axes: Any, shown: Mapping[str, Array]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
-        axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
+        axes.plot(shown["t"], shown["hand_force"], color=COLOURS[0], linewidth=0.9)
 
     figure = _draw_trace_grid(summary, traces, draw_run, "force [N]")
     figure.suptitle("Rendered force (blue) and scaled contact force (grey)", x=0.01, ha="left")

@@ -123,12 +123,12 @@ def measures_of_press(
 def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
     """Return a run's t [s], vertical forces at the master's scale [N] and `injected_energy` [J].
 
-    "felt" is the displayed force, "pressed" the scaled true contact force.
+    "hand_force" is the displayed force, "pressed" the scaled true contact force.
     """
     scaling = scenario.force_scaling
     return {
         "t": result.t,
-        "felt": result["force_to_master"][:, 2],
+        "hand_force": result["force_to_master"][:, 2],
         "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
         "energy": injected_energy(result, scenario),
     }
