@@ -23,7 +23,9 @@ def test_every_name_is_there(name):
 
 def test_names_with_their_module_in_the_docs_exist():
     root = Path(__file__).parents[1]
-    texts = [path.read_text() for path in (root / "README.md", *root.glob("docs/*.md"))]
+    pages = [root / "README.md", *root.glob("docs/*.md")]
+    # A build of the site copies CHANGELOG.md, which has old names.
+    texts = [page.read_text() for page in pages if page.name != "changelog.md"]
     names = set(re.findall(r"\bdrake_teleop(?:\.[A-Za-z_]\w*)+", "\n".join(texts)))
     assert len(names) > 40
     for name in names:

@@ -33,7 +33,7 @@ _CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
 
 @dataclass(frozen=True, eq=False)
 class MotionRun:
-    """Recorded movement, with the load's wrench scaled."""
+    """Simulated movement, with the sensor's wrench for several shares of the load's wrench."""
 
     scenario: Scenario
     result: SimulationResult

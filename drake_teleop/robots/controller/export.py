@@ -158,7 +158,7 @@ def _c_literal(value: Any) -> str:
 
 
 def fmu_files(target: ExportedCompensation) -> ExportedFiles:
-    """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
+    """Return FMUs for FMI 2 and 3, with sources, and Linux binaries if there is a C compiler."""
     is_linux64 = platform.system() == "Linux" and platform.machine() == "x86_64"
     compiler = shutil.which("cc") if is_linux64 else None
     if compiler is None:
