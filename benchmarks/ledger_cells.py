@@ -283,8 +283,7 @@ def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
     device = master.GetSubsystemByName("master_device")
-    parameters, *scratch = device._constants
-    device._constants = (parameters._replace(hand_mass=0.0), *scratch)
+    device._constants[0]["hand_mass"] = 0.0
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
     return read_recorded_signals(simulator, SETTLE)
 

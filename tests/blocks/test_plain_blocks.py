@@ -260,7 +260,7 @@ def test_force_display_equals_the_display_of_the_station():
     for row in rows:
         for _ in range(2):
             drive, memory[:6] = np.zeros(len(memory)), row["joint_position"]
-            step_display(row["wrench_command"], memory, device.parameters, T, J, drive)
+            step_display(row["wrench_command"], memory, device.packed_parameters, T, J, drive)
             if _ == 0:
                 memory = drive.copy()
         expected.append(drive[:6])

@@ -133,7 +133,7 @@ def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q
-        step_display(command, device, DEVICE.parameters, PERIOD, J, drive)
+        step_display(command, device, DEVICE.packed_parameters, PERIOD, J, drive)
         torque[k], shown[k] = drive[:6], drive[12:19]
         device[6:] = drive[6:]
     return shown, torque

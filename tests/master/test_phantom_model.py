@@ -48,7 +48,8 @@ def test_sdf_has_the_mass_matrix_and_coriolis_forces_of_the_device(plant):
     rng = np.random.default_rng(1)
     context = plant.CreateDefaultContext()
     still = np.zeros(6)
-    no_friction = arrays.PHANTOM.parameters._replace(dry_friction=still, damping=still)
+    no_friction = arrays.PHANTOM.packed_parameters.copy()[0]
+    no_friction.dry_friction = no_friction.damping = still
     for q in postures():
         v = rng.normal(size=6)
         plant.SetPositions(context, phantom.serial_joint_angles(q))

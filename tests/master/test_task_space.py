@@ -133,8 +133,8 @@ def test_end_of_workspace_is_reported_and_start_beyond_rejected():
 
 def test_unactuated_axes_display_zero():
     for model, force, torque in (("geomagic_touch", 3.3, 0.0), ("virtuose_6d", 35.0, 3.1)):
-        numbers, q = device(model).parameters, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
-        start, drive = initial_display_state(q, numbers), np.empty(27)
+        numbers, q = device(model).packed_parameters, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
+        start, drive = initial_display_state(q, numbers[0]), np.empty(27)
         step_display(np.full(6, 100.0), start, numbers, PERIOD, np.empty((6, 6)), drive)
         assert np.linalg.norm(drive[12:15]) == pytest.approx(force, rel=1e-12)
         np.testing.assert_allclose(drive[15:18], torque, rtol=1e-12)
@@ -151,8 +151,7 @@ def test_file_selects_device_and_overrides_figures():
     other = replace(named, master__model="omega_7")  # its data sheet, not the falcon's
     for scenario, model in ((named, "falcon"), (other, "omega_7")):
         devices = scenario.master.device(*HAND), Master(model=model).device(*HAND)
-        for found, wanted in zip(*(each.parameters for each in devices), strict=True):
-            np.testing.assert_array_equal(found, wanted)
+        np.testing.assert_array_equal(*(each.packed_parameters for each in devices))
     for block, where in (
         ({"figures": {"friction": 0.1}}, "figures"),
         ({"model": "falcon", "friction": {"coulomb": [0.1] * 6}}, "friction"),
@@ -191,9 +190,9 @@ def test_encoders_count_whole_steps_from_the_start():
     omega, steps = device(), np.repeat([1e-3, 0.01], 3)
     pose = np.empty(7)
     for away, counts in ((0.4, 0.0), (0.6, 1.0), (-2.3, -2.0)):
-        encoder_pose_into(Q + away * steps, Q, steps, omega.parameters, pose)
+        encoder_pose_into(Q + away * steps, Q, steps, omega.packed_parameters, pose)
         np.testing.assert_allclose(pose, omega.forward_kinematics(Q + counts * steps), atol=1e-12)
-    encoder_pose_into(Q + V, Q, np.zeros(6), omega.parameters, pose)
+    encoder_pose_into(Q + V, Q, np.zeros(6), omega.packed_parameters, pose)
     np.testing.assert_allclose(pose, omega.forward_kinematics(Q + V), atol=1e-12)
 
 

@@ -248,7 +248,7 @@ def test_offset_drifts_and_may_change_during_a_run():
     np.testing.assert_allclose(error, expected, atol=1e-12)
 
     constants, memory = initialize_sensor_chain(part(offset=offset), JOINTS, PERIOD)
-    constants.offset[:6] += 5.0
+    constants[0].offset[:6] += 5.0
     reading = np.empty(13 + JOINTS)
     read_sensor_into(constants, memory, np.zeros(NOISE_BLOCK_SIZE), truths[0], reading)
     np.testing.assert_allclose(reading[:6], truths[0, :6] + offset + 5.0, 1e-12)
@@ -297,13 +297,13 @@ def test_overload_including_offset_is_not_plausible():
     assert are_values_plausible(constants, truth)
     truth[0] = 0.99 * largest
     assert are_values_plausible(constants, truth)
-    constants.offset[0] = 0.02 * largest  # as with the offset
+    constants[0].offset[0] = 0.02 * largest  # as with the offset
     assert not are_values_plausible(constants, truth)
     truth[0] = 0.0
     assert are_values_plausible(constants, truth)
-    constants.offset[0] = np.nan
+    constants[0].offset[0] = np.nan
     assert not are_values_plausible(constants, truth)
-    constants.offset[0] = 0.0
+    constants[0].offset[0] = 0.0
     for place in range(len(truth)):
         for bad in (np.nan, -np.inf, 1e9):
             assert not are_values_plausible(

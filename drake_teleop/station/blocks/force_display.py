@@ -40,7 +40,8 @@ class ForceDisplay(SteppedBlock):
         self, device: HapticDevice | LeaderDevice, period: float, start: ArrayLike = (0.0,) * 6
     ) -> None:
         super().__init__()
-        self._period, self._parameters, self._jacobian = period, device.parameters, np.zeros((6, 6))
+        self._period, self._jacobian = period, np.zeros((6, 6))
+        self._parameters = device.packed_parameters
         memory = display.initial_display_state(finite_array("start", start, 6), device.parameters)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._position = self.DeclareVectorInputPort("joint_position", 6)

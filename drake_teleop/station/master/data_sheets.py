@@ -4,15 +4,16 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
-from drake_teleop.station.master.device_parameters import DeviceParameters
+from drake_teleop.station.master.device_parameters import pack_device_parameters
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
@@ -117,20 +118,29 @@ class Master:
         """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
-        hand = hand_mass, hand_inertia
+        pack = partial(pack_device_parameters, hand_mass=hand_mass, hand_inertia=hand_inertia)
         if self.model == PHANTOM_NAME:
-            peaks = PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
-            resistance = self.friction.coulomb, self.friction.viscous
-            parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
-        else:
-            sheet = self._data_sheet()
-            limits = sheet.peak_force, sheet.peak_torque
-            body = sheet.apparent_mass, sheet.inertia
-            dry = np.repeat([sheet.friction, sheet.friction_torque], 3)
-            damping = np.repeat([sheet.damping, sheet.turning_damping], 3)
-            workspace = sheet.centre, 0.5 * np.array(sheet.size), sheet.turn
-            parameters = DeviceParameters(*hand, *limits, dry, damping, True, *body, *workspace)
-        return HapticDevice(as_compiled_arguments(parameters), self.model)
+            parameters = pack(
+                peak_force=PEAK_FORCE_N,
+                peak_torque=PEAK_WRIST_TORQUES_N_M,
+                dry_friction=self.friction.coulomb,
+                damping=self.friction.viscous,
+            )
+            return HapticDevice(parameters, self.model)
+        sheet = self._data_sheet()
+        parameters = pack(
+            peak_force=sheet.peak_force,
+            peak_torque=sheet.peak_torque,
+            dry_friction=np.repeat([sheet.friction, sheet.friction_torque], 3),
+            damping=np.repeat([sheet.damping, sheet.turning_damping], 3),
+            in_task_space=True,
+            mass=sheet.apparent_mass,
+            inertia=sheet.inertia,
+            workspace_centre=sheet.centre,
+            half_workspace=0.5 * np.array(sheet.size),
+            max_rotation=sheet.turn,
+        )
+        return HapticDevice(parameters, self.model)
 
     @property
     def is_joint_leader(self) -> bool:

@@ -23,7 +23,10 @@ _MAX_STABLE_RATE_TIMES_PERIOD = 2.0
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _advance_device(device, work, stages, state, pose, twist, display, hand_wrench, drive, period):
+def _advance_device(
+    packed_device, work, stages, state, pose, twist, display, hand_wrench, drive, period
+):
+    device = packed_device[0]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
     if are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6]):
         step_device(state, hand_wrench, drive[:6], device, period, work, stages)
@@ -82,7 +85,11 @@ class MasterDevice(LeafSystem):
         check_device_period(device, q_initial, period)
         self._period = period
         self._advance: Callable[..., None] = _advance_device
-        self._constants: tuple[Any, ...] = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
+        self._constants: tuple[Any, ...] = (
+            device.packed_parameters,
+            np.zeros((2, 6, 6)),
+            np.zeros((3, 12)),
+        )
         if isinstance(device, LeaderDevice):
             self._advance = step_leader
             self._constants = device.compiled_constants, device.hand_weight
@@ -102,7 +109,7 @@ class MasterDevice(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
 
     def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
-        states = [discrete_state.get_mutable_value(group) for group in range(4)]
+        states = map(discrete_state.get_mutable_value, range(4))
         inputs = self._hand_wrench.Eval(context), self._drive.Eval(context)
         self._advance(*self._constants, *states, *inputs, self._period)
 

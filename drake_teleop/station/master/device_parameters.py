@@ -2,23 +2,43 @@
 
 from __future__ import annotations
 
-from collections import namedtuple
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Records
 
-#: Parameters of a haptic device for compiled code: mass [kg] of the hand, its inertia about every
-#: axis through E [kg m^2]; largest force [N] (some postures of a leader arm allow less) and torques
-#: (3,) about the rotational axes [N m], 0: none; Coulomb friction (6,) and damping (6,) of the
-#: axes. Then, for a device in `task_space` only: apparent mass and inertia at the grip, centre p_B
-#: (3,) and half edges (3,) of the workspace [m], largest yaw, pitch and roll (3,) [rad].
-DeviceParameters = namedtuple(
-    "DeviceParameters",
-    "hand_mass hand_inertia peak_force peak_torque dry_friction damping in_task_space"
-    " mass inertia workspace_centre half_workspace max_rotation",
-    defaults=(np.zeros(6), np.zeros(6), True, 0.0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3)),
+DeviceParameters: TypeAlias = np.record
+"""Parameters of a haptic device, read by compiled code as attributes; see `DEVICE_DTYPE`."""
+DEVICE_DTYPE = np.dtype(
+    (
+        np.record,
+        [
+            ("hand_mass", float),  # [kg]
+            ("hand_inertia", float),  # of the hand about every axis through E [kg m^2]
+            ("peak_force", float),  # [N]; some postures of a leader arm allow less
+            ("peak_torque", float, 3),  # about the rotational axes [N m]; 0: none
+            ("dry_friction", float, 6),  # Coulomb friction of the axes [N m; N]
+            ("damping", float, 6),  # of the axes [N m s/rad; N s/m]
+            ("in_task_space", bool),  # the other fields are for a device in `task_space`
+            ("mass", float),  # apparent mass at the grip [kg]
+            ("inertia", float),  # apparent inertia at the grip [kg m^2]
+            ("workspace_centre", float, 3),  # p_B [m]
+            ("half_workspace", float, 3),  # half edges [m]
+            ("max_rotation", float, 3),  # largest yaw, pitch and roll [rad]
+        ],
+    )
 )
+
+
+def pack_device_parameters(**values: ArrayLike) -> Records:
+    """Return an array (1,) of `DEVICE_DTYPE`; values that are not given are zero."""
+    packed: Records = np.zeros(1, DEVICE_DTYPE)
+    for name, value in values.items():
+        packed[name] = value
+    return packed
 
 
 @njit(cache=True)

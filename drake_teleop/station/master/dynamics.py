@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, Records
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
 from drake_teleop.station.master.device_parameters import DeviceParameters
@@ -90,10 +90,14 @@ class HapticDevice:
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
     """
 
-    parameters: DeviceParameters
+    packed_parameters: Records
     name: str = "phantom_premium_15"
 
     num_joints = 6
+
+    @property
+    def parameters(self) -> DeviceParameters:
+        return self.packed_parameters[0]
 
     @property
     def friction_setting_path(self) -> str:

@@ -12,7 +12,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 
 @njit(cache=True)
-def encoder_pose_into(q, q_start, steps, device, pose):
+def encoder_pose_into(q, q_start, steps, packed_device, pose):
     """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
 
     `steps` (6,) are in m or rad; 0 disables rounding.
@@ -21,7 +21,7 @@ def encoder_pose_into(q, q_start, steps, device, pose):
     for i in range(6):
         away = q[i] - q_start[i]
         read[i] = q_start[i] + (np.rint(away / steps[i]) * steps[i] if steps[i] > 0.0 else away)
-    pose_into(read, device, pose)
+    pose_into(read, packed_device[0], pose)
 
 
 class Encoders(LeafSystem):
@@ -42,7 +42,7 @@ class Encoders(LeafSystem):
 
     def __init__(self, device: HapticDevice, q_start: Array, steps: Array) -> None:
         super().__init__()
-        self._constants = q_start, steps, device.parameters
+        self._constants = q_start, steps, device.packed_parameters
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
         self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_rounded_pose), inputs)

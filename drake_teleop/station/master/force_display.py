@@ -80,11 +80,12 @@ def motor_torque_into(displayed, q, parameters, J, torque):
 
 
 @njit(cache=True, omits_reference_counting=True)
-def step_display(wrench, device, parameters, period, J, drive):
+def step_display(wrench, device, packed_parameters, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
     `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
     """
+    parameters = packed_parameters[0]
     q, fault = device[_JOINT_POSITIONS_SLOTS], _NO_FAULT
     copy_into(drive, 6, device, 6, _SAFE_STATE_MONITOR_SLOTS.stop - 6)
     if are_finite_and_in_range(q):
@@ -148,7 +149,7 @@ class ForceDisplay(LeafSystem):
 
     def __init__(self, period: float, device: dynamics.HapticDevice | LeaderDevice) -> None:
         super().__init__()
-        self._period, self._parameters = period, device.parameters
+        self._period, self._parameters = period, device.packed_parameters
         self._jacobian, self._shortened = np.zeros((6, 6)), np.zeros(6)
         self._num_joints = device.num_joints
         self._command = self.DeclareVectorInputPort("wrench_command", 6)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, Records
 from drake_teleop.common.vectors import (
     add_vector_into,
     copy_into,
@@ -171,18 +171,22 @@ class LeaderDevice:
             lower and upper limits [rad], stiffness and damping of end stops, torque limits [N m],
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
-        parameters: parameters for the force display.
+        packed_parameters: parameters for the force display, in an array (1,).
     """
 
     arm: ArmModel
     arm_without_hand: ArmModel
     joint_table: Array
     home: Array
-    parameters: DeviceParameters
+    packed_parameters: Records
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
     friction_setting_path = "master.leader"
+
+    @property
+    def parameters(self) -> DeviceParameters:
+        return self.packed_parameters[0]
 
     @property
     def num_joints(self) -> int:

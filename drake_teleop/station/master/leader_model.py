@@ -11,9 +11,9 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import inertia_about_origin
-from drake_teleop.station.master.device_parameters import DeviceParameters
+from drake_teleop.station.master.device_parameters import pack_device_parameters
 from drake_teleop.station.master.leader import LeaderDevice, make_leader_joint_table
 from drake_teleop.station.slave import arm as serial_arm
 from drake_teleop.station.slave.arm import ArmModel
@@ -90,8 +90,13 @@ class Leader:
         limits = self.torque_limit, "master.leader.torque_limit", arm.effort_limit
         rows = coulomb, viscous, values_per_joint(arm, *limits)
         joint_table = make_leader_joint_table(held, home, *rows, self.weight_carried)
-        peak = self.peak_force, np.full(3, self.peak_torque)
-        parameters = as_compiled_arguments(DeviceParameters(hand_mass, hand_inertia, *peak))
+        parameters = pack_device_parameters(
+            hand_mass=hand_mass,
+            hand_inertia=hand_inertia,
+            peak_force=self.peak_force,
+            peak_torque=self.peak_torque,
+            in_task_space=True,
+        )
         return LeaderDevice(held, arm_without_hand, joint_table, home, parameters)
 
     def _home_positions(self, arm: ArmModel) -> Array:

@@ -7,7 +7,6 @@ Sources of specific force s of So, angular velocity omega and acceleration alpha
 - `fused`: a steady-state Kalman filter per axis integrates s and alpha, corrected by the encoders.
 """
 
-from collections import namedtuple
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
-from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.common.numeric import Array, Records, pack_for_compiled_code
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -53,11 +52,6 @@ _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 #: Constants: whether the encoders are the only source, and whether they correct the accelerometer;
 #: waits of wrench, acceleration, angles (fractional); low-passes of the sensor and of `encoders`.
-_EstimatorConstants = namedtuple(
-    "_EstimatorConstants",
-    "period encoders_only fused wait_samples accelerometer_position R_SA angle_low_passes"
-    " angle_gains linear_gains",
-)
 _NUM_ANGLE_SECTIONS = 4
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
@@ -191,25 +185,29 @@ def _accelerometer_std(sensor: WristSensorConfig) -> tuple[Array, Array]:
 
 def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[_EstimatorConstants, Array]:
+) -> tuple[Records, Array]:
     """Return constants and initial memory of `estimate_sample_into`."""
     *paths, sample = path_delays(config, sensor, period)
     used = np.array([True, config.source != "encoders", True])
     waits = np.where(used, sample - np.array(paths), 0.0) / period
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
-    constants = _EstimatorConstants(
-        period,
-        config.source == "encoders",
-        config.source == "fused" and not sensor.ideal,  # an ideal one needs no correction
-        waits,
-        *sensor.accelerometer_pose(),
-        _angle_low_pass_sections(config, sensor, period),
-        *fusion_gains(config, sensor, num_joints, period),
+    p_SoAo_S, R_SA = sensor.accelerometer_pose()
+    angle_gains, linear_gains = fusion_gains(config, sensor, num_joints, period)
+    constants = pack_for_compiled_code(
+        period=period,
+        encoders_only=config.source == "encoders",
+        fused=config.source == "fused" and not sensor.ideal,  # an ideal one needs no correction
+        wait_samples=waits,
+        accelerometer_position=p_SoAo_S,
+        R_SA=R_SA,
+        angle_low_passes=_angle_low_pass_sections(config, sensor, period),
+        angle_gains=angle_gains,
+        linear_gains=linear_gains,
     )
     rows = int(np.ceil(waits.max())) + 1
     size = _MEMORY_SIZE_PER_JOINT * num_joints + rows * (12 + num_joints)
-    return as_compiled_arguments(constants), np.zeros(_JOINT_MEMORY_START + size)
+    return constants, np.zeros(_JOINT_MEMORY_START + size)
 
 
 def _angle_low_pass_sections(
@@ -237,7 +235,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
         reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
-    n = sample.shape[0] - regressor.FIRST_JOINT_INDEX
+    constants, n = constants[0], sample.shape[0] - regressor.FIRST_JOINT_INDEX
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     angles, gravity = sample[regressor.SAMPLE_JOINT_POSITION], motion[:3]
     _align_signal_paths(constants, memory, n, reading, sample)
@@ -282,7 +280,7 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
 
 @njit(cache=True)
 def _align_signal_paths(constants, memory, n, reading, sample):
-    sections, angles = constants.angle_low_passes, sample[regressor.SAMPLE_JOINT_POSITION]
+    sections, angles = constants.angle_low_passes[:], sample[regressor.SAMPLE_JOINT_POSITION]
     filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:

@@ -12,7 +12,6 @@ low-pass is analog or mechanical (`before_noise`), or digital as in the JR3 (`af
 
 import copy
 import dataclasses
-from collections import namedtuple
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,7 +22,7 @@ from drake_teleop.common.blocks import LARGEST_PORT_VALUE
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.common.numeric import Array, Records, pack_for_compiled_code
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -274,12 +273,6 @@ READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 #: Constants of the chain: those up to `range` are of 12 channels, and `offset` may change in a run.
 #: Calibrations: (6, 6) of the wrench, (2, 3, 3) of s and alpha from S into A; low-pass: (2, 5).
-_ChainConstants = namedtuple(
-    "_ChainConstants",
-    "offset drift_per_sample noise_std walk_step_std quantum range wrench_calibration"
-    " motion_calibration accelerometer_position low_pass low_pass_stage latency_samples"
-    " encoder_quantum is_ideal overload_limits",
-)
 _LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
@@ -291,10 +284,10 @@ _DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
-) -> tuple[_ChainConstants, Array]:
+) -> tuple[Records, Array]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
-    `constants.offset[:6]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
+    `constants[0].offset[:6]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
@@ -306,23 +299,35 @@ def initialize_sensor_chain(
     latencies = config.latency_samples(period)
     drift = np.append(np.array(config.drift) * period, np.zeros(6))
     walk_step_std = config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period)
-    errors = drift, config.noise_std(), walk_step_std, config.resolution * ranges
-    channels = [*config.offset, *config.acceleration_offset], *errors, limits
-    calibrations = wrench, [force @ R_SA.T, angular @ R_SA.T]
-    low_pass = sections, _LOW_PASS_CHOICES.index(config.low_pass)
-    rest = config.encoder_resolution, config.ideal, _PLAUSIBLE_RANGES_UNSATURATED * ranges[:6]
-    constants = _ChainConstants(*channels, *calibrations, p_SoAo_S, *low_pass, latencies, *rest)
+    constants = pack_for_compiled_code(
+        offset=[*config.offset, *config.acceleration_offset],
+        drift_per_sample=drift,
+        noise_std=config.noise_std(),
+        walk_step_std=walk_step_std,
+        quantum=config.resolution * ranges,
+        range=limits,
+        wrench_calibration=wrench,
+        motion_calibration=[force @ R_SA.T, angular @ R_SA.T],
+        accelerometer_position=p_SoAo_S,
+        low_pass=sections,
+        low_pass_stage=_LOW_PASS_CHOICES.index(config.low_pass),
+        latency_samples=latencies,
+        encoder_quantum=config.encoder_resolution,
+        is_ideal=config.ideal,
+        overload_limits=_PLAUSIBLE_RANGES_UNSATURATED * ranges[:6],
+    )
     rows = 0 if config.ideal else latencies.max() + 1
     memory = np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
-    return as_compiled_arguments(constants), memory
+    return constants, memory
 
 
 @njit(cache=True)
 def are_values_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
+    offset, limits = constants[0].offset, constants[0].overload_limits
     good = True
     for i in range(6):
-        good = good and abs(truth[i] + constants.offset[i]) <= constants.overload_limits[i]
+        good = good and abs(truth[i] + offset[i]) <= limits[i]
     for i in range(6, truth.shape[0]):
         good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
@@ -340,7 +345,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
-    angles = truth[TRUE_JOINT_ANGLES]
+    constants, angles = constants[0], truth[TRUE_JOINT_ANGLES]
     if constants.is_ideal != 0.0:
         copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
         copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
@@ -354,7 +359,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row, channels = line[0], line[0, :_NUM_CHANNELS]
     walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
     filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
-    sections, place = constants.low_pass, constants.low_pass_stage
+    sections, place = constants.low_pass[:], constants.low_pass_stage
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         step = noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
         for i in range(_NUM_CHANNELS):

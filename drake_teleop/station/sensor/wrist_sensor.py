@@ -274,7 +274,7 @@ class WristSensor(LeafSystem):
         self._physics, contact = slave.physics_of_plant, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
-        self.offset, self.phi = constants.offset[:6], self._physics[1]
+        self.offset, self.phi = constants["offset"][0, :6], self._physics[1]
         self.contact_pairs = self._physics[2]
         first = sample_at_rest(arm, slave.start)
         if not config.ideal:

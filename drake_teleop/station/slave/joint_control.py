@@ -290,20 +290,20 @@ class JointControl(LeafSystem):
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joint_torque)
-        self._arm, self._groups, self._constants = arm.table, range(1), tuple[Any, ...]()
+        self._arm, self._groups, self._constants = arm.table, [0], tuple[Any, ...]()
         if interface is None:
             self._servo = computed_torque_into
             self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
         else:
-            self._servo, self._groups = position_servo_torque_into, range(2)
+            self._servo, self._groups = position_servo_torque_into, [1, 0]
             arguments = _interface_constants_and_memory(arm, interface, period, q_start)
             self._constants, memory = arguments
             self.DeclareDiscreteState(memory)
 
     def _update_joint_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
         inputs = self._command.Eval(context), self._state.Eval(context)
-        torque, *memory = [discrete_state.get_mutable_value(group) for group in self._groups]
-        self._servo(self._arm, *inputs, *self._constants, *memory, torque)
+        states = map(discrete_state.get_mutable_value, self._groups)
+        self._servo(self._arm, *inputs, *self._constants, *states)
 
 
 class HeldTorque(LeafSystem):
