@@ -90,6 +90,13 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
         now[i], rate[i] = start, (end - start) / (samples * period)
 
 
+@njit(cache=True, omits_reference_counting=True)
+def _torque_at_time_into(time, line, torque):
+    n = torque.shape[0]
+    for i in range(n):
+        torque[i] = line[i] + (time - line[-1]) * line[n + i]
+
+
 class SampledServo(LeafSystem):
     """Block that controls joints by computed torque, with several servo samples per event.
 
@@ -123,8 +130,8 @@ class SampledServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update_torque_line)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        n, line = self._n, context.get_discrete_state_vector().value()
-        output.SetFromVector(line[:n] + (context.get_time() - line[-1]) * line[n : 2 * n])
+        line = context.get_discrete_state_vector().value()
+        _torque_at_time_into(context.get_time(), line, output.get_mutable_value())
 
     def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
