@@ -67,7 +67,7 @@ FAULT_WARNINGS = {
 
 
 @njit(cache=True)
-def are_finite_and_in_range(numbers):
+def are_valid_port_values(numbers):
     """Return whether all numbers are finite and at most `LARGEST_PORT_VALUE` in magnitude."""
     good = True
     for x in numbers:

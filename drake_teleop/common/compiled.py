@@ -154,10 +154,10 @@ def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
     options = getattr(compiled, "targetoptions", {})
     text = (
         _qualified_name(compiled),
-        _constant_text(function.__code__),
-        _constant_text(function.__defaults__),
+        _cache_key_text(function.__code__),
+        _cache_key_text(function.__defaults__),
         sorted((name, str(option)) for name, option in options.items()),
-        sorted((name, _constant_text(value)) for name, value in constants.items()),
+        sorted((name, _cache_key_text(value)) for name, value in constants.items()),
     )
     package = function.__module__.partition(".")[0]
     callees = (value for value in constants.values() if _is_callee(value, package))
@@ -193,14 +193,14 @@ def _names_referenced_by_code(code: CodeType) -> Iterator[str]:
             yield from _names_referenced_by_code(constant)
 
 
-def _constant_text(value: Any) -> str:
+def _cache_key_text(value: Any) -> str:
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
         # Since Python 3.11 exception handlers are in a separate table.
         parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
-        return repr((parts, _constant_text(value.co_consts)))
+        return repr((parts, _cache_key_text(value.co_consts)))
     if isinstance(value, tuple):
-        return f"{type(value).__name__}{[_constant_text(each) for each in value]}"
+        return f"{type(value).__name__}{[_cache_key_text(each) for each in value]}"
     if isinstance(value, np.ndarray):
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):

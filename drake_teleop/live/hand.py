@@ -13,7 +13,7 @@ from pydrake.systems import framework
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_valid_port_values, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.live.station_swap import build_master_side
@@ -237,7 +237,7 @@ def _pose_and_twist_on_path_into(path, time, out):
 @njit(cache=True)
 def _update_displayed_wrench(wrench, is_device_held, period, limits, last_state, state):
     fault = 0.0
-    if not are_finite_and_in_range(wrench):
+    if not are_valid_port_values(wrench):
         fault = _WRENCH_FAULT_NUMBER
     enabled = is_device_held and fault == 0.0
     change = _LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S

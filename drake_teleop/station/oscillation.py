@@ -97,7 +97,7 @@ def pose_reversal_times(t: Array, pose: Array) -> Array:
 def doubled_quaternions(pose: Array, reference: Array) -> Array:
     """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
 
-    Each quaternion has the sign that is nearer to the first one of `reference` (N, 7).
+    Each has the sign that is nearer to the quaternion of the pose `reference[0]`.
     """
     q: Array = pose[:, :4]
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]

@@ -80,7 +80,7 @@ def _block_lines(config: Any) -> list[str]:
     lines = []
     for entry in entries:
         if entry.kind == "block":
-            lines += _inner_block_lines(entry)
+            lines += _nested_block_lines(entry)
             continue
         line = f"{starts[entry.name]:{column}}  # {comment_of_field(entry)}"
         of_preset = preset is not None and entry.default == getattr(preset, entry.name)
@@ -88,7 +88,7 @@ def _block_lines(config: Any) -> list[str]:
     return lines
 
 
-def _inner_block_lines(entry: FieldInfo) -> list[str]:
+def _nested_block_lines(entry: FieldInfo) -> list[str]:
     if entry.default:
         return _field_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]

@@ -32,7 +32,7 @@ class NetworkChannel(SteppedBlock):
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
         - arriving: (N + 1,) value of `received` at the next period; depends on the input
 
-    Connect `arriving` to a block that updates at the same instants and whose output is a state.
+    Connect `arriving` to a block with the same period and without feedthrough.
 
     Args:
         size: length N of the vector.
@@ -42,8 +42,8 @@ class NetworkChannel(SteppedBlock):
         direction: 0 or 1; each direction has its own random numbers.
 
     Raises:
-        DrakeTeleopError: if `config.silence` requires packets of a passivity method, and `size`
-            is not the length of such a packet.
+        DrakeTeleopError: if `config.silence` is not "hold" and `size` is not the packet size of a
+            passivity method.
     """
 
     __slots__ = ()

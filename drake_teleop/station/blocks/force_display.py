@@ -1,4 +1,4 @@
-"""Force display: motor torques J^T F for a wrench F, within the limits of any haptic device."""
+"""Force display: motor torques J^T F for a wrench F, within the device's limits."""
 
 from __future__ import annotations
 

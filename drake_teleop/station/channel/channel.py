@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import are_finite_and_in_range
+from drake_teleop.common.blocks import are_valid_port_values
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -169,7 +169,7 @@ def step_master_end(
     for g in range(2):
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
-    if are_finite_and_in_range(hand_B):
+    if are_valid_port_values(hand_B):
         _convert_wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
@@ -203,7 +203,7 @@ def step_slave_end(
     for g in range(2):
         work[g] += dot_of_group(held, dx, g)
     load = memory[slots.LOAD_WRENCH]
-    if not (are_finite_and_in_range(wrench_B) and are_finite_and_in_range(load_B)):
+    if not (are_valid_port_values(wrench_B) and are_valid_port_values(load_B)):
         valid = False
         ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
     elif saturated:
@@ -238,7 +238,7 @@ def step_slave_end(
 @njit(cache=True)
 def _update_pose_and_twist(pose, before, T, dx, twist):
     """Write change (6,) and twist (6,), 0 unless both poses are valid; return whether `pose` is."""
-    valid = are_finite_and_in_range(pose)
+    valid = are_valid_port_values(pose)
     if valid:
         pose_difference_into(pose, before, dx)
         copy_into(before, 0, pose, 0, 7)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
@@ -46,7 +46,7 @@ def update_contact_flag_with_sample(memory, sample, estimate, acceleration, sett
 
     `acceleration` (3,) is that of So, in S [m/s^2]; `settings` is `ContactDetector.settings`.
     """
-    if not (are_finite_and_in_range(sample) and are_finite_and_in_range(estimate)):
+    if not (are_valid_port_values(sample) and are_valid_port_values(estimate)):
         return memory[CONTACT_INDEX] != 0.0
     contact = np.empty(6)
     s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -28,7 +28,7 @@ def _advance_device(
 ):
     device = packed_device[0]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
-    if are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6]):
+    if are_valid_port_values(hand_wrench) and are_valid_port_values(drive[:6]):
         step_device(state, hand_wrench, drive[:6], device, period, work, stages)
         pose_into(state[:6], device, pose)
         twist_into(state[:6], state[6:], device, work[0], twist)

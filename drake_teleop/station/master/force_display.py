@@ -7,7 +7,7 @@ import math
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_valid_port_values, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
@@ -88,11 +88,11 @@ def step_display(wrench, device, packed_parameters, period, J, drive):
     parameters = packed_parameters[0]
     q, fault = device[_JOINT_POSITIONS_SLOTS], _NO_FAULT
     copy_into(drive, 6, device, 6, _SAFE_STATE_MONITOR_SLOTS.stop - 6)
-    if are_finite_and_in_range(q):
+    if are_valid_port_values(q):
         copy_into(drive, _LAST_VALID_POSITIONS_SLOTS.start, q, 0, 6)
     else:
         q, fault = device[_LAST_VALID_POSITIONS_SLOTS], _HAND_FAULT
-    if not are_finite_and_in_range(wrench):
+    if not are_valid_port_values(wrench):
         fault = _WRENCH_FAULT
     displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_WRENCH_SLOTS], fault
     dynamics.jacobian_into(q, parameters, J)

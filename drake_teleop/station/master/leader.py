@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.blocks import are_finite_and_in_range
+from drake_teleop.common.blocks import are_valid_port_values
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, Records
@@ -106,8 +106,8 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
     _, arm, joint_table = leader
     n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
-    valid = are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6])
-    if valid and are_finite_and_in_range(state):
+    valid = are_valid_port_values(hand_wrench) and are_valid_port_values(drive[:6])
+    if valid and are_valid_port_values(state):
         F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
         for i in range(3):
             F[i], F[3 + i] = drive[i], drive[5 - i]
@@ -127,7 +127,7 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
             add_runge_kutta_stage(i, period, slope, total, stage, state)
         _update_pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
-        display[i] = pose[4 + i] if are_finite_and_in_range(state) else math.nan
+        display[i] = pose[4 + i] if are_valid_port_values(state) else math.nan
 
 
 @njit(cache=True)

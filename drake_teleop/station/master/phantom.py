@@ -244,7 +244,7 @@ def inverse_kinematics(pose: Array) -> Array:
 
 
 def serial_joint_angles(q: Array) -> Array:
-    """Return the joint angles of `phantom.sdf` for q (..., 6): its third is q3 - q2."""
+    """Return the joint angles of `phantom.sdf` for q (..., 6): the third is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial

@@ -35,16 +35,16 @@ def update_contact_fit(sums, force_change, displacement, speed_change, kept_weig
 
 
 @njit(cache=True)
-def force_without_slip_steps(displayed, component, explained_change, share, max_change):
+def force_without_slip_steps(rendered, measured, explained_change, removed_share, max_difference):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change
-    `explained_change` by depth and speed is rendered at once. The remaining difference, at most
-    `max_change`, is reduced by `share`.
+    The last force, `rendered` [N], changes by `explained_change` [N], due to depth and speed. Then
+    `removed_share` of its difference from `measured` [N] is removed; at most `max_difference` [N]
+    remains.
     """
-    displayed += explained_change
-    displayed += min(share, 1.0) * (component - displayed)
-    return min(max(displayed, component - max_change, 0.0), component + max_change)
+    rendered += explained_change
+    rendered += min(removed_share, 1.0) * (measured - rendered)
+    return min(max(rendered, measured - max_difference, 0.0), measured + max_difference)
 
 
 @njit(cache=True)

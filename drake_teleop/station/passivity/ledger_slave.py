@@ -102,7 +102,7 @@ def wrench_component_along(a, b, p):
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return wrench (6,) times displacement (6,): work [J], for a unit wrench a length [m]."""
+    """Return wrench (6,) times displacement (6,): work [J]; a length [m] for unit wrenches."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, Fault, are_valid_port_values
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -106,17 +106,17 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
 
 
 @njit(cache=True)
-def blend_scales_at(change, time, scales):
+def blend_scales_at(ramp, time, scales):
     """Write the scales at `time` [s] to `scales` (6,): a minimum-jerk blend from old to new ones.
 
-    `change` (14,) contains old scales (6), new scales (6), start of the change [s], duration [s].
+    `ramp` (14,) contains old scales (6), new scales (6), start of the ramp [s], duration [s].
     Scales are sigma of gripper and object, gamma, force scale, weights of gripper and object.
     """
-    u = min(max((time - change[12]) / change[13], 0.0), 1.0) if change[13] > 0.0 else 1.0
+    u = min(max((time - ramp[12]) / ramp[13], 0.0), 1.0) if ramp[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
     for i in range(_NUM_BLENDED_SCALES):
         # Exact at both ends, so that unchanged scales equal the configured ones.
-        scales[i] = (1.0 - share) * change[i] + share * change[_NUM_BLENDED_SCALES + i]
+        scales[i] = (1.0 - share) * ramp[i] + share * ramp[_NUM_BLENDED_SCALES + i]
 
 
 @njit(cache=True)
@@ -139,66 +139,66 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
 
 
 @njit(cache=True)
-def find_sample_fault(sample, estimate, time, valid_range):
+def find_sample_fault(sample, estimate, time, sample_limits):
     """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
-    `valid_range` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
+    `sample_limits` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
     """
-    if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= valid_range[6]:
+    if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= sample_limits[6]:
         return _STALE_SAMPLE_FAULT
     reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.LOST_SAMPLE_FLAG
-    reading = reading and are_finite_and_in_range(sample[regressor.SAMPLE_MOTION])
+    reading = reading and are_valid_port_values(sample[regressor.SAMPLE_MOTION])
     for i in range(6):
-        reading = reading and abs(sample[i]) <= valid_range[i]
+        reading = reading and abs(sample[i]) <= sample_limits[i]
     if not reading:
         return _BAD_READING_FAULT
-    if not are_finite_and_in_range(sample[_JOINT_ANGLES]):
+    if not are_valid_port_values(sample[_JOINT_ANGLES]):
         return _BAD_JOINTS_FAULT
-    return _NO_FAULT if are_finite_and_in_range(estimate) else _BAD_LOAD_FAULT
+    return _NO_FAULT if are_valid_port_values(estimate) else _BAD_LOAD_FAULT
 
 
 @njit(cache=True)
-def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out):
+def _scaled_wrench_at_time_into(sample, estimate, gripper, scale_ramp, time, arm, out):
     scales = np.empty(_NUM_BLENDED_SCALES)
-    blend_scales_at(change, time, scales)
+    blend_scales_at(scale_ramp, time, scales)
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
 
 
 @njit(cache=True)
-def _contact_wrench_into(sample, estimate, gripper, change, time, arm, contact_scales, out):
+def _contact_wrench_into(sample, estimate, gripper, scale_ramp, time, arm, contact_scales, out):
     _scaled_wrench_into(sample, estimate, gripper, arm, contact_scales, out)
 
 
 @njit(cache=True)
-def _non_contact_wrench_into(sample, estimate, gripper, change, time, out):
+def _non_contact_wrench_into(sample, estimate, gripper, scale_ramp, time, out):
     motion = sample[regressor.SAMPLE_MOTION]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], estimate[6:], out)
 
 
 @njit(cache=True)
-def _sample_fault_into(sample, estimate, gripper, change, time, valid_range, out):
-    out[0] = find_sample_fault(sample, estimate, time, valid_range)
+def _sample_fault_into(sample, estimate, gripper, scale_ramp, time, sample_limits, out):
+    out[0] = find_sample_fault(sample, estimate, time, sample_limits)
 
 
 @njit(cache=True, omits_reference_counting=True)
 def _scaled_contact_and_fault_into(
-    sample, estimate, gripper, change, time, arm, contact_scales, valid_range, out
+    sample, estimate, gripper, scale_ramp, time, arm, contact_scales, sample_limits, out
 ):
-    _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out[:6])
+    _scaled_wrench_at_time_into(sample, estimate, gripper, scale_ramp, time, arm, out[:6])
     _scaled_wrench_into(sample, estimate, gripper, arm, contact_scales, out[6:12])
-    out[12] = find_sample_fault(sample, estimate, time, valid_range)
+    out[12] = find_sample_fault(sample, estimate, time, sample_limits)
 
 
 @njit(cache=True)
 def _rendered_wrench_into(
-    sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact_share, out
+    sample, estimate, gripper, scale_ramp, time, arm, R_WB, sample_limits, contact_factor, out
 ):
-    if find_sample_fault(sample, estimate, time, valid_range) != _NO_FAULT:
+    if find_sample_fault(sample, estimate, time, sample_limits) != _NO_FAULT:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
-    blend_scales_at(change, time, scales)
-    scales[2] *= contact_share
+    blend_scales_at(scale_ramp, time, scales)
+    scales[2] *= contact_factor
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
     forward_kinematics(arm, sample[_JOINT_ANGLES], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
@@ -244,7 +244,7 @@ class ForceScaling(LeafSystem):
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
-        valid_range, phi = np.append(largest, oldest), config.gripper_phi
+        sample_limits, phi = np.append(largest, oldest), config.gripper_phi
         self._gripper = None if phi is None else np.concatenate([np.zeros(6), phi])
         # Old and new scales, start and length of the change; see `blend_scales_at`.
         found = config.scales()
@@ -254,16 +254,16 @@ class ForceScaling(LeafSystem):
         self._sample = self.DeclareVectorInputPort("sample", sample_size)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         contact, rendered = (arm.table, _CONTACT_ONLY_SCALES), _rendered_wrench_into
-        frames = arm.table, np.ascontiguousarray(R_WB), valid_range
+        frames = arm.table, np.ascontiguousarray(R_WB), sample_limits
         for name, size, calculate_into, constants in (
             ("scaled_wrench_S", 6, _scaled_wrench_at_time_into, (arm.table,)),
             ("contact_wrench_S", 6, _contact_wrench_into, contact),
             ("non_contact_wrench_S", 6, _non_contact_wrench_into, ()),
             ("wrench_B", 6, rendered, (*frames, 1.0)),
             ("load_wrench_B", 6, rendered, (*frames, 0.0)),
-            ("fault", 1, _sample_fault_into, (valid_range,)),
+            ("fault", 1, _sample_fault_into, (sample_limits,)),
             ("scaled_contact_and_fault", 13, _scaled_contact_and_fault_into,
-             (*contact, valid_range)),
+             (*contact, sample_limits)),
         ):  # fmt: skip
             self._declare_output(name, size, calculate_into, constants)
 
@@ -310,5 +310,5 @@ class ForceScaling(LeafSystem):
     def _evaluate_inputs(self, context: Context) -> tuple[Any, ...]:
         sample, estimate = self._sample.Eval(context), self._estimate.Eval(context)
         gripper = estimate if self._gripper is None else self._gripper
-        change = context.get_numeric_parameter(self._change).value()
-        return sample, estimate, gripper, change, context.get_time()
+        scale_ramp = context.get_numeric_parameter(self._change).value()
+        return sample, estimate, gripper, scale_ramp, context.get_time()

@@ -50,7 +50,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
     ContactPlantCopy,
-    assemble_plant_state,
+    assemble_plant_state_into,
     contact_and_plant_rates_into,
     contact_wrench_W,
     environment_wrench_about_Wo_into,
@@ -124,7 +124,7 @@ def append_step_to_queue(queue, time, state, surroundings):
     width = state.shape[0] + 1 + surroundings.shape[0]
     entry = queue[2 + int(queue[1]) * width :][:width]
     entry[0] = time
-    assemble_plant_state(state, surroundings, entry[1:])
+    assemble_plant_state_into(state, surroundings, entry[1:])
     queue[1] += 1.0
 
 
@@ -179,7 +179,7 @@ def take_due_samples(
     now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
-    assemble_plant_state(state, surroundings, now)
+    assemble_plant_state_into(state, surroundings, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
     _extrapolate_torque_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
@@ -437,7 +437,7 @@ class WristSensor(LeafSystem):
         n, physics = self._n, self._physics
         state, around = self._states_of_arm_and_environment(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
-        assemble_plant_state(state, around, x)
+        assemble_plant_state_into(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)

@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
@@ -148,7 +148,7 @@ def _nearest_branch_into(
         return _BAD_POSE
     for i in range(6):
         q[i] = min(max(reference[i], lower[i]), upper[i])
-    if not (np.isfinite(R.sum()) and are_finite_and_in_range(p)):
+    if not (np.isfinite(R.sum()) and are_valid_port_values(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
     status = _ik_status_and_all_solutions_into(R, p, reference[0], reference[3], branches)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
@@ -72,7 +72,7 @@ class LeaderJointFollower(LeafSystem):
 
     def _next_command(self, context: Context) -> tuple[Array, IkStatus]:
         last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
-        if not are_finite_and_in_range(leader):
+        if not are_valid_port_values(leader):
             return last, IkStatus.BAD_POSE
         within = np.clip(leader, self._lower, self._upper)
         status = IkStatus.OK if (within == leader).all() else IkStatus.JOINT_LIMIT

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -159,12 +159,12 @@ def computed_torque_into(table, command, state, kp, kv, speed_limit, effort_limi
     `effort_limit`. Invalid encoder readings give gravity compensation at the commanded posture; an
     invalid command keeps the last torque.
     """
-    if not are_finite_and_in_range(command):
+    if not are_valid_port_values(command):
         return
     n = torque.shape[0]
     q, v, acceleration = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
     copy_into(scratch, 0, state, 0, 2 * n)
-    if not are_finite_and_in_range(state):
+    if not are_valid_port_values(state):
         copy_into(q, 0, command, 0, n)
         v[:] = 0.0
     for i in range(n):
@@ -197,7 +197,7 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
-    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and are_finite_and_in_range(command):
+    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and are_valid_port_values(command):
         if queued > 0.0:
             place = 2 + 3 * n + int(memory[_OLDEST_QUEUED_INDEX]) * n
             copy_into(target, 0, memory, place, n)
@@ -231,7 +231,7 @@ def position_servo_torque_into(
     n = torque.shape[0]
     _advance_joint_reference(command, interface, limits, memory, scratch)
     q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
-    if are_finite_and_in_range(state):
+    if are_valid_port_values(state):
         copy_into(q, 0, state, 0, n)
         copy_into(v, 0, state, n, n)
         for i in range(n):
@@ -324,7 +324,7 @@ class HeldTorque(LeafSystem):
 
     def _hold_requested_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
         torque = self._request.Eval(context)
-        if are_finite_and_in_range(torque):
+        if are_valid_port_values(torque):
             discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))
 
 

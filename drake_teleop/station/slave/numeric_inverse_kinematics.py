@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common import vectors
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_finite_and_in_range, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import (
@@ -180,8 +180,8 @@ def follow_pose(
         q[i] = min(max(reference[i], lower[i]), upper[i])
         low[i], high[i] = max(q[i] - max_step[i], lower[i]), min(q[i] + max_step[i], upper[i])
     length = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3]
-    if not (are_finite_and_in_range(reference) and are_finite_and_in_range(pose) and length > 0.0):
-        if not are_finite_and_in_range(reference):
+    if not (are_valid_port_values(reference) and are_valid_port_values(pose) and length > 0.0):
+        if not are_valid_port_values(reference):
             q[:] = np.nan
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
@@ -336,7 +336,7 @@ def _follow_command(
     """
     n = q.shape[0]
     vectors.copy_into(q, 0, last, 0, n)
-    if not are_finite_and_in_range(position):
+    if not are_valid_port_values(position):
         return _BAD_POSE
     reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)
     if elapsed > 0.0:  # inf * 0 is nan

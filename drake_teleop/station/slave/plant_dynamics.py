@@ -166,7 +166,7 @@ class ToolContact(LeafSystem):
 
 
 @njit(cache=True)
-def assemble_plant_state(state, surroundings, x):
+def assemble_plant_state_into(state, surroundings, x):
     """Write x from `state` [q; v] and `surroundings` [leaf deflection, rate, plant's q; v]."""
     n = state.shape[0] // 2
     copy_into(x, 0, state, 0, n)

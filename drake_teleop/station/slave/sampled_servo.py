@@ -22,7 +22,7 @@ from drake_teleop.station.slave.joint_control import (
 )
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
-    assemble_plant_state,
+    assemble_plant_state_into,
     contact_and_plant_rates_into,
 )
 
@@ -62,7 +62,7 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
     predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
-    assemble_plant_state(state, sheet, x)
+    assemble_plant_state_into(state, sheet, x)
     now[:] = 0.0
     rate[:] = 0.0
     for k in range(samples):

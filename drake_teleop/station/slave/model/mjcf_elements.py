@@ -50,7 +50,7 @@ class Attributes(dict[str, str]):
         return [*values, *default[len(values) :]][: len(default)]
 
     def vector(self, name: str, default: tuple[float, ...]) -> Array:
-        """Return the numbers in attribute `name`, or `default`; their number must be equal."""
+        """Return the numbers in attribute `name`, or `default`; another count adds a fault."""
         count, values = len(default), self.numbers(name, default)
         has_wrong_count = len(self.get(name, "").split()) not in (0, count)
         if has_wrong_count or max(map(abs, values)) > MAX_MODEL_VALUE_SI:

@@ -31,7 +31,7 @@ class MassProperties(NamedTuple):
     inertia: Array
 
     def in_frame(self, X_BG: RigidTransform) -> MassProperties:
-        """Return properties that are given in G, in the frame B."""
+        """Return the properties, transformed from frame G to B."""
         R = X_BG.rotation().matrix()
         return MassProperties(self.mass, X_BG @ self.centre, R @ self.inertia @ R.T)
 
