@@ -42,7 +42,7 @@ class MultiSine:
         return odd[odd > 0]
 
     def sines_along(self, direction: Array, start: float) -> list[Sine]:
-        """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
+        """Return one `Sine` per frequency, along `direction` (6,) in base B, from `start` [s]."""
         frequencies = self.odd_multiples_of_base_rate() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         phases = self._phases_with_lowest_peak()

@@ -67,7 +67,7 @@ class Linearization:
     def multipliers(self) -> Complex:
         """Eigenvalues over one period, largest first; stable if all magnitudes are below 1.
 
-        Above 800 states they are only those near the unit circle, up to 100 Hz.
+        Above 800 states only those near the unit circle, up to 100 Hz, are returned.
         """
         A, size = self._state_matrix_with_delays(), self.num_states
         if size <= _MAX_STATES_FOR_DENSE_EIGENVALUES:

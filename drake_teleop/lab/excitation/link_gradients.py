@@ -32,13 +32,13 @@ _VIRTUAL_V_IN_SEED, _VIRTUAL_W_IN_SEED = 15, 18
 
 
 @njit(cache=True)
-def rotate_to_world(motion, a):
-    return apply_matrix(matrix_at(motion, 12), a)
+def rotate_to_world(motion, vector_L):
+    return apply_matrix(matrix_at(motion, 12), vector_L)
 
 
 @njit(cache=True)
-def rotate_to_link(motion, a):
-    return apply_matrix(transposed(matrix_at(motion, 12)), a)
+def rotate_to_link(motion, vector_W):
+    return apply_matrix(transposed(matrix_at(motion, 12)), vector_W)
 
 
 @njit(cache=True)

@@ -145,7 +145,7 @@ class MainEffect:
         mean, half_width: (n,) mean over other factors and seeds, and its half width.
         effect, effect_half_width: (n,) difference from the mean of all levels, and its half width.
         missing_reasons: (n,) reason of a missing value.
-        num_used_combinations, num_unused_combinations: of the levels of other factors.
+        num_used_combinations, num_unused_combinations: combinations of other factors' levels.
         is_fitted: True if the values are from a regression.
     """
 

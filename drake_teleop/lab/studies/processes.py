@@ -107,25 +107,25 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
             found += next(_joblib_pool(2)([_joblib_task(run, [row], store)]))
         except BrokenExecutor:
             found.append(row | {"error": PROCESS_ENDED_ERROR})
-    store.clear_chunk_starts(chunk[0]["run"])
+    store.clear_start_count_of_chunk(chunk[0]["run"])
     return found
 
 
 def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
-    store.record_chunk_start(chunk[0]["run"])
+    store.count_start_of_chunk(chunk[0]["run"])
     try:
         return run(chunk)
     finally:
-        store.clear_chunk_starts(chunk[0]["run"])
+        store.clear_start_count_of_chunk(chunk[0]["run"])
 
 
 def _exit_when_parent_ends(parent: int) -> None:
-    def wait_for_parent() -> None:
+    def exit_after_parent() -> None:
         while os.getppid() == parent:
             time.sleep(0.5)
         os._exit(1)
 
-    threading.Thread(target=wait_for_parent, daemon=True).start()
+    threading.Thread(target=exit_after_parent, daemon=True).start()
 
 
 @contextmanager

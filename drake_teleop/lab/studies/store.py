@@ -64,14 +64,14 @@ class Store:
             except OSError:  # a file system without links
                 shutil.copyfile(part, temporary)
 
-    def record_chunk_start(self, first_run: int) -> None:
+    def count_start_of_chunk(self, first_run: int) -> None:
         path = self._start_counts_folder / str(first_run)
         with files.wrap_write_errors(path):
             self._start_counts_folder.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
 
-    def clear_chunk_starts(self, first_run: int) -> None:
+    def clear_start_count_of_chunk(self, first_run: int) -> None:
         (self._start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
     def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
@@ -113,7 +113,7 @@ def _read_run_numbers_if_undamaged(parts: list[Path]) -> set[int]:
 def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     """Open the store in the folder `out` and lock it for this process.
 
-    `identity` is JSON data of all inputs of the rows; rows of other inputs raise an error.
+    `identity` is JSON data of all inputs; raise an error if `out` has other inputs or is locked.
     """
     store = Store(out / "runs.parquet")
     files.make_folder(store.folder)
