@@ -124,7 +124,7 @@ class Inputs:
         return dataclasses.replace(self, **changes) if changes else self
 
     @property
-    def hand_inputs(self) -> tuple[int, ...]:
+    def hand_pose_and_held(self) -> tuple[int, ...]:
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
 
     @property

@@ -163,7 +163,7 @@ class Live:
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()
-        self._last_target = self._requested.hand_inputs
+        self._last_target = self._requested.hand_pose_and_held
         self._last_frame: dict[str, Any] = {}
         self.pace.restart(now)
 
@@ -300,8 +300,8 @@ class Live:
 
     def _simulate_slice(self, now: float) -> None:
         self._requested = self._rates.advance_inputs(self._requested, 1e-3 * self._slice_ms, now)
-        self._show_now |= self._requested.hand_inputs != self._last_target
-        self._last_target = self._requested.hand_inputs
+        self._show_now |= self._requested.hand_pose_and_held != self._last_target
+        self._last_target = self._requested.hand_pose_and_held
         requested, may_jump = self._requested, not self._session.inputs.held
         if self._link is not None:
             requested = requested.with_changes(self._link.hand_inputs(now))

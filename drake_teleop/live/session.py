@@ -215,7 +215,7 @@ class Session:
         if inputs.station_choices != before.station_choices:
             self._swap_station(inputs)
         self.inputs = inputs
-        if inputs.hand_inputs != before.hand_inputs:
+        if inputs.hand_pose_and_held != before.hand_pose_and_held:
             hand, context = self._station.block_and_context("live_hand")
             hand.SetTarget(context, inputs.intended_pose(self._start))
         if inputs.clutch != before.clutch or inputs.station_choices != before.station_choices:

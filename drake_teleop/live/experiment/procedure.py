@@ -19,7 +19,7 @@ FEEDBACK_PHASE, BREAK_PHASE, END_PHASE = "told", "break", "end"
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """Planned trial: indices of task and condition, interval (1, 2) of the stimulus; 0: peg."""
+    """Planned trial: indices of task and condition, interval (1, 2) of stimulus; 0: peg task."""
 
     task: int
     condition: int
@@ -29,13 +29,12 @@ class PlannedTrial:
 
 @dataclass(frozen=True)
 class IntervalResult:
-    """Result of an interval.
+    """Result of one interval of a trial.
 
     Attributes:
-        level: measured stimulus [N or kg]; 0 without one.
+        level, force_N: measured stimulus [N or kg], 0 without stimulus; largest contact force.
         valid: False if contact is missing.
-        done: whether the tool reached the floor of the slot.
-        time_s: time until the floor.
+        done, time_s: True if the peg reached the slot's floor; time until then or the end.
         lost_s: delay of the simulation behind real time.
     """
 

@@ -73,7 +73,7 @@ def simulate_participant(
             if isinstance(procedure.task, PegInSlot):
                 result = _insert_peg(apparatus, procedure)
             else:
-                result, response = _run_interval(apparatus, procedure)
+                result, response = _run_with_response(apparatus, procedure)
                 responses[procedure.interval - 1] = response
             procedure.finish_interval(result)
         elif procedure.phase == GAP_PHASE:
@@ -101,7 +101,7 @@ def answer_by_larger_response(
     return 1 if noisy[0] > noisy[1] else 2
 
 
-def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
+def _run_with_response(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
