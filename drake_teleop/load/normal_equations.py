@@ -1,10 +1,10 @@
 """Load and sensor offsets by batch least squares, from second moments of a record.
 
-Row c of the regressor [E V] is T_c z with the constant T_c, Eq. (T4), and w = omega:
+The regressor [E V] of [offsets; phi] has rows T_c z with constant T_c, s = a - g, w = omega:
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
 
-All least squares estimates follow from the mean of z z^T, Eqs. (7)-(8), (T3) and (T16).
+All least squares estimates follow from the mean of z z^T, Eqs. (7)-(8), (T3), (T4), (T16).
 """
 
 from __future__ import annotations

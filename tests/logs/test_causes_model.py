@@ -141,7 +141,7 @@ def test_whitened_sums_are_those_of_rows_with_four_predecessors(gaps):
     model = LoadModel()
     rows = UsedRows(data, used, (), model.columns)
     whole = [n for n in range(4, len(T)) if used[n - 4 : n + 1].all()]
-    np.testing.assert_array_equal(rows.rows_with_predecessors, whole)
+    np.testing.assert_array_equal(rows.rows_with_four_predecessors, whole)
     filters = rng.normal(size=(6, 5))
     found = rows.whitened_products(filters)
     residual = rng.normal(size=(6, len(model.columns)))

@@ -54,7 +54,7 @@ from drake_teleop.logs.pose_motion.rigid import (
     _residual_and_derivative,
     _RigidFitData,
     _solve_rigid_fit,
-    estimate_units_and_axes,
+    estimate_position_unit_axes_and_masses,
     fit_rigid,
     motion_transformation_matrix,
 )
@@ -424,7 +424,7 @@ def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> UnitsAnd
         PoseSplines(poses.with_continuous_quaternions(), 0.1),
     )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    return estimate_units_and_axes(
+    return estimate_position_unit_axes_and_masses(
         fit_coefficients(FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE))
     )
 
@@ -453,7 +453,7 @@ def test_planar_gravity_determines_the_unit_but_not_the_axes():
         PoseSplines(poses.with_continuous_quaternions(), 0.1),
         end_taper(t[::2], 0.3, SECONDS - 0.3),
     )
-    seen = estimate_units_and_axes(
+    seen = estimate_position_unit_axes_and_masses(
         fit_coefficients(FitWindow(grid, taper, DOWN, 20.0).spectra_at_delay(splines, LATE))
     )
     assert not seen.is_usable

@@ -122,12 +122,12 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
     covariance, natural = equations.covariance(), identification.natural_scales(load.phi)
     unexcited = equations.unexcited_columns
 
-    def scaled_combination(coefficients: Array, leading: int) -> ParameterCombination:
-        c = coefficients / coefficients[leading]
+    def scaled_combination(coefficients: Array, leading_index: int) -> ParameterCombination:
+        c = coefficients / coefficients[leading_index]
         std = float(np.sqrt(max(0.0, c @ covariance @ c)))
         relative_std = std / float(np.linalg.norm(c * natural))
-        words = _combination_text(c, leading, np.abs(c) * natural)
-        return ParameterCombination(c, leading, float(c @ theta), std, relative_std, words)
+        words = _combination_text(c, leading_index, np.abs(c) * natural)
+        return ParameterCombination(c, leading_index, float(c @ theta), std, relative_std, words)
 
     # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
     # the load as independent, so that the text begins with its parameters.
@@ -159,11 +159,11 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
-def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
+def _combination_text(coefficients: Array, leading_index: int, weights: Array) -> str:
     weights = weights / weights.max()
-    text = identification.PARAMETER_NAMES[leading]
+    text = identification.PARAMETER_NAMES[leading_index]
     for i in np.flatnonzero(weights >= _MIN_TERM_SHARE_WITH_NUMBER):
-        if i != leading:
+        if i != leading_index:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
             text += f" {'-' if c < 0.0 else '+'} {size}{identification.PARAMETER_NAMES[i]}"
@@ -178,7 +178,7 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 def covariance_for_white_noise(
     least_squares_covariance: Array, equations: SecondMoments, fit: EstimatorFit
 ) -> Array:
-    """Return the covariance (16, 16) by noise whose channels correlate as in the fit's weights.
+    """Return the covariance (16, 16) due to noise whose channels correlate as in the fit's weights.
 
     Without correlation it is `least_squares_covariance`.
     """
@@ -200,14 +200,14 @@ def _inverse_gram(fit: EstimatorFit) -> Array:
 
 
 def covariance_for_random_walks(
-    record: SampleRecord, kept: NDArray[np.bool_], fit: EstimatorFit, steps: Array
+    record: SampleRecord, kept: NDArray[np.bool_], fit: EstimatorFit, step_covariance: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `steps` (6, 6) is the covariance of the wrench change per sample.
+    `step_covariance` (6, 6) is that of the wrench change per sample.
     """
     covariance = np.zeros((16, 16))
-    if not steps.any():
+    if not step_covariance.any():
         return covariance
     backwards, used = record.decimate(-1), kept[::-1]
     after = np.zeros((6, 16))
@@ -220,7 +220,7 @@ def covariance_for_random_walks(
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
         sums -= rows
-        covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
+        covariance += np.einsum("nci,cd,ndj->ij", sums, step_covariance, sums, optimize=True)
     inverse = _inverse_gram(fit)
     return inverse @ covariance @ inverse
 

@@ -61,7 +61,7 @@ def _square_of_innovation_sum(memory, last, n):
 
 @njit(cache=True)
 def update_statistics(
-    memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet_level
+    memory, contact_wrench, s, omega, alpha, acceleration, parameters, slack, following, quiet_level
 ):
     """Process one sample and write level, cusum and glr to memory[5:8].
 
@@ -73,7 +73,7 @@ def update_statistics(
     noise, peaks = (variances, P, growth, fade), memory[HELD_SQUARES_START:CONTACT_INDEX]
     noise_variances_into(peaks, s, omega, alpha, acceleration, *noise, V, scaled)
     for c in range(6):
-        scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(scaled[c])
+        scaled[c] = (contact_wrench[c] - memory[MEAN_START + c]) / math.sqrt(scaled[c])
     count = int(memory[SAMPLE_COUNT_INDEX])
     level, length = 0.0, 0.0
     for i in range(6):
@@ -92,7 +92,7 @@ def update_statistics(
     level, length = math.sqrt(level), math.sqrt(length)
     if level < quiet_level:
         for c in range(6):
-            memory[MEAN_START + c] += following * (contact[c] - memory[MEAN_START + c])
+            memory[MEAN_START + c] += following * (contact_wrench[c] - memory[MEAN_START + c])
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
         memory[CUSUM_START + i] *= shrink
@@ -142,10 +142,12 @@ def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
 
 
 @njit(cache=True)
-def update_contact_flag(memory, contact, s, omega, alpha, acceleration, parameters, flag_settings):
+def update_contact_flag(
+    memory, contact_wrench, s, omega, alpha, acceleration, parameters, flag_settings
+):
     """Process a row of `DetectorSamples` with `ContactDetector.settings`; return if in contact."""
     slack, following, statistic, enter, leave, hold = flag_settings
-    sample = contact, s, omega, alpha, acceleration
+    sample = contact_wrench, s, omega, alpha, acceleration
     update_statistics(memory, *sample, parameters, slack, following, leave)
     return update_flag_with_hysteresis(memory, statistic, enter, leave, hold, parameters[5])
 

@@ -1,4 +1,4 @@
-"""Candidate causes of a misfit: extensions of a model, and their minimum effects."""
+"""Candidate causes of a misfit: extensions of a model with a sufficiently large effect."""
 
 from __future__ import annotations
 

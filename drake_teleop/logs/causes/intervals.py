@@ -1,4 +1,4 @@
-"""Covariance of a load with the effect of misfit (docs/theory.md, "Causes of a misfit")."""
+"""Covariance of a load, widened by misfit (docs/theory.md, "Causes of a misfit")."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
 
 
 def load_covariance_by_gain_errors(state: FittedModel) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] by errors of all gains; 0 if implausible."""
+    """Return the covariance (16, 16) of [offsets; phi] due to gain errors; 0 if implausible."""
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
     unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)

@@ -38,7 +38,7 @@ class UsedRows:
         return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
-    def rows_with_predecessors(self) -> NDArray[np.intp]:
+    def rows_with_four_predecessors(self) -> NDArray[np.intp]:
         """Indices of rows whose four predecessors are used, too."""
         padded = np.pad(self.used, (instants.MAX_NOISE_LAG, 0))
         return np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).all(axis=1))
@@ -47,7 +47,7 @@ class UsedRows:
     def _lagged_signals_of_edge_rows(self) -> Array:
         padded = np.pad(self.used, instants.MAX_NOISE_LAG)
         near = np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).any(axis=1))
-        edge = np.setdiff1d(near, self.rows_with_predecessors)
+        edge = np.setdiff1d(near, self.rows_with_four_predecessors)
         at = edge[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
         y = np.vstack([self.y, np.zeros((2 * instants.MAX_NOISE_LAG, self.y.shape[1]))])
         return np.asarray(y[at])
@@ -67,7 +67,7 @@ class UsedRows:
         """Return whitening filters (6, 5) and noise power (6,) >= `floor` (6,) of the residual."""
         e = self.y @ residual_coefficients.T
         filters = np.eye(1, instants.MAX_NOISE_LAG + 1).repeat(6, axis=0)
-        now = self.rows_with_predecessors
+        now = self.rows_with_four_predecessors
         history = np.stack([e[now - d] for d in range(instants.MAX_NOISE_LAG + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(now), 1)
@@ -157,7 +157,7 @@ class FittedModel:
     @cached_property
     def likelihood(self) -> float:
         """Logarithm of the likelihood of all rows; contacts have separate noise."""
-        count = len(self.rows.rows_with_predecessors)
+        count = len(self.rows.rows_with_four_predecessors)
         own = -0.5 * count * float(np.log(self.noise_power).sum())
         if not self.contact_spans:
             return own
@@ -165,7 +165,7 @@ class FittedModel:
         power = inside.noise_filters_and_power(self.residual, 1e-6 * self.noise_power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
         every = replace(self.rows, used=self.data.used)
-        others = len(every.rows_with_predecessors) - count
+        others = len(every.rows_with_four_predecessors) - count
         return own - 0.5 * others * float(np.log(power).sum())
 
     @cached_property
@@ -193,7 +193,7 @@ class FittedModel:
             parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
-        whole, filters = self.rows.rows_with_predecessors, self.noise_filters
+        whole, filters = self.rows.rows_with_four_predecessors, self.noise_filters
         gain, freedom = 0.0, 0
         late = [columns[whole - d] for d in range(instants.MAX_NOISE_LAG + 1)]
         for c in range(6):

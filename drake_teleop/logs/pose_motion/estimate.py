@@ -54,12 +54,12 @@ class PoseFrame:
 
     @property
     def is_position_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): whether it is known to 2 cm along the axes of S."""
+        """Whether the standard deviations (3,) of `p_SoPo_S` are below 2 cm."""
         return np.asarray(self.position_stds_m < MAX_KNOWN_FRAME_SHIFT_STD_M)
 
     @property
     def is_rotation_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): whether it is known to 1 degree about the axes of S."""
+        """Whether the standard deviations (3,) of `R_SP` are below 1 degree."""
         return np.asarray(self.rotation_stds_deg < MAX_KNOWN_FRAME_ROTATION_STD_DEG)
 
 
@@ -87,10 +87,10 @@ class PoseEstimate(PoseMotion):
     """Load, delay and pose frame from a wrench and poses.
 
     Attributes:
-        fit: load, with the pose frame as described or as estimated on request.
+        fit: load for the given pose frame, which is estimated where None.
         free_frame_fit: load, with the pose frame always estimated.
         frame: pose frame of `free_frame_fit`.
-        units_and_axes: units, axes and masses from a fit without a rigid load.
+        units_and_axes: unit of positions, axes and masses from the linear model's fit.
         t, rejected: (M,) instants [s], and True for disturbed ones.
     """
 
@@ -148,7 +148,7 @@ def estimate_from_poses(
         def fit_rigid_from(start: RigidParameters, free: NDArray[np.bool_]) -> RigidFit:
             return rigid.fit_rigid(Z, Q, levels, start, free, best, gain_std=gain_std)
 
-        seen = rigid.estimate_units_and_axes(best)
+        seen = rigid.estimate_position_unit_axes_and_masses(best)
         has_axes = seen.is_usable and not seen.is_mirrored
         R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
         R = seen.R_SP.T if R_SP is None and has_axes else R

@@ -328,7 +328,7 @@ _UNIT_RATIO_ITERATIONS = 5
 
 @dataclass(frozen=True, eq=False)
 class UnitsAndAxes:
-    """Units, axes and masses that the fit of a linear model of the wrench implies.
+    """Position unit, axes and masses that the fit of a linear model of the wrench implies.
 
     Attributes:
         position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
@@ -354,7 +354,7 @@ class UnitsAndAxes:
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
-def estimate_units_and_axes(fit: LinearFit) -> UnitsAndAxes:
+def estimate_position_unit_axes_and_masses(fit: LinearFit) -> UnitsAndAxes:
     variances = np.diagonal(fit.covariance, axis1=1, axis2=2)[:3]
     M_a, M_g, v_a, v_g = (
         x[:, k] for x in (fit.coefficients[:3], variances) for k in (slice(1, 4), GRAVITY_COLUMNS)
