@@ -22,7 +22,7 @@ from drake_teleop.common.registry import REGISTRIES
 
 
 class Utf8Path(click.Path):
-    """Parameter type of paths with UTF-8 names, which all libraries accept."""
+    """Parameter type of paths; rejects empty paths and names outside UTF-8."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)

@@ -52,8 +52,7 @@ def contact_and_scaled_wrench_into(
 
     `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
     unfiltered contact wrench. `gravity` (3,) matters if scales of weight and inertia differ.
-    `no_load` (10,) contains zeros, `memory` (2, 12) the state of the filter `low_pass`. For the
-    scaled wrench see `scaled_wrench`.
+    `no_load` (10,) is 0, `memory` (2, 12) is the filter's; `set_scale_factors_into` sets `scales`.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]
@@ -70,7 +69,7 @@ def contact_and_scaled_wrench_into(
 
 @njit(cache=True)
 def set_scale_factors_into(sigma_weight, sigma_inertia, gamma, scales):
-    """Write sigma_inertia twice, gamma and sigma_weight - sigma_inertia to `scales` (4,)."""
+    """Write the scales (4,) of inertia (gripper, object), contact, and excess weight."""
     scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
     scales[3] = sigma_weight - sigma_inertia
 
