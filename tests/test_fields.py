@@ -117,7 +117,7 @@ def test_misspelt_field_raises_with_a_suggestion() -> None:
         replace(scenario, force_scaling__sgima=0.5)
     with pytest.raises(DrakeTeleopError, match=r"scenario:simulaton: .* mean 'simulation'"):
         replace(scenario, simulaton__seed=1)
-    with pytest.raises(DrakeTeleopError, match="slot is null or a text in this scenario"):
+    with pytest.raises(DrakeTeleopError, match="slot is None in this scenario"):
         replace(scenario, slot__depth=0.03)
     assert scenario == Scenario()
 

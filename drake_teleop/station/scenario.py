@@ -182,23 +182,24 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     return ScenarioFromData(*ReadScenarioData(name_or_path))
 
 
-def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
+def ReadScenarioData(name_or_path: str | Path, where: str = "") -> tuple[Any, str]:
     """Read a scenario file; return the unchecked data, and the file's name for messages."""
-    path = find_shipped_file("scenario", name_or_path, scenarios_dir())
+    path = find_shipped_file("scenario", name_or_path, scenarios_dir(), where)
     return read_yaml(path, tagged=True), str(path)
 
 
-def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
+def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path, where: str = "") -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    A DrakeTeleopError that names `kind` is raised if neither exists.
+    A DrakeTeleopError for `where` that names `kind` is raised if neither exists.
     """
     expect_type((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     path = folder / f"{name_or_path}.yaml" if str(name_or_path) in names else Path(name_or_path)
     if not os.path.isfile(path):  # False also for invalid file names
         remedy = suggest_name(name_or_path, names, f"give a YAML file or one of {', '.join(names)}")
-        raise DrakeTeleopError(f"there is no {kind} '{name_or_path}'", remedy=remedy)
+        what = f"there is no {kind} '{name_or_path}'"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     return path
 
 
@@ -271,7 +272,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         if inner:
             present, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if present is None or isinstance(present, str):
-                what = f"{block} is null or a text in this scenario, so it has no field {inner}"
+                what = f"{block} is {present!r} in this scenario, so it has no field {inner}"
                 remedy = f"set the whole block {block} first"
                 raise DrakeTeleopError(what, where=place, remedy=remedy)
             config.check_field(type(present), inner, value, place)

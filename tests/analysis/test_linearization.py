@@ -381,8 +381,12 @@ def test_sparse_search_finds_the_largest_multipliers():
 
 def test_rates_method_and_direction_without_linear_model_raise():
     scenario = LoadScenario("free_motion_force")
-    with pytest.raises(DrakeTeleopError, match=r"rates.*joint_control_hz"):
+    with pytest.raises(DrakeTeleopError, match=r"^rates\.joint_control_hz: 10000 Hz .* hand_hz, "):
         linearize(replace(scenario, rates__joint_control_hz=10000.0))
+    with pytest.raises(
+        DrakeTeleopError, match=r"^rates\.sensor_hz: 7000 Hz is no multiple of hand"
+    ):
+        linearize(replace(scenario, rates__sensor_hz=7000.0))
     with pytest.raises(DrakeTeleopError, match=r"passivity\.method"):
         linearize_station(replace(scenario, passivity=PassivityConfig(method="tdpa")))
     with pytest.raises(DrakeTeleopError, match="direction"):

@@ -327,6 +327,7 @@ def test_arrays_of_parameters_equal_single_loops() -> None:
         (lambda: cut_loop(OneAxis(ideal_servo=True), STATION), "ideal servo"),
         (lambda: cut_loop(OneAxis(), Sampling(joint_control_hz=1999.0)), "joint_control_hz"),
         (lambda: cut_loop(OneAxis(), Sampling(joint_control_hz=1e3)), "whole multiple"),
+        (lambda: cut_loop(OneAxis(), Sampling(low_pass_hz=5e3)), "5000 Hz is not .*, 8000 Hz"),
     ],
 )
 def test_ideal_servo_and_incompatible_rates_raise(call, words: str) -> None:

@@ -164,6 +164,8 @@ def test_scattering_relates_the_waves():
     np.testing.assert_allclose(found, waves_out, rtol=1e-9, atol=1e-12)
 
 
-def test_ratio_of_powers_must_be_positive():
-    with pytest.raises(DrakeTeleopError, match="ratio"):
+def test_scales_and_ratio_of_powers_must_be_positive():
+    with pytest.raises(DrakeTeleopError, match=r"OneAxis\.position_scale: is 0"):
+        tp.reference_impedances(OneAxis(position_scale=0.0))
+    with pytest.raises(DrakeTeleopError, match="ratio: 0, "):
         tp.scale_slave_power(tp.hybrid_matrix(OneAxis(), S), 0.0)

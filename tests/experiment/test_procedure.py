@@ -187,6 +187,10 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
     [
         ("tasks: []", "tasks: is empty"),
         ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "has no slot"),
+        (
+            "tasks: [!PegInSlot {scenario: gone}]\nconditions: [{name: a}]",
+            r":tasks\[0\]\.scenario: there is no scenario",
+        ),
         ("tasks: [!Juggling {}]\nconditions: [{name: a}]", "Juggling"),
         (
             "tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]",

@@ -426,9 +426,10 @@ def _remove_contact_friction(diagram: Diagram) -> None:
 
 def _check_rate_multiples(scenario: Scenario) -> None:
     rates = scenario.rates
-    if rates.joint_control_hz != rates.hand_hz or rates.sensor_hz % rates.hand_hz != 0.0:
-        raise DrakeTeleopError(
-            "hand and joint control, or sensor and hand, have unequal rates (they set loop gains)",
-            where="rates",
-            remedy="set joint_control_hz to hand_hz, and sensor_hz to a multiple of it",
-        )
+    rule = f"hand_hz, {rates.hand_hz:g} Hz (required by the linearisation)"
+    if rates.joint_control_hz != rates.hand_hz:
+        what = f"{rates.joint_control_hz:g} Hz differs from {rule}"
+        raise DrakeTeleopError(what, where="rates.joint_control_hz", remedy="set it to hand_hz")
+    if rates.sensor_hz % rates.hand_hz != 0.0:
+        what, remedy = f"{rates.sensor_hz:g} Hz is no multiple of {rule}", "set it to a multiple"
+        raise DrakeTeleopError(what, where="rates.sensor_hz", remedy=remedy)

@@ -144,8 +144,8 @@ def _low_pass_sections(sampling: Sampling) -> Array:
     if sampling.low_pass_hz is None:
         return np.zeros((0, 5))
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
-    if not (cutoffs < rates / 2).all():
-        what = "the cut-off frequency is not below half of the sensor's rate"
+    if (wrong := ~(cutoffs < rates / 2)).any():
+        what = f"{cutoffs[wrong][0]:g} Hz is not below half of sensor_hz, {rates[wrong][0]:g} Hz"
         remedy = "choose less than half of sensor_hz"
         raise DrakeTeleopError(what, where="sampling.low_pass_hz", remedy=remedy)
     pairs = zip(cutoffs.flat, rates.flat, strict=True)

@@ -62,7 +62,7 @@ def task_direction(
         raise DrakeTeleopError("has length zero", where="direction", remedy="give a vector in W")
     sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
-        what = "sets different sigmas for gripper and object (one axis has one sigma)"
+        what = f"sets sigma {sigma:g} of gripper and {sigma_object:g} of object (must be equal)"
         raise DrakeTeleopError(what, where="force_scaling.eta", remedy="set eta: null")
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand

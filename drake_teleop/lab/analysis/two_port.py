@@ -70,9 +70,9 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
     """Return the reference impedances b [N s/m] of both ports for `scattering_matrix`."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
-        what = "one of them is 0 (reference impedances need both above 0)"
-        remedy = "set both above 0"
-        raise DrakeTeleopError(what, where="force_scale, translation_scale", remedy=remedy)
+        name = "force_scale" if axis.force_scale == 0 else "position_scale"
+        what = "is 0, so that the reference impedances are undefined"
+        raise DrakeTeleopError(what, where=f"OneAxis.{name}", remedy="set it above 0")
     return axis.hand_damping, axis.hand_damping / scale
 
 
@@ -85,7 +85,7 @@ def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
     """Return H with the slave's power multiplied by `ratio` > 0."""
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
-        what = "the ratio of slave power to master power is not positive"
+        what = f"{np.min(ratio):g}, slave power over master power, is not positive"
         raise DrakeTeleopError(what, where="ratio", remedy="give values above 0")
     h11, h12, h21, h22 = matrix_entries(H)
     return two_port_matrix(h11, h12 / root, h21 * root, h22)

@@ -85,7 +85,7 @@ def excite(
     excitation = assemble_excitation(robot, criterion, found, trajectory, uses)
     if not np.isfinite(excitation.values[criterion]):
         what = "the largest motion that was found within all limits does not excite all parameters"
-        remedy = "raise this limit, or take more time, a longer period or another seed"
+        remedy = "raise this limit, or give more --time, a longer --period or another --seed"
         raise DrakeTeleopError(f"{what}; it uses {uses[0]}", where=robot.name, remedy=remedy)
     return excitation
 
@@ -132,7 +132,7 @@ def find_best_within_limits(
         if worst is None or uses[0].used_share < worst.used_share:
             worst = uses[0]
     what = "no trajectory was found that respects all limits"
-    remedy = "take more time, a longer period or another seed"
+    remedy = "give more --time, a longer --period or another --seed"
     if worst is not None:
         what += f": the best uses {worst}"
         remedy += _ADVICE_BY_LIMIT.get(worst.limit_name, "")

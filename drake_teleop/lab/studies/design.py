@@ -62,16 +62,16 @@ class Factor:
         return [(value - low) / (high - low) if high > low else 0.0]
 
     def check(self, where: str) -> None:
-        ranged = [self.low is not None, self.high is not None]
-        lists = (self.values, self.words, self.flags, self.vectors)
-        if [*map(bool, lists), any(ranged)].count(True) != 1 or any(ranged) != all(ranged):
-            what = "has no values, or several kinds of them"
+        kinds = ["values", "words", "flags", "vectors", "low", "high"]
+        given = [name for name in kinds if getattr(self, name) not in (None, [])]
+        if given != kinds[4:] and (len(given) != 1 or given[0] in kinds[4:]):
+            what = f"has {' and '.join(given) or 'no values'}"
             remedy = "give one of values, words, flags, vectors, or both low and high"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = [*self.values, *itertools.chain(*self.vectors)]
         numbers += [self.high - self.low] if self.low is not None and self.high is not None else []
-        if not all(map(math.isfinite, numbers)):
-            what = "has numbers, or a range, that are not finite"
+        if wrong := [number for number in numbers if not math.isfinite(number)]:
+            what = f"the value or range {wrong[0]:g} is not finite"
             raise DrakeTeleopError(what, where=where, remedy="replace NaN and infinity")
         if self.low is not None and self.high is not None and not self.low < self.high:
             what = f"{self.high:g} is not above low, {self.low:g}"

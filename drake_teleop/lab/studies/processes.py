@@ -72,7 +72,7 @@ def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int)
             suspicious = 1
             if not store.first_runs_of_chunks_started_at_least(suspicious):
                 what = f"processes ended before their first run ({error})"
-                remedy = "repeat with one job to see the cause"
+                remedy = "repeat with --jobs 1 to see the cause"
                 raise DrakeTeleopError(what, where="study", remedy=remedy) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 

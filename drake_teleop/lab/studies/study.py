@@ -89,7 +89,7 @@ def study_command(
     study.check_num_runs(str(path), yes)
     known = study.scenario in scenarios.ScenarioNames()
     data, where = scenarios.ReadScenarioData(
-        study.scenario if known else path.parent / study.scenario
+        study.scenario if known else path.parent / study.scenario, f"{path}:scenario"
     )
     scenario = scenarios.ScenarioFromData(data, where)
     files = [*scenario.slave.model_files(), *scenarios.referenced_files(scenario)]

@@ -168,7 +168,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
             found.sort(key=lambda entry: entry[0])
     if not found:
         what = "no settings were stable for all given hands and walls"
-        remedy = "state firmer hands, softer walls or a faster network"
+        remedy = "give firmer --hands, softer --walls or a faster --network"
         raise DrakeTeleopError(what, where="tune", remedy=remedy)
     _, chosen, inside = found[0]
     larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)

@@ -11,8 +11,9 @@ from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import (
-    LoadScenario,
+    ReadScenarioData,
     Scenario,
+    ScenarioFromData,
     ScenarioNames,
     find_shipped_file,
     settings_without_range_check,
@@ -161,8 +162,9 @@ def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
 
 def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
     known = task.scenario in ScenarioNames()
-    scenario = LoadScenario(task.scenario if known else path.parent / task.scenario)
     place = f"{path}:tasks[{index}].scenario"
+    file = task.scenario if known else path.parent / task.scenario
+    scenario = ScenarioFromData(*ReadScenarioData(file, place))
     if isinstance(task, PegInSlot) and not isinstance(scenario.operator.task, Insert):
         remedy = "give its operator a task !Insert"
         raise DrakeTeleopError(f"{task.scenario} has no slot", where=place, remedy=remedy)

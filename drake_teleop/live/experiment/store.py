@@ -77,11 +77,10 @@ class TrialStore:
         with wrap_read_errors(path, remedy):
             table = pl.read_csv(path, schema=_TRIAL_SCHEMA)
         rows = [TrialRow(**row) for row in table.iter_rows(named=True)]
-        if (
-            any(row.trial != index for index, row in enumerate(rows))
-            or table.null_count().sum_horizontal()[0]
-        ):
-            raise DrakeTeleopError("lacks trials or values", where=str(path), remedy=remedy)
+        gaps = [index for index, row in enumerate(rows) if row.trial != index]
+        if gaps or table.null_count().sum_horizontal()[0]:
+            what = f"row {gaps[0]} is of another trial" if gaps else "lacks values"
+            raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         return rows
 
     def write_rows(self, participant: int, rows: list[TrialRow]) -> None:
