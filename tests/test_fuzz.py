@@ -51,7 +51,7 @@ SAID = {
     "robot-1e300_m.urdf": "",
     "scenario-tag_of_a_block.yaml": "rates: the tag !Rates is not allowed here",
     "scenario-whole_tag.yaml": "the tag tag:yaml.org,2002:int is not allowed here",
-    "trajectory-1e308_rad.yaml": "contains numbers above 1e+06",
+    "trajectory-1e308_rad.yaml": "contains -1e+308, outside +-1e+06",
     "scenario-tag_of_nothing.yaml": "operator.task: '!!' is not known",
     "sdf-colour.sdf": "",
     "sdf-logged_error.sdf": "",

@@ -42,7 +42,10 @@ ALL_READERS = {
     "bytes": ("a: !!binary aGk=", ":a: 'aGk=' does not match the tag 'binary'"),
     "a word that is called a number": ("a: !!int x", ":a: 'x' does not match the tag 'int'"),
     "two documents": ("--- 1\n--- 2", "is not YAML (line 2"),
-    "a character of control": ("a: \x00", "is not YAML"),
+    "a character of control": (
+        "a: 1\nb: \x00",
+        "is not YAML (line 2 contains the character U+0000)",
+    ),
     "another encoding": ("a: \xff", "is not UTF-8 text"),
 }
 

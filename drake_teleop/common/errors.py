@@ -72,9 +72,9 @@ def refuse_polars_in_forked_process() -> None:
     _POLARS_PROCESS_ID.append(os.getpid())
     del _POLARS_PROCESS_ID[1:]
     if [os.getpid()] != _POLARS_PROCESS_ID:
-        what = "polars would hang in this process, which was forked after polars was used"
+        what = "would hang in this process, which was forked after polars was used"
         remedy = 'start processes by multiprocessing.get_context("spawn")'
-        raise DrakeTeleopError(what, remedy=remedy)
+        raise DrakeTeleopError(what, where="polars", remedy=remedy)
 
 
 def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:

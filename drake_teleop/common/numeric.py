@@ -84,7 +84,7 @@ def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...],
     except ValueError as error:
         shapes = ", ".join(f"{name} {table.shape}" for name, table in tables.items())
         what, remedy = f"the numbers of samples differ: {shapes}", "give one row of each per sample"
-        raise DrakeTeleopError(what, remedy=remedy) from error
+        raise DrakeTeleopError(what, where=", ".join(tables), remedy=remedy) from error
     rows = []
     for table in tables.values():
         shape = (*leading, table.shape[-1])

@@ -87,8 +87,10 @@ def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
         line = f"line {mark.line + 1}: " if mark else ""
         what = f"is not YAML ({line}{error.problem or error.context})"
         raise DrakeTeleopError(what, where=where) from None
-    except yaml.YAMLError as error:
-        raise DrakeTeleopError(f"is not YAML ({error})", where=where) from None
+    except yaml.reader.ReaderError as error:
+        number, code = text.count("\n", 0, error.position) + 1, int(error.character)
+        what = f"is not YAML (line {number} contains the character U+{code:04X})"
+        raise DrakeTeleopError(what, where=where, remedy="save it as UTF-8 text") from None
     except RecursionError:
         remedy = "use fewer levels of lists and mappings"
         raise DrakeTeleopError("is nested too deeply", where=where, remedy=remedy) from None

@@ -108,7 +108,7 @@ class SecondMoments:
     def mean_products(self) -> Array:
         if self.num_samples < 3:
             what = f"{self.num_samples:.3g} samples cannot determine a load"
-            raise DrakeTeleopError(what, remedy="give at least 3, in different orientations")
+            raise DrakeTeleopError(what, where="wrench", remedy="give 3 or more orientations")
         return self._sums / self.num_samples
 
     def add_samples(

@@ -100,13 +100,15 @@ class FourierTrajectory:
         except (AttributeError, TypeError, ValueError) as error:
             what = f"is not a trajectory ({error})"
             raise DrakeTeleopError(what, where=where, remedy=remedy) from None
-        shapes_fit = q0.ndim == 1 and rho.ndim == 2 and rho.shape == delta.shape
-        numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
-        if not (shapes_fit and np.isfinite(numbers).all() and frequency > 0):
-            what = "is not a trajectory: q0, rho and delta differ in shape, a number is not finite,"
-            what += " or the frequency is not above 0"
+        if not (q0.ndim == 1 and rho.ndim == 2 and rho.shape == delta.shape):
+            what = f"q0, rho and delta have the shapes {q0.shape}, {rho.shape} and {delta.shape}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
-        if np.abs(numbers).max() > _MAX_FILE_NUMBER:
-            what = f"contains numbers above {_MAX_FILE_NUMBER:g}"
+        numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
+        wrong = numbers[~(np.abs(numbers) <= _MAX_FILE_NUMBER)]
+        if len(wrong):
+            what = f"contains {wrong[0]:g}, outside +-{_MAX_FILE_NUMBER:g}"
             raise DrakeTeleopError(what, where=where, remedy="give rad and Hz")
+        if not frequency > 0:
+            what, remedy = f"{frequency:g} Hz is not above 0", "give the frequency of a motion"
+            raise DrakeTeleopError(what, where=f"{where}:frequency", remedy=remedy)
         return cls(q0, rho, delta, frequency)

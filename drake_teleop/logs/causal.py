@@ -40,7 +40,8 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
-            what = "causal mode `predicted` needs a low-pass below half the rate of the log"
+            limit = f"{0.5 / dt:g} Hz, half the rate of the log"
+            what = f"{cutoff_hz} is not below {limit}, as causal mode `predicted` requires"
             remedy = "give a lower cut-off, or causal mode `delayed`"
             raise DrakeTeleopError(what, where="cutoff", remedy=remedy)
         return x

@@ -189,7 +189,7 @@ def test_error_names_the_invalid_input_and_keeps_the_estimate():
     F, motion = noisy_record(5)
     estimator = run_estimator(F, motion)
     before = estimator.phi
-    with pytest.raises(DrakeTeleopError, match=r"^sample: contains NaN or infinity"):
+    with pytest.raises(DrakeTeleopError, match=r"^wrench: contains NaN or infinity"):
         estimator.update(np.full(6, np.nan), REST, REST, REST)
     with pytest.raises(
         DrakeTeleopError, match=r"^sample: wrench, s, omega, alpha of one sample have shapes"

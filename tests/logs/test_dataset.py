@@ -318,3 +318,21 @@ def test_csv_episodes_keep_their_text(tmp_path: Path) -> None:
 def test_invalid_input_is_one_error(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(DrakeTeleopError, match=words):
         dataset_command(tmp_path, tmp_path.with_name("out"), quiet=True, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("wrench: {colums: [fx]}", r"d\.yaml:wrench\.colums: unknown field"),
+        ("pose: {}", r"d\.yaml:wrench: is missing"),
+    ],
+)
+def test_invalid_description_is_an_error_with_its_field(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "demo").mkdir()
+    pl.DataFrame({"t": [0.0, 0.1], "fx": [0.0, 1.0]}).write_csv(tmp_path / "demo" / "0.csv")
+    (tmp_path / "d.yaml").write_text(text)
+    options: dict[str, Any] = {"identify": True, "quiet": True, "description": tmp_path / "d.yaml"}
+    with pytest.raises(DrakeTeleopError, match=words):
+        dataset_command(tmp_path / "demo", tmp_path / "out", **options)

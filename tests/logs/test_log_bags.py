@@ -325,9 +325,13 @@ def test_draft_of_a_bag_without_wrench_topic_has_a_placeholder(tmp_path: Path) -
         ("wrench", {"file": "broken.bag"}, ["broken.bag", "cannot be read"]),
         ("wrench", {"file": "broken"}, ["cannot be read"]),
         ("imu", {"topic": "/blind"}, ["marks 'linear_acceleration.x' as not provided"]),
-        ("pose", {}, ["/tf", "several child frames", "camera, tool0"]),
+        ("pose", {}, ["/tf", "several child frames", "set child_frame to one of camera, tool0"]),
         ("pose", {"topic": "/tf", "child_frame": "hand"}, ["no child frame 'hand'", "tool0"]),
-        ("pose", {"topic": "/imu", "child_frame": "x"}, ["no child frame 'x'", "leave it out"]),
+        (
+            "pose",
+            {"topic": "/imu", "child_frame": "x"},
+            ["no child frame 'x'", "remove child_frame"],
+        ),
         (
             "pose",
             {"topic": "/imu", "position": None},

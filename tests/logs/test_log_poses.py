@@ -221,6 +221,10 @@ def test_undetermined_auto_raises_error(folder, tmp_path):
     moved.write_csv(tmp_path / "rest_wrench.csv")
     with pytest.raises(DrakeTeleopError, match="do not determine the pose's origin along x, y, z"):
         read_log(described(tmp_path, "rest", position_in_sensor="auto"))
+    still[:40].write_csv(tmp_path / "short_pose.csv")
+    moved[:60].write_csv(tmp_path / "short_wrench.csv")
+    with pytest.raises(DrakeTeleopError, match=r"\.yaml:pose: wrench and poses share .* required"):
+        read_log(described(tmp_path, "short", position_in_sensor="auto"))
 
 
 @pytest.mark.parametrize(

@@ -258,9 +258,9 @@ def fit_noise_floor(
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
     if len(rows[0]) < MIN_NOISE_FLOOR_SAMPLES:
-        what = f"{len(rows[0])} samples are too few for a noise floor"
-        remedy = f"give {MIN_NOISE_FLOOR_SAMPLES} samples of free motion or more"
-        raise DrakeTeleopError(what, where="contact", remedy=remedy)
+        what = f"{len(rows[0])} samples of free motion are too few"
+        remedy = f"give at least {MIN_NOISE_FLOOR_SAMPLES}"
+        raise DrakeTeleopError(what, where="noise floor", remedy=remedy)
     P = finite_array("covariance", covariance, 16, 16)
     parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
     noise_std_into(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)

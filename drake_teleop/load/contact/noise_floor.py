@@ -92,8 +92,9 @@ class NoiseFloor:
         positive_array("sum_widths", self.sum_widths, NUM_SUM_LENGTHS)
         finite_array("free_maxima", self.free_maxima, 3)
         indefinite = np.linalg.eigvalsh(correlation).min() <= 0.0
+        worst = rho[np.abs(rho).argmax()]
         for is_wrong, where, what in (
-            ((np.abs(rho) >= 1.0).any(), "rho", "has a value that is not between -1 and 1"),
+            (abs(worst) >= 1.0, "rho", f"{worst:g} is not between -1 and 1"),
             (not 0.0 <= self.fade < 1.0, "fade", f"{self.fade} is outside the range 0 <= fade < 1"),
             (indefinite, "correlation", "the matrix is not positive definite"),
         ):

@@ -174,8 +174,10 @@ class RecursiveEstimator(ABC):
             raise DrakeTeleopError(what, where="sample", remedy=remedy)
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
-            what, remedy = "contains NaN or infinity", "leave the sample out"
-            raise DrakeTeleopError(what, where="sample", remedy=remedy)
+            named = zip(("wrench", "s", "omega", "alpha"), parts, strict=True)
+            wrong = ", ".join(name for name, part in named if not np.isfinite(part).all())
+            what, remedy = "contains NaN or infinity", "leave this sample out"
+            raise DrakeTeleopError(what, where=wrong or "sample", remedy=remedy)
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
@@ -35,7 +36,7 @@ from drake_teleop.logs.dataset.shared_load import SharedLoad
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
-from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.description import Description, validation_error
 from drake_teleop.logs.read.reading import read_described_log
 from drake_teleop.logs.summaries import summarize_load
 
@@ -112,16 +113,19 @@ def _described_or_drafted_streams(dataset: Dataset, description: Path | None) ->
         return _draft_streams_by_majority(dataset)
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
-        what = "describes no wrench"
-        raise DrakeTeleopError(what, where=str(description), remedy="see docs/log-description.md")
+        remedy = "add `wrench:` with its columns (docs/log-description.md)"
+        what = "is missing or not a mapping of fields"
+        raise DrakeTeleopError(what, where=f"{description}:wrench", remedy=remedy)
     for name in _STREAM_NAMES:
         if isinstance(data.get(name), dict):
             data[name].pop("file", None)
-    _description_of_episode(data, dataset.episodes[0], dataset.fps)  # report errors before the work
+    _description_of_episode(data, dataset.episodes[0], dataset.fps, description)  # early errors
     return data
 
 
-def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: float) -> Description:
+def _description_of_episode(
+    streams: dict[str, Any], episode: Episode, fps: float, where: Path | str = "description"
+) -> Description:
     data = copy.deepcopy(streams)
     for name in _STREAM_NAMES:
         if name in data:
@@ -129,11 +133,8 @@ def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: floa
             data[name] = {"file": episode.file, "time": time} | data[name]
     try:
         return Description.model_validate(data)
-    except ValueError as error:
-        first = str(error).splitlines()
-        what = " ".join(first[1:3]).strip() or first[0]
-        remedy = "see docs/robot-learning.md for an example"
-        raise DrakeTeleopError(what, where="description", remedy=remedy) from error
+    except ValidationError as error:
+        raise validation_error(error, where) from error
 
 
 def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:
@@ -215,8 +216,8 @@ def _read_log_and_row_times(
     source = f"{episode.file.name}: {episode.name}"
     log = read_described_log(described, source, tables={episode.file: table}, differentiate=False)
     if log.posed is None and log.R_WS is None:
-        what = "the episode has no orientation"
-        raise DrakeTeleopError(what, where=source, remedy="describe pose.orientation")
+        what, remedy = "the episode has no orientation", "give pose.orientation in --description"
+        raise DrakeTeleopError(what, where=source, remedy=remedy)
     assert described.wrench is not None
     timed = table.rows_with_any_number(described.wrench.columns)
     clock = read_clock(described.wrench.time, timed, described.wrench.columns, source)

@@ -61,7 +61,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         candidates = [x.own.phi for x in episodes if x.own.phi is not None and x.own.phi[0] > 0.0]
         if not candidates:
             what = "the fitted mass is negative in all episodes"
-            remedy = "set wrench.sign: -1 in a --description, or remove it there"
+            remedy = "write wrench.sign: -1 into a --description file, or remove it if it is there"
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
         def counted_excess(phi: Array) -> float:

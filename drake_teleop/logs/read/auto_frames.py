@@ -143,7 +143,10 @@ def estimate_auto_pose_frame(description: Description, source: str, read: ReadLo
     log = read(description.model_copy(update=alone))
     assert log.posed is not None
     arrays = log.t, log.wrench, log.posed.poses, log.posed.gravity_W
-    frame = estimate_from_poses(*arrays, p_SoPo_S=None, R_SP=None, lost=log.bridged).frame
+    try:
+        frame = estimate_from_poses(*arrays, p_SoPo_S=None, R_SP=None, lost=log.bridged).frame
+    except DrakeTeleopError as error:
+        raise DrakeTeleopError(str(error), where=f"{source}:pose") from error
     changes: dict[str, Any] = {}
     notes: list[str] = []
     mm, deg = 1e3 * frame.position_stds_m.max(), frame.rotation_stds_deg.max()

@@ -179,7 +179,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
-        what = f"the bag cannot be read: {text}"
+        what = f"the bag cannot be read: {text.rstrip('.')}"
         remedy = "check it with `ros2 bag info`"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy) from error
 
@@ -231,7 +231,8 @@ def _read_column_blocks(
     if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
         named = ", ".join(sorted(filter(None, children)))
         what = f"no child frame {child_frame!r}" if child_frame else "several child frames"
-        remedy = f"give child_frame, one of {named}" if named else "leave it out"
+        remedy = f"set child_frame to one of {named}" if named else "remove child_frame"
+        remedy += " in the log description"
         raise DrakeTeleopError(f"has {what}", where=where, remedy=remedy)
     return blocks
 

@@ -93,11 +93,12 @@ class Log:
                 what = f"has shape {np.shape(value)} instead of {shape}"
                 raise DrakeTeleopError(what, where=where, remedy="give one row per time")
             if not np.isfinite(value).all():
-                what = "holds NaN or infinity (numbers must be finite)"
+                what = f"holds NaN or infinity at index {np.argwhere(~np.isfinite(value))[0, 0]}"
                 raise DrakeTeleopError(what, where=where, remedy="cut or repair these samples")
-        if np.any(np.diff(self.t) <= 0):
+        if (wrong := np.diff(self.t) <= 0).any():
+            what = f"does not increase at index {wrong.argmax() + 1}"
             remedy = "sort the rows, and remove repeated times"
-            raise DrakeTeleopError("does not increase", where=f"{self.source}:t", remedy=remedy)
+            raise DrakeTeleopError(what, where=f"{self.source}:t", remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.t)

@@ -331,7 +331,7 @@ def load_description(path: str | Path) -> Description:
     try:
         description = Description.model_validate(data)
     except ValidationError as error:
-        raise _validation_error(error, path) from error
+        raise validation_error(error, path) from error
     streams = {
         name: stream.model_copy(update={"file": path.parent / stream.file})
         for name, stream in description.streams.items()
@@ -339,7 +339,7 @@ def load_description(path: str | Path) -> Description:
     return description.model_copy(update=streams)
 
 
-def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
+def validation_error(error: ValidationError, path: Path | str) -> DrakeTeleopError:
     # A misspelt field also causes "missing"; report the misspelling first.
     first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
     *outer, last = first["loc"] or ("",)

@@ -389,6 +389,6 @@ class _LogReader:
         for start, stop in np.concatenate(self.gaps):
             flags[slice(*np.searchsorted(t, [start, stop]))] = True
         if (~flags).sum() < MIN_STREAM_SAMPLES:
-            what = f"only {int((~flags).sum())} samples are outside of gaps"
+            what = f"{(~flags).sum()} samples are outside of gaps ({MIN_STREAM_SAMPLES} required)"
             raise DrakeTeleopError(what, where=self.source, remedy="record without interruptions")
         return flags
