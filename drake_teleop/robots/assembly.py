@@ -171,7 +171,7 @@ class WrenchAndMotionStreams(Source):
         arm: ArmKinematics | None = None,
     ) -> None:
         self._wrench, self._motion, self._arm = wrench, motion, arm
-        self.dt, self.two_clocks = wrench.dt, motion is not None
+        self.dt, self.two_clocks, self.where = wrench.dt, motion is not None, where
         streams = (wrench if motion is None else motion).streams
         if arm is not None:
             if JOINTS not in streams:
@@ -333,7 +333,7 @@ class ReadingAssembler(Source):
         weight_removed: bool = False,
     ) -> None:
         if weight_removed and streams.motion_stream == IMU:
-            raise removed_weight_needs_orientation_error("the source")
+            raise removed_weight_needs_orientation_error(streams.where)
         self._streams, self._delay, self.dt = streams, delay_s, streams.dt
         self._tracker = None if track is None else DelayTracker(track, self.dt, cutoff_hz, delay_s)
         self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY_W)

@@ -115,10 +115,10 @@ def _period_s(rate_hz: float | None, address: str) -> float:
 
 
 def _refuse_motion_options(address: str, **motion_options: Any) -> None:
-    if any(option is not None for option in motion_options.values()):
+    options = {"motion": "--motion", "arm": "--model", "sensor_pose": "--sensor-pose"}
+    if given := [options[name] for name, value in motion_options.items() if value is not None]:
         what = "this source already contains the motion of sensor frame S"
-        remedy = "remove --motion, --model and --sensor-pose"
-        raise DrakeTeleopError(what, where=address, remedy=remedy)
+        raise DrakeTeleopError(what, where=address, remedy=f"remove {' and '.join(given)}")
 
 
 def _open_streams(
@@ -133,7 +133,7 @@ def _open_streams(
     opened = [_open_registered_source(address, rate_hz, joints)]
     try:
         if WRENCH_AND_MOTION in opened[0].streams:
-            _refuse_motion_options(address, motion=motion, pose=sensor_pose, arm=arm)
+            _refuse_motion_options(address, motion=motion, sensor_pose=sensor_pose, arm=arm)
             return opened[0]
         if motion is not None:
             opened.append(_open_registered_source(motion, 1.0 / opened[0].dt, joints))

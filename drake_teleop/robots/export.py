@@ -91,14 +91,14 @@ def export_load(
 
 def unused_sensor_pose_error(to: str) -> DrakeTeleopError:
     what = f"{to} takes its values in the sensor's frame"
-    return DrakeTeleopError(what, where="export", remedy="remove the sensor's pose")
+    return DrakeTeleopError(what, where="--sensor-pose", remedy="remove it")
 
 
 def refuse_removed_weight(found: Identification, to: str) -> None:
     if found.weight_removed:
         what = "the robot has removed the load's weight from the wrench, and"
         what += f" {to} would subtract it once more"
-        remedy = "use a wrench without the robot's payload compensation, or `compensate`"
+        remedy = "identify without payload compensation, or use `drake-teleop compensate` instead"
         raise DrakeTeleopError(what, where="export", remedy=remedy)
 
 

@@ -69,7 +69,7 @@ def pack_wrench(out: CompensatedWrench) -> bytes:
 
 def unpack_wrench(packet: bytes) -> CompensatedWrench:
     if len(packet) != WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
-        what = f"its {len(packet)} bytes are not a compensated wrench"
+        what = f"its {len(packet)} bytes are not a compensated wrench of drake_teleop_udp.h"
         remedy = f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}"
         raise DrakeTeleopError(what, where="packet", remedy=remedy)
     _, flags, number, t, *values = WRENCH_FORMAT.unpack(packet)

@@ -94,7 +94,8 @@ class StreamContactDetector:
         delay: str | float = "auto",
     ) -> None:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
-            raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
+            what = f"needs a low-pass below half the stream's rate, {0.5 / dt:g} Hz"
+            raise DrakeTeleopError(what, where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
         if abs(source.dt / dt - 1.0) > _FREE_LOG_RATE_TOLERANCE:
             what = f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz"

@@ -215,7 +215,7 @@ def test_unsupported_syntax_is_named(function):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ((), "rate: missing, but required by c99"),
+        ((), "--rate: is missing, but required by c99"),
         (("--rate", "500", "--sensor-pose", *"000000"), "takes its values in the sensor's frame"),
     ],
 )

@@ -122,6 +122,8 @@ def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
     weightless = dataclasses.replace(load(), weight_removed=True)
     with pytest.raises(DrakeTeleopError, match=r"udp://:0.*without an orientation"):
         open_source("udp://:0", weightless, rate_hz=500.0)
+    with pytest.raises(DrakeTeleopError, match=r"^replay:log\.csv: .*; remove --motion$"):
+        open_source("replay:log.csv", None, motion="udp://:0")
 
 
 def test_motion_on_another_clock_is_synchronised() -> None:

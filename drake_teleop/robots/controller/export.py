@@ -282,8 +282,8 @@ def export_controller(
     `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.
     """
     if rate_hz is None:
-        what, remedy = f"missing, but required by {to}", "give the readings' rate in Hz"
-        raise DrakeTeleopError(what, where="rate", remedy=remedy)
+        what, remedy = f"is missing, but required by {to}", "give the readings' rate in Hz"
+        raise DrakeTeleopError(what, where="--rate", remedy=remedy)
     if sensor_pose is not None:
         raise unused_sensor_pose_error(to)
     refuse_removed_weight(found, to)
