@@ -54,13 +54,14 @@ class Fault(IntEnum):
     RESUMING = 7
 
 
+_OUT_OF_RANGE = f"not finite or above {LARGEST_PORT_VALUE:g} in SI units"
 FAULT_WARNINGS = {
-    Fault.STALE: "the wrist sensor's last sample is too old or too new",
-    Fault.READING: "the wrist sensor gives no reading, or an impossibly large one",
-    Fault.JOINTS: "the slave's joint angles are not finite or too large",
-    Fault.LOAD: "the load estimate is not finite or too large",
-    Fault.WRENCH: "the wrench for the hand is not finite or too large",
-    Fault.HAND: "the hand's joint angles are not finite or too large",
+    Fault.STALE: "the wrist sensor's last sample is over 50 ms (and two periods) old or ahead",
+    Fault.READING: "the wrist sensor gives no reading, or one beyond its valid range",
+    Fault.JOINTS: f"the slave's joint angles are {_OUT_OF_RANGE}",
+    Fault.LOAD: f"the load estimate is {_OUT_OF_RANGE}",
+    Fault.WRENCH: f"the wrench for the hand is {_OUT_OF_RANGE}",
+    Fault.HAND: f"the hand's joint angles are {_OUT_OF_RANGE}",
     Fault.RESUMING: "the force at the hand comes back after a fault",
 }
 """Warning text of each fault."""

@@ -324,7 +324,7 @@ class Live:
         if self._link is not None and not self.stopped:
             self._link.send_wrench(self._session.device_wrench())
         if self._session.ms >= live_inputs.MAX_DURATION_MS:
-            self.stopped = "the limit of ten hours is reached"
+            self.stopped = "the limit of ten hours of simulated time is reached"
 
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()

@@ -97,9 +97,9 @@ def write_replay(
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
-        what = f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}"
+        what = f"cannot be made: the log contains no {', '.join(missing) or 'samples'}"
         remedy = "give the log of a station with a simulated slave"
-        raise DrakeTeleopError(what, where="replay", remedy=remedy)
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     start, stop = float(result.t[0]), float(result.t[-1])
     times, slow_motion = replay_file.frame_times(start, stop, slow_motion)
     rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time

@@ -99,7 +99,7 @@ def _raise_recorded_fault(simulator: Simulator, start: float, num_checked_rows: 
         for k in np.flatnonzero(log.data()[column][0, num_checked_rows:])[:1] + num_checked_rows:
             what = FAULT_WARNINGS[Fault(int(log.data()[column][0, k]))]
             what = f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}"
-            remedy = "set it to continue, and the run goes on in its safe state"
+            remedy = "correct the cause; or set it to continue, for a run on in the safe state"
             raise DrakeTeleopError(what, where="simulation.on_fault", remedy=remedy)
     return int(log.num_samples())
 

@@ -457,3 +457,16 @@ def test_a_scene_is_found_from_the_scenarios_folder(tmp_path):
     (found, shipped) = LoadScenario(tmp_path / "mine.yaml").environment
     assert found.path == tmp_path / "pad.sdf"
     assert shipped.path.parent.name == "models"
+
+
+def test_shape_without_contact_stiffness_is_named(tmp_path):
+    shape = (
+        '<collision name="c"><geometry><box><size>0.1 0.1 0.1</size></box></geometry></collision>'
+    )
+    link = f'<link name="plate">{shape}</link>'
+    text = f'<sdf version="1.9"><model name="m"><static>1</static>{link}</model></sdf>'
+    (tmp_path / "plate.sdf").write_text(text)
+    scene = Scene(file=str(tmp_path / "plate.sdf"), position=[0.6, 0.0, 0.2])
+    slave = AddSlavePlant(DiagramBuilder(), Slave(), scene)
+    reason = slave.contact.drake_contact_reason
+    assert reason.startswith("m::c: has no drake:point_contact_stiffness; add it to its")

@@ -186,5 +186,5 @@ def test_invalid_scales_are_rejected(arm):
     block = ForceScaling(ForceScalingConfig(), arm, np.eye(3))
     context = block.CreateDefaultContext()
     scales = dict(sigma_gripper=0.0, sigma_object=0.0, gamma=1.0, force_scale=np.nan)
-    with pytest.raises(DrakeTeleopError, match="SetScales"):
+    with pytest.raises(DrakeTeleopError, match="SetScales: force_scale: nan is"):
         block.SetScales(context, **scales)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydrake.geometry import Box, GeometryId, Obb, ProximityProperties, SceneGraphInspector, Sphere
+from pydrake.geometry import Box, GeometryId, Obb, SceneGraphInspector, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, RigidBody
@@ -91,8 +91,8 @@ def FindContactPairs(
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
                     sphere, edges = _require_sphere_and_box(inspector, own, other)
-                    materials = map(inspector.GetProximityProperties, (own, other))
-                    last = [direction, _combined_contact_law(*materials), [slip_speed, row]]
+                    law = _combined_contact_law(inspector, own, other)
+                    last = [direction, law, [slip_speed, row]]
                     place, half = [X_SShape.translation(), [sphere.radius()]], edges.size() / 2
                     compiled_pairs.append(_shape_pair_row(place, X_Other, half, last))
                 except DrakeTeleopError as beyond:
@@ -147,13 +147,16 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
     return direction
 
 
-def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
+def _combined_contact_law(
+    inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
+) -> list[float]:
     names = "point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"
-    if not all(x.HasProperty("material", name) for x in (ball, box) for name in names[:2]):
-        what = "the contact material has no stiffness or no dissipation"
-        remedy = "give drake:point_contact_stiffness and drake:hunt_crossley_dissipation"
-        raise DrakeTeleopError(what, where="drake:proximity_properties", remedy=remedy)
-    values = [[x.GetProperty("material", n) for x in (ball, box)] for n in names]
+    materials = [inspector.GetProximityProperties(shape) for shape in (ball, box)]
+    for shape, material in zip((ball, box), materials, strict=True):
+        if missing := [n for n in names[:2] if not material.HasProperty("material", n)]:
+            what, remedy = f"has no drake:{missing[0]}", "add it to its drake:proximity_properties"
+            raise DrakeTeleopError(what, where=inspector.GetName(shape), remedy=remedy)
+    values = [[x.GetProperty("material", n) for x in materials] for n in names]
     (k_1, k_2), (d_1, d_2), frictions = values
     both = CalcContactFrictionFromSurfaceProperties(*frictions)
     d = (k_2 * d_1 + k_1 * d_2) / (k_1 + k_2)

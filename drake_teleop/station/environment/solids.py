@@ -121,7 +121,7 @@ class Block(Surface):
 
     def check(self, where: str) -> None:
         if 0.0 < min(self.table) < max(self.size[:2]):
-            what = "the table is smaller than the block on it"
+            what = f"the table, {self.table} m, is smaller than the block, {self.size[:2]} m"
             remedy = "give a larger table; or give [0, 0] and add a !Box that carries the block"
             raise DrakeTeleopError(what, where=f"{where}.table", remedy=remedy)
 

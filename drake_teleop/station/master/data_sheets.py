@@ -188,7 +188,8 @@ class Master:
             remedy = "leave friction out, and set figures.friction and figures.damping"
             raise DrakeTeleopError(what, where=f"{where}.friction", remedy=remedy)
         if (self.leader is None) == (self.model == LEADER_NAME):
-            what = "`model: leader` and the settings `leader` require each other"
+            word = "without" if self.leader is None else "with"
+            what = f"`model: {self.model}` {word} the settings `leader` is invalid"
             remedy = "give both, with leader.file and leader.hand_frame, or none"
             raise DrakeTeleopError(what, where=f"{where}.leader", remedy=remedy)
         if self.leader is not None:

@@ -52,7 +52,7 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
             f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
             f"simulation with a period of {1e3 * period:g} ms is unstable",
             where=device.friction_setting_path,
-            remedy="choose less friction, or a higher hand rate",
+            remedy="choose less friction, or a higher rates.hand_hz",
         )
 
 

@@ -216,8 +216,8 @@ class LeaderDevice:
             place = ", ".join(f"{x:.3g}" for x in pose[4:])
             cause = f"inverse kinematics: {status.name}"
             what = f"the leader arm cannot reach ({place}) m in B ({cause})"
-            remedy = "choose a pose that its joints reach, or another home"
-            raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
+            remedy = "choose a position that its joints reach, or another master.leader.home"
+            raise DrakeTeleopError(what, where="master.position", remedy=remedy)
         return q
 
     def forward_kinematics(self, q: Array) -> Array:

@@ -229,8 +229,8 @@ def inverse_kinematics(pose: Array) -> Array:
     cosine = (reach**2 + z**2 - L1**2 - L2**2) / (2 * L1 * L2)
     if abs(cosine) > 1:
         what = f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m"
-        remedy = "choose a start pose inside the device's workspace, in its base frame B"
-        raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
+        remedy = "choose a start position inside the device's workspace, in its base frame B"
+        raise DrakeTeleopError(what, where="master.position", remedy=remedy)
     elbow = math.acos(cosine)
     q2 = math.atan2(z, reach) + math.atan2(L2 * math.sin(elbow), L1 + L2 * math.cos(elbow))
     q3 = q2 - elbow + math.pi / 2
@@ -266,5 +266,5 @@ def check_limits(q: Array) -> None:
         if i < 6:
             limits = f"its range is {least:.1f} to {most:.1f}"
             what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, {limits}"
-        remedy = "choose a start pose inside the device's workspace"
-        raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
+        remedy = "choose a start position inside the device's workspace"
+        raise DrakeTeleopError(what, where="master.position", remedy=remedy)

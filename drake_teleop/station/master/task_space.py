@@ -143,6 +143,6 @@ def check_limits(q: Array, device: DeviceParameters) -> None:
             f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll "
             f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "
             f"is {axes} m, +-({turns}) degrees",
-            where="pose_master",
-            remedy="choose a start pose inside the device's workspace, in its base frame B",
+            where="master.position",
+            remedy="choose a start position inside the device's workspace, in its base frame B",
         )

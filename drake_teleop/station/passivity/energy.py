@@ -27,7 +27,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
         what = f"expected shapes (N, 6) and (N, 7), found {wrench.shape} and {pose.shape}"
-        remedy = "give one wrench and one pose per sample"
+        remedy = "give one wrench and one pose for each of the N samples"
         raise DrakeTeleopError(what, where="wrench, pose", remedy=remedy)
     work = np.zeros((len(wrench), 2))
     _cumulative_work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)

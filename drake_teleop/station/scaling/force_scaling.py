@@ -298,10 +298,11 @@ class ForceScaling(LeafSystem):
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)
         requested = np.array([*both, gamma, force_scale, *weights, duration], dtype=float)
-        if not (requested >= 0.0).all() or not np.isfinite(requested).all():
-            what = "a scale or the duration of the change is negative or not finite"
-            remedy = "give finite numbers of 0 or more"
-            raise DrakeTeleopError(what, where="SetScales", remedy=remedy)
+        names = "sigma_gripper sigma_object gamma force_scale sigma_weight sigma_weight duration"
+        for name, value in zip(names.split(), requested, strict=True):
+            if not 0.0 <= value < np.inf:
+                what, remedy = f"{value:g} is negative or not finite", "give 0 or more"
+                raise DrakeTeleopError(what, where=f"SetScales: {name}", remedy=remedy)
         parameter = context.get_mutable_numeric_parameter(self._change)
         now, start = np.empty(_NUM_BLENDED_SCALES), context.get_time()
         blend_scales_at(parameter.value(), start, now)

@@ -13,7 +13,7 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.arm import (
@@ -48,9 +48,10 @@ def ArmModelFromPlant(
     other joint moves on its links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
-        what, where = "the arm has no frame named", plant.GetModelInstanceName(model_instance)
-        remedy = "name the frame or link at which the sensor measures"
-        raise DrakeTeleopError(f"{what} {sensor_frame_name!r}", where=where, remedy=remedy)
+        what = f"{plant.GetModelInstanceName(model_instance)} has no frame {sensor_frame_name!r}"
+        known = sorted(plant.get_frame(k).name() for k in plant.GetFrameIndices(model_instance))
+        remedy = suggest_name(sensor_frame_name, known, f"name one of {', '.join(known)}")
+        raise DrakeTeleopError(what, where="sensor_frame_name", remedy=remedy)
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
     joints = _moving_joints_to_sensor(plant, frame_S)
     actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
@@ -138,8 +139,8 @@ def _bodies_moved_by_joints(
         moving = [inboard[k] for k in loose if inboard[k].parent_body().index() not in loose]
         if moving:
             where, name = moving[0].name(), link.name()
-            what = f"the joint moves on link {name}, but is not between the world and the sensor"
-            raise DrakeTeleopError(what, where=where, remedy="weld that joint")
+            what = f"moves on link {name}, but is not a joint between the world and the sensor"
+            raise DrakeTeleopError(what, where=f"joint {where}", remedy="weld this joint")
     return [*map(list, rows), list(load)]
 
 

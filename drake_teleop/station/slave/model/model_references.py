@@ -168,7 +168,8 @@ class ModelFiles:
         try:
             for address in _mesh_addresses(path) if with_meshes else self._addresses_in_file(path):
                 if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
-                    what = f"references a file by {len(address)} characters"  # Drake aborts on it
+                    limit = f"(at most {_MAX_PATH_LENGTH})"  # Drake aborts on it
+                    what = f"references a file by {len(address)} characters {limit}"
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
                 found = set[Path]().union(*map(_existing_raw_and_normalized_paths, named))
