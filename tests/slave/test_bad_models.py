@@ -124,9 +124,11 @@ ERRORS = {
     "URDF called MJCF": ("xml", arm(), "does not contain a mujoco tag"),
     "no such kind": ("usda", "#usda 1.0", "give a URDF, SDF, MJCF.*not a recognized type"),
     "a macro by its name": ("urdf.xacro", arm(),
-                            "is a xacro file, not a model; run it through xacro first"),
+                            "is a xacro file, not a model; expand it first"),
     "a macro by what is in it": ("urdf", '<robot name="a" xmlns:xacro="x"><xacro:arm/></robot>',
-                                 "arm.urdf: is a xacro file, not a model; run it through xacro"),
+                                 "arm.urdf: is a xacro file, not a model; expand it first"),
+    "a property that is used": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')).replace(
+        "<link", '<xacro:property name="m" value="2"/><link', 1), "is a xacro file"),
     "a macro's number": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')),
                          "link l3: mass ..m. kg is not between 0 and"),
     # Trees

@@ -108,6 +108,8 @@ LOOKALIKES = {
     "arm without masses": (
         re.sub("<inertial>.*?</inertial>", "", arm()),
         "a rotor inertia of 0.219 kg m.2, as the model has no inertia there, for j1, .*, j6$"),
+    "arm with unused properties of xacro": (
+        arm(l0='<xacro:property name="m" value="2"/><xacro:arg name="n"/>' + link("l0")), "^$"),
     "arm with plugins, a loose cup and a floating base": (
         arm(l0=link("world", "") + link("l0") + joint(30, "floating", "", "world", "l0"),
             beyond=link("cup") + '<gazebo reference="l3"><kp>1</kp></gazebo><sensor/>'),
@@ -272,14 +274,26 @@ def test_arm_is_taken_out_of_an_sdf(tmp_path, text, stated):
         np.testing.assert_allclose(pose(model, [q]), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("uri", ["inside/arm.sdf", "inside"])
-def test_included_model_is_repaired(tmp_path, uri):
-    """The folder of a model names its file in model.config."""
+@pytest.mark.parametrize("name", ["hand", "base", "l1"])
+def test_sdf_joint_with_the_name_of_a_link_gets_another(tmp_path, name):
+    """Drake rejects such a file; older simulators accept it."""
+    text = ARM_SDF.replace('<joint name="a"', f'<joint name="{name}"')
+    path = written(tmp_path, f"<sdf version='1.7'>{text}</sdf>", "arm.sdf")
+    _, model, said = read(path, "ft", shapes=True)
+    assert f"a new name for the joint {name} ({name}_1)" in said
+    assert model.joint_names == (f"{name}_1",) and model.effort_limit[0] == 30.0
+
+
+@pytest.mark.parametrize("outer_name", ["outer.sdf", "arm.sdf"])
+@pytest.mark.parametrize("uri", ["inside/arm.sdf", "inside", "model://inside"])
+def test_included_model_is_repaired(tmp_path, uri, outer_name):
+    """The folder of a model, also the outer one, names its file in model.config."""
+    written(tmp_path, f"<model><sdf>{outer_name}</sdf></model>", "model.config")
     (tmp_path / "inside").mkdir()
     written(tmp_path / "inside", f"<sdf version='1.7'>{ARM_SDF}</sdf>", "arm.sdf")
     written(tmp_path / "inside", "<model><sdf> arm.sdf </sdf></model>", "model.config")
     outer = f"<sdf version='1.7'><model name='m'><include><uri>{uri}</uri></include></model></sdf>"
-    _, model, said = read(written(tmp_path, outer, "outer.sdf"), "ft")
+    _, model, said = read(written(tmp_path, outer, outer_name), "ft")
     assert model.joint_names == ("a",) and model.effort_limit[0] == 30.0
     assert "of link l1 (11.1 %)" in said
 

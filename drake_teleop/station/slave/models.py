@@ -26,7 +26,8 @@ from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRep
 from drake_teleop.station.slave.model.urdf_and_sdf_repair import repair_sdf, repair_urdf
 
 _XACRO_FAULT = "is a xacro file, not a model"
-_XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
+_XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the URDF that comes out"
+_UNUSED_XACRO_TAGS = ("xacro:property", "xacro:arg")  # of no effect without ${...} and $(...)
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 # Remedies for missing packages.
 _ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
@@ -106,9 +107,21 @@ def _repair_text(model: ModelRepair) -> None:
     repair = _REPAIR_FUNCTION_OF_SUFFIX.get(model.path.suffix.lower())
     if repair is None:
         return
-    if any(element.tag.startswith("xacro:") for element in model.root.iter()):
-        raise DrakeTeleopError(_XACRO_FAULT, where=str(model.path), remedy=_XACRO_REMEDY)
+    _remove_unused_xacro_elements(model)
     repair(model)
+
+
+def _remove_unused_xacro_elements(model: ModelRepair) -> None:
+    elements = list(model.root.iter())
+    found = {each.tag for each in elements if each.tag.startswith("xacro:")}
+    values = [value for each in elements for value in (*each.attrib.values(), each.text or "")]
+    uses = any("${" in value or "$(" in value for value in values)
+    if found and (uses or found.difference(_UNUSED_XACRO_TAGS)):
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(model.path), remedy=_XACRO_REMEDY)
+    for parent in elements:
+        for tag in found:
+            for child in parent.findall(tag):
+                parent.remove(child)
 
 
 class ParsedArm(NamedTuple):

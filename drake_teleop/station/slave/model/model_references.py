@@ -164,6 +164,8 @@ class ModelFiles:
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
             tops.append(Path.cwd())  # Drake resolves nested includes from here
+        if path.is_dir() or path.suffix.lower() == ".config":  # Gazebo: names of files in it
+            tops = [path if path.is_dir() else path.parent]
         folders = {top / base for top in tops for base in self._bases}
         try:
             for address in _mesh_addresses(path) if with_meshes else self._addresses_in_file(path):

@@ -68,7 +68,7 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
     model_numbers.replace_commas_by_blanks(model.root)
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
-        _make_names_unique(scope, model)
+        _make_names_unique(scope, model, is_sdf=is_sdf)
     chain, num_joints_to_link = _reduce_model_to_arm(scopes, model) or (set(), {})
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
@@ -128,8 +128,10 @@ def _reduce_model_to_arm(
     return model_tree.reduce_to_chain(scopes[0], link, model) if link else None
 
 
-def _make_names_unique(scope: Element, model: ModelRepair) -> None:
-    joints, names = list_joints(scope), set[str]()
+def _make_names_unique(scope: Element, model: ModelRepair, *, is_sdf: bool) -> None:
+    joints = list_joints(scope)
+    # In SDF, a joint must not have the name of a link either.
+    names = {link.get("name", "") for link in scope.findall("link")} if is_sdf else set[str]()
     for number_of_joint, joint in enumerate(joints, start=1):
         name = joint.get("name", "")
         if not name or name in names:
