@@ -155,6 +155,21 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
     assert (plan.tool_axis_advice, plan.tip_S, plan.place.is_set_by_position) == ("", [], True)
 
 
+@pytest.mark.parametrize(
+    ("name", "where"),
+    [
+        ("scene.xml", ' quat="0.70711 0 0.70711 0"/> in the body hand and give'),
+        ("world.sdf", "</frame> in the model of hand and give"),
+        ("arm.urdf", "add to arm.urdf <link"),
+        ("arm.dmd.yaml", "add to arm.dmd.yaml - add_frame"),
+    ],
+)
+def test_advised_line_names_the_file_only_if_it_includes_no_models(name, where):
+    advice = place.tool_frame_advice(Path(name), "hand", "x")
+    assert where in advice
+    assert (name in advice) == ("add to" in where)
+
+
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_advised_line_of_directives_turns_z_to_the_tool(axis):
     line = place.tool_frame_advice(Path("a.dmd.yaml"), "sensor", axis).split(" - ")[1]

@@ -106,3 +106,17 @@ def other_plant(**kwargs):
 
 def sliding_plant():
     return other_plant(slides=4)
+
+
+def five_joint_plant(fourth_axis: tuple[float, ...] = (0, 1, 0)):
+    """Return a small arm: by default yaw, three pitch joints, and roll, as OpenManipulator-X."""
+    joints = [("0 0 0.034", (0, 0, 1)), ("0 0 0.064", (0, 1, 0)), ("0.042 0 0.113", (0, 1, 0))]
+    joints += [("0.162 0 0", fourth_axis), ("0.029 0 0", (1, 0, 0))]
+    parts = ['<robot name="five"><link name="world"/>']
+    for k, (xyz, axis) in enumerate(joints):
+        parent = "world" if k == 0 else f"l{k - 1}"
+        parts += [link(f"l{k}"), joint(f"j{k}", "revolute", parent, f"l{k}", xyz, axis=axis)]
+    plant = MultibodyPlant(0.0)
+    (arm,) = Parser(plant).AddModelsFromString("".join(parts) + "</robot>", "urdf")
+    plant.Finalize()
+    return plant, arm, "l4"

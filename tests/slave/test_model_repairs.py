@@ -16,8 +16,9 @@ from test_bad_models import INERTIA, INERTIAL, LIMIT, arm, joint, link
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.scenario_reference import write_scenario
-from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.arm import forward_kinematics, holding_torque
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.chain_joints import bodies_carried_by
 from drake_teleop.station.slave.model.model_numbers import (
     check_lengths_and_inertias,
     nearest_possible_inertia,
@@ -136,6 +137,54 @@ def test_masses_beside_the_chain_stay(tmp_path):
     masses = model.table[:-1, 12]  # first of the inertial parameters
     np.testing.assert_allclose(masses, [2.0, 2.0, 2.0, 10.0, 2.0, 2.0])
     assert plant.num_positions() == 6
+
+
+PALM_AND_FINGER = link("palm") + joint(21, parent="l6", child="palm")
+PALM_AND_FINGER += link("finger") + joint(22, "prismatic", parent="palm", child="finger")
+
+
+def frames_on_last_link(*origins: str) -> str:
+    """Return massless links, each welded to the one before; the last one is `tool`."""
+    names = ["l6", *(f"frame_{k}" for k in range(1, len(origins))), "tool"]
+    return "".join(
+        f'{link(child, "")}<joint name="to_{child}" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin {origin}/></joint>'
+        for parent, child, origin in zip(names, names[1:], origins, strict=False)
+    )
+
+
+@pytest.mark.parametrize(
+    "origins",
+    [
+        ['rpy="0 1.5708 0"'],
+        ['rpy="0.3 -0.2 2.5"'],
+        ['rpy="1 0 0"', 'rpy="0 0 0.5"'],
+        ['xyz="0 0 0.2"', 'xyz="0 0 -0.2" rpy="0 0 3"'],
+    ],
+)
+def test_massless_frame_at_the_last_link_carries_what_the_link_carries(tmp_path, origins):
+    path = written(tmp_path, arm(beyond=PALM_AND_FINGER + frames_on_last_link(*origins)))
+    _, on_link, _ = read(path)
+    plant, on_frame, said = read(path, "tool")
+    assert "robot's side" not in said
+    names = {body.name() for body in bodies_carried_by(plant, plant.GetBodyByName("tool"))}
+    assert names == {"palm", "finger"}
+    np.testing.assert_allclose(on_frame.table[:-1], on_link.table[:-1], atol=1e-12)
+    q = np.full(6, 0.3)
+    R_WL, R_WF = pose(on_link, q)[:, :3], pose(on_frame, q)[:, :3]
+    moments = R_WL @ on_link.phi_load[1:4], R_WF @ on_frame.phi_load[1:4]
+    np.testing.assert_allclose(*moments, atol=1e-12)
+    torques = holding_torque(on_link, q), holding_torque(on_frame, q)
+    np.testing.assert_allclose(*torques, atol=1e-12)
+
+
+@pytest.mark.parametrize("offset", [1e-3, -0.1])
+def test_bodies_beside_a_frame_elsewhere_on_the_link_are_stated(tmp_path, offset):
+    frame = frames_on_last_link(f'xyz="0 {offset} 0"')
+    _, model, said = read(written(tmp_path, arm(beyond=PALM_AND_FINGER + frame)), "tool")
+    assert model.phi_load[0] == 0.0
+    expected = "on the robot's side of tool: palm of the model, 4 kg (beyond the sensor with"
+    assert f"{expected} sensor_frame l6)" in said
 
 
 @pytest.mark.parametrize("hold", [None, {"j1": 0.3}])

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from odd_arms import other_plant, rx90_plant, sliding_plant
+from odd_arms import five_joint_plant, other_plant, rx90_plant, sliding_plant
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
@@ -242,6 +242,42 @@ def test_arm_stops_at_boundary_and_returns(rx90):
         q, status = follow(rx90, pose, q, max_step=max_step)
     assert status == IkStatus.OK
     np.testing.assert_allclose(q, start, atol=1e-8)
+
+
+FIVE_JOINTS = np.array([0.2, -0.46, 0.71, 1.11, -0.04])
+
+
+def follow_displacement(case, displacement, turn):
+    """Return position error [m], orientation error [rad] and status after a slow motion."""
+    start, q = case.X_WS(FIVE_JOINTS), FIVE_JOINTS
+    for k in range(1, 801):
+        share = min(k / 500, 1.0)
+        R = RotationMatrix.MakeZRotation(share * turn) @ start.rotation()
+        pose = pose_of(RigidTransform(R, start.translation() + share * np.array(displacement)))
+        q, status = follow(case, pose, q, max_step=0.01)
+    return (*case.errors(pose, q), status)
+
+
+@pytest.mark.parametrize("fourth_axis", [(0, 1, 0), (0, 0, 1)])
+@pytest.mark.parametrize(
+    ("displacement", "turn"),
+    [([0, 0.002, 0], 0), ([0, -0.01, 0], 0), ([0.01, 0.02, 0.01], 0), ([0, 0, 0], 0.02)],
+)
+def test_five_joints_that_miss_only_the_orientation_are_not_out_of_reach(
+    displacement, turn, fourth_axis
+):
+    case = case_of(*five_joint_plant(fourth_axis))
+    position_error, angle, status = follow_displacement(case, displacement, turn)
+    assert position_error < 1e-3 and angle > 1e-3
+    assert status == IkStatus.WRIST_SINGULAR
+
+
+@pytest.mark.parametrize("displacement", [[0.5, 0, 0], [0.25, 0.25, 0], [-0.02, 0.6, 0.1]])
+def test_five_joints_that_miss_the_position_by_1_mm_are_out_of_reach(displacement):
+    case = case_of(*five_joint_plant())
+    position_error, _, status = follow_displacement(case, displacement, 0)
+    assert position_error > 1e-3
+    assert status == IkStatus.OUT_OF_REACH
 
 
 def test_other_joints_compensate_for_joint_at_limit(rx90):

@@ -373,7 +373,7 @@ def tool_frame_advice(model: Path, sensor_frame: str, axis: str) -> str:
     lines = {
         ".xml": f'<body name="{name}" quat="{quaternion}"/> in the body {sensor_frame}',
         ".sdf": f'<frame name="{name}" attached_to="{sensor_frame}"><pose>0 0 0 {rpy}</pose>'
-        "</frame>",
+        f"</frame> in the model of {sensor_frame}",
         ".yaml": f"- add_frame: {{name: {name}, X_PF: {{base_frame: MODEL::{sensor_frame},"
         f" rotation: !Rpy {{deg: [{degrees}]}}}}}}",
     }
@@ -381,8 +381,10 @@ def tool_frame_advice(model: Path, sensor_frame: str, axis: str) -> str:
         f'<link name="{name}"/><joint name="{name}_joint" type="fixed">'
         f'<parent link="{sensor_frame}"/><child link="{name}"/><origin rpy="{rpy}"/></joint>'
     )
+    # MJCF and SDF files may include the file with the sensor frame.
+    place = f" to {model.name}" if model.suffix.lower() not in (".xml", ".sdf") else ""
     return (
         f"the tool points along {axis}_S, so the start is in slave.home and the contact point in"
-        f" slave.tip; to use position, or another direction, add to {model.name}"
+        f" slave.tip; to use position, or another direction, add{place}"
         f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame {name}"
     )

@@ -34,6 +34,9 @@ from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
 _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG = 0.14
 _SLIDER_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
+# Largest mass of a sensor body that is only a frame, and its largest distance to the origin of the
+# link that it shares.
+_MAX_FRAME_MASS_KG, _MAX_FRAME_OFFSET_M = 1e-6, 1e-6
 _SKELETON_STICK_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -165,6 +168,52 @@ def weld_joints_outside_chain(
     return [f"held: {join_names(names)}"] if names else []
 
 
+def weld_load_of_link_to_sensor_frame(
+    plant: MultibodyPlant, frame: Frame, chain: list[Joint]
+) -> list[str]:
+    """Weld the other bodies on a link to a massless sensor body at the link's origin.
+
+    They become the load, as if the link were the sensor frame. If the sensor body is elsewhere on
+    the link, they remain on the robot's side; the returned list then has a note on them.
+    """
+    X_LS = frame.GetFixedPoseInBodyFrame()
+    for inboard in reversed(chain):
+        body, link = inboard.child_body(), inboard.parent_body()
+        if not isinstance(inboard, WeldJoint) or _carried_mass(plant, body) > _MAX_FRAME_MASS_KG:
+            break
+        X_LS = _pose_of_welded_child(inboard) @ X_LS
+        others = [
+            joint
+            for joint in joints_by_child(plant).values()
+            if isinstance(joint, WeldJoint)
+            and joint.parent_body().index() == link.index()
+            and joint.child_body().index() != body.index()
+            and _carried_mass(plant, joint.child_body()) > _MAX_FRAME_MASS_KG
+        ]
+        if others and np.linalg.norm(X_LS.translation()) > _MAX_FRAME_OFFSET_M:
+            names = join_names(sorted(joint.child_body().name() for joint in others))
+            mass = sum(_carried_mass(plant, joint.child_body()) for joint in others)
+            what = f"on the robot's side of {frame.name()}: {names} of the model, {mass:.4g} kg"
+            return [f"{what} (beyond the sensor with sensor_frame {link.name()})"]
+        for joint in others:
+            name, frame_M = joint.name(), joint.frame_on_child()
+            X_SM = X_LS.inverse() @ joint.frame_on_parent().GetFixedPoseInBodyFrame() @ joint.X_FM()
+            plant.RemoveJoint(joint)
+            plant.AddJoint(WeldJoint(name, frame, frame_M, X_SM))
+        if others:
+            break
+    return []
+
+
+def _carried_mass(plant: MultibodyPlant, body: RigidBody) -> float:
+    return sum(each.default_mass() for each in [body, *bodies_carried_by(plant, body)])
+
+
+def _pose_of_welded_child(weld: WeldJoint) -> RigidTransform:
+    X_MB = weld.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+    return weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM() @ X_MB
+
+
 def _replace_joint_by_weld(plant: MultibodyPlant, joint: Joint) -> None:
     name, ends = joint.name(), (joint.frame_on_parent(), joint.frame_on_child())
     X_FM = _default_joint_pose(joint)
@@ -287,8 +336,7 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
             continue
         if joint.parent_body().index() == plant.world_body().index():
             _add_stick(plant, joint.child_body(), np.zeros(3), p_BEnd)
-        X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-        p_BEnd = frame.GetFixedPoseInBodyFrame() @ joint.X_FM() @ X_MB @ p_BEnd
+        p_BEnd = _pose_of_welded_child(joint) @ p_BEnd
 
 
 def _add_stick(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:

@@ -34,7 +34,8 @@ class IkStatus(IntEnum):
     """Status of an inverse kinematics, whose search starts at the reference posture.
 
     The numeric method reports a singularity only if it misses the pose: WRIST_SINGULAR if the last
-    three axes are nearly coplanar, otherwise SHOULDER_SINGULAR.
+    three axes are nearly coplanar, otherwise SHOULDER_SINGULAR. With fewer than 6 joints it is
+    WRIST_SINGULAR, or OUT_OF_REACH if the position is missed by more than 1 mm.
     """
 
     OK = 0

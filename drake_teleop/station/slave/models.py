@@ -157,6 +157,7 @@ def ParseModel(
     moving = [joint for joint in chain if joint.num_velocities() > 0]
     with translate_drake_errors(path):
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
+        held += chain_joints.weld_load_of_link_to_sensor_frame(plant, frame, chain)
         limits = model.effort_limits if model.text else None
         chain_joints.set_one_actuator_per_joint(plant, moving, limits)
         rotors = chain_joints.add_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)

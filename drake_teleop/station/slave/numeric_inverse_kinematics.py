@@ -41,6 +41,10 @@ _ZERO_GRADIENT_RATIO_M = 1e-3
 _MAX_POSE_ERROR_AT_SINGULARITY_M = 5e-6
 # The same for `find_posture`, which stops the search earlier [m].
 _MAX_SEARCH_ERROR_AT_SINGULARITY_M = 1e-3
+# Position error above which a pose is out of reach for an arm with fewer than 6 joints, which
+# always misses a part of the orientation [m]. 1 mm is visible at the tool, and about the
+# repeatability of small arms.
+_MAX_POSITION_ERROR_WITH_FEW_JOINTS_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
@@ -147,6 +151,8 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
 @njit(cache=True)
 def _wrist_or_shoulder_status(L, J):
     n = J.shape[1]
+    if n < 6:  # such an arm lacks a direction in every posture
+        return _WRIST_SINGULAR
     a, b, c = (
         vectors.vector_at(J[3:, n - 3], 0),
         vectors.vector_at(J[3:, n - 2], 0),
@@ -201,7 +207,8 @@ def follow_pose(
     squared = _pose_error_into(table, L, pose, q, x, J, e, push)
     _smaller_gram_matrix_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
-    before, expected_gain = np.inf, 0.0
+    before, missed, expected_gain = np.inf, 0.0, 0.0
+    limit = _MAX_POSITION_ERROR_WITH_FEW_JOINTS_M if n < 6 else _MAX_POSE_ERROR_AT_SINGULARITY_M
     while True:
         anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
@@ -245,7 +252,7 @@ def follow_pose(
             if squared < (1.0 - 1e-7) * before - expected_gain:
                 return _wrist_or_shoulder_status(L, J)
             vectors.copy_into(q, 0, kept, 0, n)
-            far = before > _MAX_POSE_ERROR_AT_SINGULARITY_M**2 and expected_gain < 1e-3 * before
+            far = missed > limit**2 and (n < 6 or expected_gain < 1e-3 * before)
             return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
@@ -258,7 +265,7 @@ def follow_pose(
         zero_gradient = _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared
         if min_singular_value > 0.0 and free > zero_gradient:
             return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
-        before = squared
+        before, missed = squared, vectors.dot(p, p) if n < 6 else squared
         # Gain expected from later samples; without it, every pose would count as reachable.
         expected_gain = 4.0 * free / max(damping, _MIN_STEP_DAMPING_M2)
         vectors.copy_into(kept, 0, q, 0, n)
