@@ -16,7 +16,7 @@ from drake_teleop.lab.new_station.place import (
     _order_postures_to_solve,
     _rows_away_from_limits,
     find_start_place,
-    sensor_axis_along_last_joint,
+    sensor_axis_along_tool,
 )
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
@@ -133,14 +133,98 @@ def test_offset_of_a_nearly_straight_arm_has_no_direction():
     np.testing.assert_allclose(upward_share_of_elbow_offset(postures, 1.0), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("height", "axis"), [(0.1, "y"), (0.0, "y"), (-0.1, "-y")])
-def test_axis_of_the_last_joint_points_away_from_it(height, axis):
+@pytest.mark.parametrize(
+    ("before", "height", "com", "axis"),
+    [
+        (0.0, 0.1, [0.0, 0.0, 0.0], "y"),
+        (0.0, 0.0, [0.0, 0.0, 0.0], "y"),
+        (0.0, -0.1, [0.0, 0.0, 0.0], "-y"),
+        (-0.2, 0.1, [0.0, 0.0, 0.0], "-y"),
+        (0.2, -0.1, [0.0, -0.05, 0.0], "y"),
+        (0.0, 0.1, [0.0, -0.2, 0.0], "-y"),
+        (0.0, 0.1, [0.0, 0.0, 0.05], "z"),
+        (0.0, 0.1, [0.0, 0.0, -0.3], "-z"),
+    ],
+)
+def test_tool_axis_is_away_from_the_arm(before, height, com, axis):
     arm = slave_arm(LoadScenario("touch"))
     table = arm.table.copy()
-    row = table[arm.num_joints]
-    row[ROTATION_COLUMN:TRANSLATION_COLUMN] = [0, 0, 1, 1, 0, 0, 0, 1, 0]
-    row[TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3] = [0.2, -0.3, height]
-    assert sensor_axis_along_last_joint(replace(arm, table=table)) == axis
+    columns = slice(ROTATION_COLUMN, TRANSLATION_COLUMN + 3)
+    table[-2, columns] = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0.4, 0.5, before]
+    table[-1, columns] = [0, 0, 1, 1, 0, 0, 0, 1, 0, 0.0, -0.3, height]
+    assert sensor_axis_along_tool(replace(arm, table=table), np.array(com)) == axis
+
+
+AXES = [
+    ("0 -1.5707963 0", [1, 0, 0]),
+    ("0 1.5707963 0", [-1, 0, 0]),
+    ("1.5707963 0 0", [0, 1, 0]),
+    ("3.1415927 0 0", [0, 0, -1]),
+]
+
+
+@pytest.mark.parametrize(("rpy", "axis"), AXES)
+@pytest.mark.parametrize("from_flange", [0.0, 0.1, 0.2])  # 0.2: S is at the end of the gripper
+def test_gripper_of_the_model_points_down(from_flange, rpy, axis, tmp_path):
+    path = write_arm(tmp_path / "arm.urdf")
+    back = " ".join(f"{-float(angle)}" for angle in rpy.split())
+    place = " ".join(map(str, -from_flange * np.array(axis)))
+    gripper = _link("gripper", 0.2) + _joint("hold", "fixed", "ft", "gripper", place, back)
+    flange = _joint("flange", "fixed", "link6", "ft", f"0 0 {0.04 + from_flange}", rpy)
+    old = _joint("flange", "fixed", "link6", "ft", "0 0 0.04")
+    path.write_text(path.read_text().replace(old, flange + gripper))
+    plan = plan_station(path, "ft")
+    assert plan.has_own_tool and plan.what_points_down == "tool"
+    plan.posture_shapes.move_to(plan.place.q)
+    down = plan.posture_shapes.X_WS.rotation().matrix() @ axis
+    np.testing.assert_allclose(down, [0.0, 0.0, -1.0], atol=1e-3)
+    assert plan.lowest_tool_point_W[2] < plan.place.position[2] - 0.17 + from_flange
+
+
+def write_scara(path, flange, last_axis="0 0 1"):
+    """Write a SCARA arm, whose last joint is below the joint before."""
+    chain = [
+        ("revolute", "0 0 0.4", "0 0 1", (-2.2, 2.2)),
+        ("revolute", "0.25 0 0", "0 0 1", (-2.2, 2.2)),
+        ("prismatic", "0.25 0 0", "0 0 1", (-0.2, 0.0)),
+        ("revolute", "0 0 -0.05", last_axis, (-3.0, 3.0)),
+    ]
+    parts = [_link("link0", 0.1)]
+    for k, (kind, origin, axis, (lower, upper)) in enumerate(chain):
+        limits = f'<limit lower="{lower}" upper="{upper}" effort="200" velocity="2"/>'
+        more = f'<axis xyz="{axis}"/>{limits}'
+        parts.append(_joint(f"j{k}", kind, f"link{k}", f"link{k + 1}", origin, more=more))
+        parts.append(_link(f"link{k + 1}", 0.04))
+    parts += ['<link name="ft"/>', _joint("flange", "fixed", "link4", "ft", "0 0 0", flange)]
+    path.write_text(f'<robot name="scara">{"".join(parts)}</robot>')
+    return path
+
+
+@pytest.mark.parametrize("last_axis", ["0 0 1", "0 0 -1"])
+@pytest.mark.parametrize(("rpy", "axis"), [("0 0 0", [0, 0, -1]), ("3.1415927 0 0", [0, 0, 1])])
+def test_rod_of_a_scara_points_down_for_each_sign(rpy, axis, last_axis, tmp_path):
+    plan = plan_station(write_scara(tmp_path / "arm.urdf", rpy, last_axis), "ft")
+    np.testing.assert_allclose(plan.stand_in_tool.com, 0.05 * np.array(axis), atol=1e-6)
+    plan.posture_shapes.move_to(plan.place.q)
+    R_WS = plan.posture_shapes.X_WS.rotation().matrix()
+    np.testing.assert_allclose(R_WS @ axis, [0.0, 0.0, -1.0], atol=1e-6)
+    assert plan.what_points_down == "tool" and not any("away" in text for text in plan.assumptions)
+
+
+def test_gripper_that_cannot_point_down_is_not_called_down(tmp_path):
+    path = write_scara(tmp_path / "arm.urdf", "0 0 0")
+    gripper = _link("gripper", 0.2) + _joint(
+        "hold", "fixed", "ft", "gripper", "0 0 0", f"0 {_HALF} 0"
+    )
+    path.write_text(path.read_text().replace("</robot>", f"{gripper}</robot>"))
+    plan = plan_station(path, "ft")
+    assert plan.has_own_tool and plan.what_points_down == "-z_S"
+    (text,) = [text for text in plan.assumptions if "away from the arm" in text]
+    assert text.startswith("-z_S downwards at the start, as no posture was found in which x_S")
+    assert plan.tool_axis_advice.startswith("-z_S points down, so")
+    model = {"model": str(path), "sensor_frame": "ft"}
+    written = scenario_text(plan, model, None, PHANTOM_NAME, None)
+    assert "-z_S down" in written and "tool down" not in written
 
 
 def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
@@ -241,8 +325,10 @@ def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain
 def test_reason_of_a_failure_counts_the_postures_of_each_condition(plain):
     arm = plain[1].posture_shapes.arm
     tilted = replace(arm, lower=arm.lower * 0.0 - 0.2, upper=arm.upper * 0.0 + 0.2)
-    with pytest.raises(DrakeTeleopError, match=r"in 20000 z_S is more than 40 degrees from down"):
-        find_start_place(tilted)
+    with pytest.raises(
+        DrakeTeleopError, match=r"x_S points.*in 20000 this axis is more than 40 deg"
+    ):
+        find_start_place(tilted, axis="x")
     with pytest.raises(DrakeTeleopError, match=r"in \d+ S is too near .*; 0 are left"):
         find_start_place(arm, plane=5.0)
 

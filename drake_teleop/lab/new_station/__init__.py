@@ -113,8 +113,8 @@ def scenario_text(
     else:
         slave["home"] = place.home
     comments = {
-        "slave.position": "sensor at the start, tool down [m]",
-        "slave.home": "joints at the start, tool down [rad, m]",
+        "slave.position": f"sensor at the start, {plan.what_points_down} down [m]",
+        "slave.home": f"joints at the start, {plan.what_points_down} down [rad, m]",
         "slave.tip": "contact point, p_STip [m]",
         "slave.torque_limits": "the limits of the model cannot hold the arm",
         "kinematic_scaling": f"the arm can move {place.reachable_text}",
@@ -175,7 +175,7 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     for name, value in (
         ("Joints", f"{len(joint_names)}: {', '.join(joint_names)}"),
         ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
-        ("Start", f"sensor at {position} m, tool down"),
+        ("Start", f"sensor at {position} m, {plan.what_points_down} down"),
         ("Reachable around it", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):

@@ -300,10 +300,18 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
+def coordinates_along_axis(
+    shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str
+) -> Array:
+    """Return the coordinate (k,) of each point on bodies along an axis of S, from So [m]."""
+    points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
+    along: Array = TOOL_AXES[axis].matrix()[:, 2] @ points
+    return along
+
+
 def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
     """Return how far bodies extend beyond So along an axis of S [m], at least 0."""
-    points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
-    return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
+    return float(coordinates_along_axis(shapes, bodies, axis).max(initial=0.0))
 
 
 def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]:
@@ -354,16 +362,32 @@ def nearest_sensor_axis(direction: Array) -> str:
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 
 
-def sensor_axis_along_last_joint(arm: ArmModel) -> str:
-    """Return the axis of S that points away from the last joint along it; empty: none."""
-    row = arm.table[arm.num_joints]
-    along = row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)[2]
-    is_behind = row[TRANSLATION_COLUMN + 2] < -_ROUNDING_TOLERANCE_M
-    return nearest_sensor_axis(-along if is_behind else along)
+def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
+    """Return the axis of S along the tool, with the sign away from the arm.
+
+    It is the axis nearest to the tool's centre of mass (3,) [m], or else to the last joint's axis.
+    The sign is that of the displacement from the arm to this centre; zeros: to So. The arm's point
+    is on the last joint's axis, level with the joint before: the joint's own origin is arbitrary
+    along its axis.
+    """
+    R = arm.table[-2:, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(2, 3, 3)
+    p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]
+    R_JS, p_arm_S_J = R[1], p[1] + np.array([0.0, 0.0, R[0, :, 2] @ p[0]])
+    axis = nearest_sensor_axis(p_SScm_S) or nearest_sensor_axis(R_JS[2]) or "z"
+    along = TOOL_AXES[axis].matrix()[:, 2]
+    is_behind = along @ (R_JS.T @ p_arm_S_J + p_SScm_S) < -_ROUNDING_TOLERANCE_M
+    return opposite_axis(axis) if is_behind else axis
 
 
-def tool_frame_advice(model: Path, sensor_frame: str, axis: str) -> str:
-    """Return advice on a sensor frame with z along the tool; empty: not needed."""
+def opposite_axis(axis: str) -> str:
+    """Return the axis of `TOOL_AXES` with the other sign."""
+    return axis[1:] if axis.startswith("-") else f"-{axis}"
+
+
+def tool_frame_advice(
+    model: Path, sensor_frame: str, axis: str, *, is_along_tool: bool = True
+) -> str:
+    """Return advice on a sensor frame whose z axis is `axis`; empty: not needed."""
     if axis == "z":
         return ""
     R_SA, name = TOOL_AXES[axis], f"{sensor_frame}_z_to_tool"
@@ -383,8 +407,9 @@ def tool_frame_advice(model: Path, sensor_frame: str, axis: str) -> str:
     )
     # MJCF and SDF files may include the file with the sensor frame.
     place = f" to {model.name}" if model.suffix.lower() not in (".xml", ".sdf") else ""
+    what = f"the tool points along {axis}_S" if is_along_tool else f"{axis}_S points down"
     return (
-        f"the tool points along {axis}_S, so the start is in slave.home and the contact point in"
+        f"{what}, so the start is in slave.home and the contact point in"
         f" slave.tip; to use position, or another direction, add{place}"
         f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame {name}"
     )

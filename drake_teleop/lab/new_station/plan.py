@@ -28,7 +28,7 @@ _MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_BALL_RADIUS_M = 0.05, 0.1, 0.012
 _STAND_IN_FREE_LENGTH_M = 0.05
 _STAND_IN_TOOL_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
-_SUFFICIENT_POSTURE_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
+_SUFFICIENT_POSTURE_SCORE = 1.5  # of a start, at which no further substitute axis is tried
 _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
@@ -48,7 +48,8 @@ class StationPlan:
         lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
         wall: horizontal wall, 1.5 swing amplitudes below this point.
         tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
-        tool_axis_advice: advice if the tool is not along z_S.
+        tool_axis_advice: advice if the axis that points down at the start is not z_S.
+        what_points_down: the tool, or an axis of S if the tool cannot point down.
         weak_joints: joints whose torque limits cannot hold the arm.
     """
 
@@ -64,6 +65,7 @@ class StationPlan:
     tip_S: list[float]
     assumptions: tuple[str, ...]
     tool_axis_advice: str
+    what_points_down: str
     overlap_warnings: tuple[str, ...]
     base_plane_height: float
     weak_joints: tuple[str, ...]
@@ -87,17 +89,22 @@ def plan_station(
     )
     shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
     load = shapes.arm.phi_load[:4] - (_STAND_IN_TOOL_LOAD if tool is None else 0.0)
-    # Axis of S towards the model's own load, or else along the last joint; else z.
-    axis = start.nearest_sensor_axis(load[1:] / load[0]) if load[0] > _MIN_TOOL_MASS_KG else ""
-    axis, own_tool = axis or start.sensor_axis_along_last_joint(shapes.arm) or "z", False
-    if tool is None and _has_tool_beyond_sensor_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
+    has_load, own_tool = load[0] > _MIN_TOOL_MASS_KG, False
+    p_SScm_S = load[1:] / load[0] if has_load else np.zeros(3)
+    tool_axis = start.sensor_axis_along_tool(shapes.arm, p_SScm_S)
+    if tool is None and has_load and _has_tool_beyond_sensor_link(shapes, tool_axis):
         slave.tool, own_tool = None, True
         shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
     plane = find_base_plane_height(shapes)
-    place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
+    place, axis, shapes = _find_start_and_axis(slave, shapes, plane, tool_axis)
     on_sensor = None if tool is not None else slave.tool
+    is_along_tool = axis == tool_axis or on_sensor is not None
     share = 1.0 if own_tool else start.MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
-    model, weak_joints, assumed = _without_weak_torque_limits(shapes.arm, place.q, share)
+    model, weak_joints, texts = _without_weak_torque_limits(shapes.arm, place.q, share)
+    if axis != tool_axis:
+        posture = "posture" if on_sensor is None else "posture without overlaps"
+        what = f"no {posture} was found in which {tool_axis}_S, away from the arm, points down"
+        texts.append(f"{axis}_S downwards at the start, as {what}")
     if on_sensor is not None:
         on_sensor.mass = _largest_mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
@@ -129,8 +136,11 @@ def plan_station(
             stiffness=_WALL_STIFFNESS_N_M,
         ),
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
-        assumptions=(*shapes.assumptions, *assumed),
-        tool_axis_advice=start.tool_frame_advice(arm, sensor_frame, axis),
+        assumptions=(*shapes.assumptions, *texts),
+        tool_axis_advice=start.tool_frame_advice(
+            arm, sensor_frame, axis, is_along_tool=is_along_tool
+        ),
+        what_points_down="tool" if is_along_tool else f"{axis}_S",
         overlap_warnings=tuple(overlap_warnings(shapes, slave_only=True)),
         base_plane_height=plane,
         weak_joints=weak_joints,
@@ -138,25 +148,31 @@ def plan_station(
     )
 
 
-def _find_start_and_tool_axis(
-    slave: Slave, shapes: PostureShapes, plane: float, natural_axis: str
+def _find_start_and_axis(
+    slave: Slave, shapes: PostureShapes, plane: float, tool_axis: str
 ) -> tuple[start.StartPlace, str, PostureShapes]:
-    # The start, the tool's axis of S, and the shapes; a stand-in tool is set along that axis.
+    # The start, its axis of S that points down, and the shapes; a stand-in tool is set along that
+    # axis. Substitutes of the tool's axis are tried only if no start is found with it, or, for a
+    # stand-in tool, no start without overlaps.
     found: list[tuple[start.StartPlace, str, PostureShapes]] = []
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
-    others = (axis for axis in start.TOOL_AXES if axis.strip("-") != natural_axis.strip("-"))
-    for axis in dict.fromkeys((natural_axis, "z", *others)):
-        if is_stand_in:
-            slave.tool = _stand_in_tool(axis, _stand_in_length(shapes, axis))
-            if axis != "z" or slave.tool.shapes[0].position[2] != _STAND_IN_LENGTH_M:
-                shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
+    substitutes = start.opposite_axis(tool_axis), *start.TOOL_AXES
+    for axis in dict.fromkeys((tool_axis, *substitutes)):
+        stand_in = _stand_in_tool(axis, _stand_in_length(shapes, axis))
+        if is_stand_in and slave.tool != stand_in:
+            slave.tool = stand_in
+            shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
         try:
             place = start.find_start_place(shapes.arm, shapes, plane=plane, axis=axis)
-            found.append((place, axis, shapes))
         except DrakeTeleopError as error:
             errors.append(error)
-        if found and found[-1][0].posture_score > _SUFFICIENT_POSTURE_SCORE:
+            continue
+        found.append((place, axis, shapes))
+        is_sufficient = place.posture_score > _SUFFICIENT_POSTURE_SCORE
+        if axis == tool_axis:
+            is_sufficient = not (is_stand_in and place.has_overlaps)
+        if is_sufficient:
             break
     if not found:
         raise errors[0]
@@ -169,8 +185,9 @@ def _find_start_and_tool_axis(
 def _has_tool_beyond_sensor_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
     link_bodies = shapes.bodies_welded_to_sensor() - shapes.tool_bodies
-    link_end = start.extent_beyond_sensor(shapes, link_bodies, axis)
-    return start.extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
+    link = start.coordinates_along_axis(shapes, link_bodies, axis)
+    own_end = start.coordinates_along_axis(shapes, own_bodies, axis).max(initial=-np.inf)
+    return bool(own_end > (link.max() if len(link) else 0.0) + _MIN_TOOL_LENGTH_M)
 
 
 def find_base_plane_height(shapes: PostureShapes) -> float:

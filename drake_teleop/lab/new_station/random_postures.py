@@ -146,7 +146,7 @@ def select_suitable_postures(
     above_plane: Any = (postures.origins[:, raised, 2] > lowest_origin).all(axis=1)
     rows, removed = np.arange(len(radius)), list[tuple[str, int]]()
     for name, met in (
-        ("z_S is more than 40 degrees from downwards", points_down),
+        ("this axis is more than 40 degrees from downwards", points_down),
         ("S is too near to the first joint, too far, too low or too high", in_region),
         ("a joint is below the base plane", above_plane),
     ):
