@@ -216,6 +216,10 @@ def _inspect_stream(
     if time is not None:
         more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, len(values), figures)
         findings += more
+        if len(usable) != len(good):
+            what = f"has {len(good)} rows, but {len(usable)} times"
+            remedy = "name columns of the same length"
+            raise DrakeTeleopError(what, where=f"{source}:{name}", remedy=remedy)
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
     if not good.all():
         first = table.line_in_file(int(np.argmin(good)))

@@ -30,6 +30,7 @@ from drake_teleop.logs.aligned_log import (
 )
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Finding, RecordPartWithLoad
+from drake_teleop.logs.check import edits
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     ConventionCheckResult,
@@ -37,7 +38,6 @@ from drake_teleop.logs.check.conventions import (
     findings_if_load_is_suspicious,
     motion_findings,
 )
-from drake_teleop.logs.check.edits import FINDINGS_CAUSED_BY_MISFIT
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
@@ -190,6 +190,8 @@ def identify_log(
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
         errors = motion_findings(check)
+    if log.described is not None:
+        errors += tuple(edits.correct_accelerometer_unit(log.described, log)[0])
     if errors:
         why, result = None, result.with_unidentified_load()
     note = fitted.fit.note
@@ -268,7 +270,9 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
-    if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
+    if identified.causes and all(
+        finding.name in edits.FINDINGS_CAUSED_BY_MISFIT for finding in findings
+    ):
         delay = own_delay if np.isfinite(deviation) else delay
         return replace(checks, findings=identified.causes, delay_s=delay)
     if all(finding.name == "lag" for finding in findings):

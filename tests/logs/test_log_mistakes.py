@@ -273,6 +273,7 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
     ("gyro", _times("angular_velocity", 57.3), IMU, "degrees", "velocity.unit: deg/s"),
     ("axes", _gyro_axes, IMU, "swapped axes", "['angular_velocity_1', 'angular_velocity_0', 'ang"),
     ("mm/s^2", _times("specific_force", 1e3), IMU, "units", "specific_force.unit: mm/s^2"),
+    ("mg", _times("specific_force", 1e3 / 9.80665), IMU, "units", "specific_force.unit: mg"),
     ("mm", _times("position", 1e3), BOTH, "units", "pose.position.unit: mm"),
     (
         "km",
@@ -325,6 +326,18 @@ def test_identify_names_a_wrong_scale_despite_a_good_fit(tmp_path: Path) -> None
     assert float(text.split("force by ")[1].split(",")[0]) == pytest.approx(1.05, abs=2e-3)
     (found,) = identify_log(tmp_path / "log.yaml").findings
     assert found.name == "gravity"
+
+
+@pytest.mark.parametrize("scale", [16384 / 9.80665, 2.2, 0.4, 0.01])
+def test_accelerometer_in_no_known_unit_leaves_the_load_unknown(
+    good: Columns, tmp_path: Path, scale: float
+) -> None:
+    columns = good | {"specific_force": scale * good["specific_force"]}
+    (text,) = (x for x in findings_of(tmp_path, columns, IMU) if x.startswith("units: "))
+    assert "imu.specific_force.scale" in text
+    found = identify_log(tmp_path / "log.yaml")
+    assert any(f.name == "units" for f in found.findings)
+    assert not found.identification.identifiable[6:].any()
 
 
 def test_a_column_that_is_named_twice_is_named(good: Columns, tmp_path: Path) -> None:

@@ -43,6 +43,30 @@ def test_npz_array_counts_as_several_columns(tmp_path: Path) -> None:
     assert parts.tolist() == [[5.0, 0.0], [14.0, 9.0]]
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".mat", ".h5"])
+@pytest.mark.parametrize("rows", [70, 3])
+def test_arrays_with_a_column_per_sample_are_turned(tmp_path: Path, suffix: str, rows: int) -> None:
+    """MATLAB users often store vectors as (3, N) and matrices as (4, 4, N)."""
+    path, t = tmp_path / f"x{suffix}", np.arange(float(rows))
+    F, T = np.arange(3.0 * rows).reshape(3, rows), np.arange(16.0 * rows).reshape(4, 4, rows)
+    arrays = {"t": t, "F": F, "T": T, "square": np.eye(3), "usual": F.T.copy()}
+    if suffix == ".npz":
+        np.savez(path, **arrays)
+    elif suffix == ".mat":
+        savemat(path, arrays)
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            for name, array in arrays.items():
+                file[name] = array
+    table = read_table(path)
+    assert table.finite_numbers(["usual"], 3, "here").tolist() == F.T.tolist()
+    if rows == 70:
+        assert table.finite_numbers(["F"], 3, "here").tolist() == F.T.tolist()
+        assert table.finite_numbers(["T[7]"], 1, "here")[:, 0].tolist() == T[1, 3].tolist()
+    assert len(table.finite_numbers(["square"], 3, "here")) == 3
+
+
 def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "1,2,3\n4,5,6\n"), header=False)
     assert table.finite_numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]

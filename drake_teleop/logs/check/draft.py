@@ -62,13 +62,14 @@ _ROBOT_COLUMN_NOTES = {
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
 _UNIT_OF_SPELLING = {
-    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g")},
-    "µs": "us", "°": "deg", "dps": "deg/s", "°/s": "deg/s", "m/s²": "m/s^2",
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
+    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
     "n*m": "N m", "n.m": "N m",
 }  # fmt: skip
 _ALLOWED_UNITS = {
     "force": description_fields.FORCE_UNITS, "torque": description_fields.TORQUE_UNITS,
-    "specific_force": ("m/s^2", "mm/s^2", "g"), "angular_velocity": ("rad/s", "deg/s"),
+    "specific_force": ("m/s^2", "mm/s^2", "g", "mg"),
+    "angular_velocity": ("rad/s", "deg/s", "mdeg/s"),
     "rotation_vector": ("rad", "deg"), "position": description_fields.POSITION_UNITS,
     "euler": ("rad", "deg"), "time": ("s", "ms", "us", "ns"),
 }  # fmt: skip
@@ -77,12 +78,17 @@ _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
+_MAX_DEG_S = 4000.0  # faster than any gyroscope measures
 _FILL_IN_TEXT, _MIN_CLOCK_ROWS = "FILL IN", 20
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
 _RAW_COUNTS_NOTE = (
     "Force and torque are raw counts. scale is the value of one count in N and N m, from the"
     " manual of the sensor: 1e-6 for 1000000 counts per N. The data contain only the ratio of both."
+)
+_RAW_ACCELERATION_NOTE = (
+    "The accelerometer is in none of g, mg, m/s^2, mm/s^2. scale is the value of one count in"
+    " m/s^2, or one for each axis; the gyroscope is probably in counts too."
 )
 _NO_TORQUE_NOTE = "A force alone is not enough: the commands need force and torque."
 _NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
@@ -178,13 +184,15 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     used |= {name.partition("[")[0] for name in used}
     parts = {x for x in table.columns if x not in arrays and x.partition("[")[0] in arrays}
     unused = [name for name in table.columns if name not in used | parts]
+    raw = f"'scale': '{_FILL_IN_TEXT}'"
     head = [
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "above all wrench.sign, units and frames.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
         *([_NO_TORQUE_NOTE] if "force" in found and "torque" not in found else []),
         *([_NO_TIME_NOTE] if _FILL_IN_TEXT in times else []),
-        *([_RAW_COUNTS_NOTE] if f"'scale': '{_FILL_IN_TEXT}'" in str(draft) else []),
+        *([_RAW_COUNTS_NOTE] if raw in str(draft | {"imu": None}) else []),
+        *([_RAW_ACCELERATION_NOTE] if raw in str(draft.get("imu")) else []),
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return Draft(draft, head)
@@ -340,7 +348,12 @@ def _draft_quantity(
         return group
     size = np.linalg.norm(table.numbers_with_nan_side_by_side(columns, columns[0]), axis=1)
     if kind == "specific_force":
-        return group | {"unit": "g" if np.nanmedian(size) < 3 else "m/s^2"}
+        median = np.nanmedian(size)
+        limits = {"g": (0, 3), "m/s^2": (3, 30), "mg": (700, 1400), "mm/s^2": (7e3, 14e3)}
+        fitting = [unit for unit, (low, high) in limits.items() if low <= median < high]
+        return group | ({"unit": fitting[0]} if fitting else {"scale": _FILL_IN_TEXT})
+    if kind == "angular_velocity" and np.nanmax(size) > _MAX_DEG_S:
+        return group | {"unit": "mdeg/s"}
     usual, other, limit = {
         "angular_velocity": ("rad/s", "deg/s", 15),
         "position": ("m", "mm", 20),

@@ -33,6 +33,8 @@ MOTION_FINDINGS = (
 MIN_LAG_OF_WRONG_CLOCK_S = 0.05  # filters lag less
 
 
+# Median specific force over gravity of an accelerometer on a moving arm.
+_MIN_MEDIAN_OVER_GRAVITY, _MAX_MEDIAN_OVER_GRAVITY = 0.6, 1.6
 Edit = tuple[Finding, Description]  # a finding, and the corrected description
 
 
@@ -61,7 +63,10 @@ def _lists_to_tuples(value: Any) -> Any:
 def correct_accelerometer_unit(
     description: Description, log: Log
 ) -> tuple[list[Finding], Description]:
-    """Return a finding for an accelerometer in a wrong unit, and the corrected description."""
+    """Return a finding for an accelerometer in a wrong unit, and the corrected description.
+
+    If no unit fits, the finding has no fields, and the description is unchanged.
+    """
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     ratio = median / float(np.linalg.norm(description.gravity_W))
     for stream, name in product(("imu", "static"), ("specific_force", "gravity")):
@@ -70,10 +75,14 @@ def correct_accelerometer_unit(
             continue
         read = ratio / description.unit_in_si(sensor.unit)
         text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in {sensor.unit}"
-        for unit in ("m/s^2", "g", "mm/s^2"):
+        for unit in ("m/s^2", "g", "mg", "mm/s^2"):
             if unit != sensor.unit and 0.7 < read * description.unit_in_si(unit) < 1.43:
                 finding, edited = _make_edit(description, "units", text, {f"{path}.unit": unit})
                 return [finding], edited
+        if not _MIN_MEDIAN_OVER_GRAVITY < ratio < _MAX_MEDIAN_OVER_GRAVITY:
+            remedy = f"correct {path}.scale or unit; a reading without gravity cannot be used"
+            text = f"the accelerometer reads {ratio:.3g} times gravity in the median; {remedy}"
+            return [Finding("units", text)], description
     return [], description
 
 

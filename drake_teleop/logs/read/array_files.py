@@ -58,7 +58,7 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
     shape = item.shape[::-1] if transpose else item.shape
     if item.dtype.kind not in "fiu" or not 1 <= len(shape) <= 3:
         return False
-    if math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW:
+    if min(math.prod(shape[1:]), math.prod(shape[:-1])) > _MAX_NUMBERS_PER_ROW:
         return False
     if (count := math.prod(shape)) > _MAX_NUMBERS_PER_ARRAY:
         raise ValueError(f"an array has {count:.2g} numbers (at most {_MAX_NUMBERS_PER_ARRAY:.2g})")

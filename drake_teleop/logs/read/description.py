@@ -315,8 +315,8 @@ class Description(StrictModel):
 
     def unit_in_si(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
-        in_si = fields.SI_VALUE_OF_UNIT
-        return float(np.linalg.norm(self.gravity_W)) if unit == "g" else in_si[unit]
+        g = float(np.linalg.norm(self.gravity_W))
+        return (fields.SI_VALUE_OF_UNIT | {"g": g, "mg": 1e-3 * g})[unit]
 
 
 def load_description(path: str | Path) -> Description:

@@ -24,8 +24,9 @@ SI_VALUE_OF_UNIT = {
     "rad": 1.0, "rad/s": 1.0, "rad/s^2": 1.0,
     "deg": np.pi / 180, "deg/s": np.pi / 180, "deg/s^2": np.pi / 180,
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "m/s^2": 1.0, "mm/s^2": 1e-3,
+    "mdeg/s": 1e-3 * np.pi / 180,
 }  # fmt: skip
-"""SI value of each unit, except "g", the magnitude of the described gravity."""
+"""SI value of each unit, except "g", the magnitude of the described gravity, and "mg"."""
 
 
 def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:
@@ -162,14 +163,14 @@ class Torque(_VectorColumns):
 class Acceleration(_VectorColumns):
     """Columns of a linear acceleration, their unit, and bias to subtract."""
 
-    unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
+    unit: Literal["m/s^2", "g", "mg", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularVelocity(_VectorColumns):
     """Columns of an angular velocity, their unit, and bias to subtract."""
 
-    unit: Literal["rad/s", "deg/s"] = "rad/s"
+    unit: Literal["rad/s", "deg/s", "mdeg/s"] = "rad/s"
     bias: Vector = (0.0, 0.0, 0.0)
 
 

@@ -308,7 +308,18 @@ _ARRAY_READERS |= {".h5": read_hdf5, ".hdf5": read_hdf5, ".zarr": read_zarr}
 
 
 def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
-    return lambda path: array_columns(read(path))
+    return lambda path: array_columns(_with_samples_as_rows(read(path)))
+
+
+def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Move the last axis of arrays (k, N) and (j, k, N) to the front if a vector has N numbers."""
+    lengths = {len(array) for array in arrays.values() if array.ndim == 1}
+    return {
+        name: np.moveaxis(array, -1, 0)
+        if array.ndim > 1 and len(array) not in lengths and array.shape[-1] in lengths
+        else array
+        for name, array in arrays.items()
+    }
 
 
 TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
