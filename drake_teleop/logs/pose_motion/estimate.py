@@ -215,10 +215,10 @@ def _find_splines_and_delay(
     free_load = grid.known_load is None
     fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
     if usable < fewest:
-        raise DrakeTeleopError(
-            f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart ({fewest} required)",
-            remedy="record both at the same time, longer, without interruptions",
-        )
+        what = f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart"
+        what = f"{what} ({fewest} required; poses more than {_MIN_EXCLUDED_POSE_GAP_S} s apart"
+        remedy = "record both at the same time, longer, without interruptions, above 10 Hz"
+        raise DrakeTeleopError(f"{what} do not count)", remedy=remedy)
     slower = min(poses.rate, grid.stride / grid.dt)
     top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)
