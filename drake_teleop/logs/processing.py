@@ -190,7 +190,7 @@ def identify_log(
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
         errors = motion_findings(check)
-    if log.described is not None:
+    if log.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
         errors += tuple(edits.correct_accelerometer_unit(log.described, log)[0])
     if errors:
         why, result = None, result.with_unidentified_load()
