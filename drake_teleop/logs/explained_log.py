@@ -16,7 +16,11 @@ from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import has_negative_mass
 from drake_teleop.logs.causes.cause import Finding
-from drake_teleop.logs.causes.explain import MisfitExplanation, explain_misfit
+from drake_teleop.logs.causes.explain import (
+    MisfitExplanation,
+    explain_misfit,
+    fit_with_missing_acceleration,
+)
 from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -211,6 +215,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitE
     if data.used.sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
         return None
     why = explain_misfit(data, instants_at_delay, log.estimated)
+    why = fit_with_missing_acceleration(why) if why.is_acceleration_missing else why
     if log.described is None:
         return why
     return replace(why, causes=add_description_lines(why.causes, log, by_pose=found is not None))
@@ -248,7 +253,7 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 
 def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> Identification:
     """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
-    if why.causes or why.always_fitted:
+    if why.causes or why.always_fitted or why.is_acceleration_missing:
         load = _load_fitted_with_causes(load, why)
     elif not why.explained and load.identifiable.any():
         stated = np.sqrt(np.diag(load.covariance))
@@ -288,7 +293,9 @@ def _load_fitted_with_causes(load: Identification, why: MisfitExplanation) -> Id
         or "weight" in why.always_fitted,
         prior_dominated=np.zeros(16, bool),
         degrees_of_freedom=np.full(16, np.inf),
-        method="generalised least squares with named causes",
+        method="least squares without acceleration"
+        if why.is_acceleration_missing
+        else "generalised least squares with named causes",
     )
 
 
@@ -307,6 +314,16 @@ def unexplained_misfit_finding(why: MisfitExplanation) -> Finding:
     )
     remedy = "record without contact, with the same load throughout and with loose cables"
     return Finding("misfit", f"{text} it; {remedy}")
+
+
+def missing_acceleration_finding(why: MisfitExplanation) -> Finding:
+    ratio = why.state.residual_ratio
+    text = (
+        f"the residual is up to {ratio:.0f} times the sensor's noise, and without accelerometer or"
+        " position the acceleration of S may cause it: the delay, the unit of the torque and the"
+        " pose frame cannot be checked"
+    )
+    return Finding("acceleration", f"{text}; add the position to pose, or an accelerometer")
 
 
 def removed_weight_note(why: MisfitExplanation) -> str:

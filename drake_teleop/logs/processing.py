@@ -177,7 +177,9 @@ def identify_log(
     possible = _is_explanation_possible(raw, motion is not None)
     why = explained_log.explain_log(raw, delay_s, motion) if possible else None
     names = {cause.name for cause in why.causes} if why is not None else set()
-    if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
+    unknown_acceleration = why is not None and why.is_acceleration_missing
+    by_gains = raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
+    if why is not None and by_gains and not unknown_acceleration:
         why = replace(why, causes=(), explained=True, loads=())
     more = 0.0 if why is None or not why.causes or source != "estimated" else why.delay_s
     if abs(more) > _MIN_CORRECTED_DELAY_S and motion is None:
@@ -185,6 +187,8 @@ def identify_log(
     elif abs(more) > _MIN_CORRECTED_DELAY_S:
         again, other = fit_load_to_posed_log(raw, method, cutoff_hz, delay_s + more)
         fitted = again or fitted
+    if unknown_acceleration and source == "estimated":  # an acceleration resembles a delay
+        source, fitted = "undetermined", _fit_load_to_motion(raw, method, cutoff_hz, 0.0)
     log, result = fitted.log, fitted.fit.identification
     causes: tuple[Finding, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
@@ -207,7 +211,9 @@ def identify_log(
         known_delay = None if source == "undetermined" else delay_s
         findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
         findings = findings or other
-        if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
+        if why is not None and unknown_acceleration and not result.identifiable.all():
+            findings = (*findings, explained_log.missing_acceleration_finding(why))
+        elif why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (explained_log.unexplained_misfit_finding(why),)
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
@@ -275,6 +281,8 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
     ):
         delay = own_delay if np.isfinite(deviation) else delay
         return replace(checks, findings=identified.causes, delay_s=delay)
+    if identified.log.is_acceleration_unknown and identified.delay_source == "undetermined":
+        findings, delay = tuple(x for x in findings if x.name != "lag"), own_delay
     if all(finding.name == "lag" for finding in findings):
         findings = (*findings, *identified.findings)
     description = identified.log.described

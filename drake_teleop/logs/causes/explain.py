@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.load.identification import mark_undetermined
 from drake_teleop.logs.causes import candidates, cause, changes, intervals
 from drake_teleop.logs.causes.candidates import (
     EXTENSIONS_BY_PLAUSIBILITY,
@@ -26,7 +27,7 @@ from drake_teleop.logs.causes.intervals import (
     load_deviations_if_unexplained,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, LoadModel
-from drake_teleop.logs.causes.state import FittedModel
+from drake_teleop.logs.causes.state import FittedModel, fit_model
 
 MAX_SEARCH_ROUNDS = 4
 MeansAtDelay = Callable[[float], BlockMeans]
@@ -237,6 +238,11 @@ class MisfitExplanation:
         return not self.explained and (large or self.state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT)
 
     @property
+    def is_acceleration_missing(self) -> bool:
+        """Whether the misfit may be the force of an acceleration that the record lacks."""
+        return not self.explained and bool(np.isinf(self.state.data.acceleration_noise))
+
+    @property
     def has_several_gains(self) -> bool:
         """Whether several gain errors were found, which only approximate a full gain matrix."""
         model = self.state.model
@@ -272,6 +278,26 @@ def explain_misfit(
             state=state,
             always_fitted=always_fitted,
         )
+
+
+def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
+    """Return the unweighted fit, as uncertain as if all residuals were one error.
+
+    A missing acceleration depends on the orientation, so that it does not average out. It may be
+    that of a rotation about any point, so that the inertia remains undetermined.
+    """
+    state = why.state
+    model = LoadModel(extensions=why.always_fitted, axes=state.model.axes)
+    rows = FittedModel.fit_record(state.data, model).rows
+    x = model.start_parameters(state.x, state.model)
+    for _ in range(2):  # the first one may be limited in its largest change
+        state = fit_model(model, rows, x, iterations=2)
+        x = state.x
+    covariance = float(rows.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]
+    covariance = mark_undetermined(covariance, np.arange(16) >= 10)
+    causes = tuple(cause.name_misfit_causes(state, why.always_fitted))
+    found = replace(why, theta=x[OFFSETS_AND_LOAD], covariance=covariance, causes=causes)
+    return replace(found, state=state, delay_s=0.0, loads=())
 
 
 def _no_load_cause(state: FittedModel, covariance: Array) -> list[Finding]:

@@ -51,7 +51,8 @@ class BlockMeans:
         used: (M,) True for rows without gaps and edges.
         wrench_noise: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        acceleration_noise: standard deviation of its noise in a block mean [m/s^2].
+        acceleration_noise: standard deviation of its noise in a block mean [m/s^2];
+            inf if the acceleration is unknown and taken as zero.
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 

@@ -175,7 +175,8 @@ def block_means_of_log(log: Log) -> BlockMeans:
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
         gravity, motion = log.gravity_W, (*log.motion, log.R_WS)
-    return block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged)
+    noise = np.inf if log.is_acceleration_unknown else 0.0
+    return block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged, noise)
 
 
 def wrench_of_weight(weight: Array, gravity: Array) -> Array:

@@ -131,6 +131,15 @@ class Log:
         return replace(self, **changes)
 
     @property
+    def is_acceleration_unknown(self) -> bool:
+        """Whether the log has neither accelerometer nor position, so that `a` is taken as zero."""
+        if self.described is None or self.described.pose is None or self.static:
+            return False
+        imu = self.described.imu
+        accelerometer = imu is not None and imu.specific_force is not None
+        return self.described.pose.position is None and not accelerometer
+
+    @property
     def motion(self) -> tuple[Array, Array, Array]:
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
