@@ -187,8 +187,9 @@ def identify_log(
         fitted = again or fitted
     log, result = fitted.log, fitted.fit.identification
     causes: tuple[Finding, ...] = ()
+    misfit = why if why is not None and why.is_misfit else None
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
-    if not errors and why is not None and why.causes and why.is_misfit:
+    if not errors and misfit is not None and misfit.causes:
         errors = motion_findings(check)
     if errors:
         why, result = None, result.with_unidentified_load()
@@ -205,17 +206,27 @@ def identify_log(
         known_delay = None if source == "undetermined" else delay_s
         findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
         findings = findings or other
-        if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
-            findings = (explained_log.unexplained_misfit_finding(why),)
+    fitted_corrections = [
+        finding
+        for finding in (findings if findings in (causes, other) else ())
+        if finding.name not in CAUSES_WITHOUT_CORRECTION
+    ]
+    if misfit is not None and result.identifiable[6:].any():  # vibrations leave a large residual
+        misfit = misfit if fitted_corrections and misfit.is_residual_large else None
+    if misfit is not None and (fitted_corrections or not findings):
+        findings, causes = (explained_log.misfit_finding(misfit, fitted_corrections),), ()
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
         result = result.with_unidentified_load()
+    determined, loads = base_parameters(fitted.fit.equations), () if why is None else why.loads
+    if misfit is not None:
+        result, loads = result.with_nothing_identified(), ()
+        determined = BaseParameters((), (), (), ())
     return IdentifiedLog(
         *(log, result, predicted, source, fitted.fit.rejected),
-        *(base_parameters(fitted.fit.equations), findings, causes),
-        () if why is None else why.loads,
+        *(determined, findings, causes, loads),
         delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
 
@@ -268,10 +279,15 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
-    if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
+    no_load = any(cause.name == "no load" for cause in identified.causes)  # explains the record
+    caused = all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings)
+    if identified.causes and (no_load or caused):
         delay = own_delay if np.isfinite(deviation) else delay
         return replace(checks, findings=identified.causes, delay_s=delay)
-    if all(finding.name == "lag" for finding in findings):
+    if any(finding.name == "misfit" for finding in identified.findings):
+        kept = (x for x in findings if x.fields or x.name not in FINDINGS_CAUSED_BY_MISFIT)
+        findings = tuple(kept) or identified.findings
+    elif all(finding.name == "lag" for finding in findings):
         findings = (*findings, *identified.findings)
     description = identified.log.described
     if identified.delay_source == "estimated" and np.isfinite(deviation) and description:
