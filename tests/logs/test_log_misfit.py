@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.inspection import inspect_command
+from drake_teleop.logs.read.description import load_description
 
 pytestmark = pytest.mark.slow
 
@@ -61,3 +62,12 @@ def test_nothing_of_a_misfit_is_identified(
     load = Identification.load(tmp_path / "out" / "identification.json")
     assert not load.identifiable.any() and set(load.verdicts) == {"not"}
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["identifiable"] == []
+
+
+def test_exchanged_force_and_torque_are_corrected(tmp_path: Path) -> None:
+    log = write_table(tmp_path, np.full(6, -1), torque_first=True)
+    summary = inspect_command(log, tmp_path / "out", quiet=True)
+    assert summary["findings"] == []
+    wrench = load_description(tmp_path / "out" / "draft.yaml").wrench
+    assert wrench is not None and wrench.sign == -1
+    assert wrench.force.columns == ("tx", "ty", "tz") and wrench.torque.columns[0] == "fx"
