@@ -117,6 +117,12 @@ class Identification:
         """Return the result with all ten parameters of the load marked as not identified."""
         return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PARAMETER)
 
+    def with_nothing_identified(self) -> Identification:
+        """Return the result with unknown deviations: the verdict on all parameters is "not"."""
+        unknown = np.ones(16, dtype=bool)
+        covariance = mark_undetermined(self.covariance, unknown)
+        return replace(self, covariance=covariance, identifiable=~unknown, prior_dominated=~unknown)
+
     def __repr__(self) -> str:
         deviations = self.standard_deviations
         named = zip(PARAMETER_NAMES, self.verdicts, strict=True)

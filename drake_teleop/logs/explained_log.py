@@ -307,13 +307,20 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Find
     return why.causes
 
 
-def unexplained_misfit_finding(why: MisfitExplanation) -> Finding:
+def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Finding:
+    """Return the finding of a misfit that none of the fitted corrections explains."""
     ratio = why.state.residual_ratio
-    text = (
-        f"the residual is up to {ratio:.0f} times the sensor's noise, and no known cause explains"
-    )
+    text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"
-    return Finding("misfit", f"{text} it; {remedy}")
+    if corrections:
+        return Finding("misfit", f"{text}, and {ask_about_correction(corrections[0])} Or {remedy}")
+    return Finding("misfit", f"{text}, and no known cause explains it; {remedy}")
+
+
+def ask_about_correction(correction: Finding) -> str:
+    """Return a correction that does not explain a record as a question, without its lines."""
+    text = correction.message.partition("; set ")[0].partition("; correct ")[0]
+    return f"no single correction explains the record; check the best candidate: is it that {text}?"
 
 
 def missing_acceleration_finding(why: MisfitExplanation) -> Finding:

@@ -18,6 +18,7 @@ from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
+from drake_teleop.logs.explained_log import ask_about_correction
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream_table
@@ -159,13 +160,21 @@ def _places_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
 
 def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     tables: dict[Path, Table] = {}
+    corrected, first, given = draft, None, dict(summary)
     for _ in range(_MAX_DRAFT_CORRECTIONS):
         found = _inspect_described_log(load_description(path), str(path), dict(tables), summary)
         finding = next((finding for finding in found if finding.fields), None)
         if finding is None:
             break
-        draft = draft.with_finding_corrected(finding)
+        if first is None:
+            first, given = finding, dict(summary)
+        corrected = corrected.with_finding_corrected(finding)
+        write_text(path, _with_checksum(corrected.text()))
+    if first is not None and any(finding.name == "misfit" for finding in found):
         write_text(path, _with_checksum(draft.text()))
+        question = {"name": "misfit", "message": ask_about_correction(first)}
+        others = [x for x in given["findings"] if x["message"] != first.message]
+        summary |= given | {"findings": [*others, question]}
 
 
 def _inspect_described_log(

@@ -191,9 +191,12 @@ def identify_log(
         source, fitted = "undetermined", _fit_load_to_motion(raw, method, cutoff_hz, 0.0)
     log, result = fitted.log, fitted.fit.identification
     causes: tuple[Finding, ...] = ()
+    misfit = why if why is not None and why.is_misfit else None
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
-    if not errors and why is not None and why.causes and why.is_misfit:
+    if not errors and misfit is not None and misfit.causes:
         errors = motion_findings(check)
+    if unknown_acceleration:  # the residual may be that of the acceleration
+        misfit = None
     if log.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
         errors += tuple(edits.correct_accelerometer_unit(log.described, log)[0])
     if errors:
@@ -213,17 +216,27 @@ def identify_log(
         findings = findings or other
         if why is not None and unknown_acceleration and not result.identifiable.all():
             findings = (*findings, explained_log.missing_acceleration_finding(why))
-        elif why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
-            findings = (explained_log.unexplained_misfit_finding(why),)
+    fitted_corrections = [
+        finding
+        for finding in (findings if findings in (causes, other) else ())
+        if finding.name not in CAUSES_WITHOUT_CORRECTION
+    ]
+    if misfit is not None and result.identifiable[6:].any():  # vibrations leave a large residual
+        misfit = misfit if fitted_corrections and misfit.is_residual_large else None
+    if misfit is not None and (fitted_corrections or not findings):
+        findings, causes = (explained_log.misfit_finding(misfit, fitted_corrections),), ()
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
         result = result.with_unidentified_load()
+    determined, loads = base_parameters(fitted.fit.equations), () if why is None else why.loads
+    if misfit is not None:
+        result, loads = result.with_nothing_identified(), ()
+        determined = BaseParameters((), (), (), ())
     return IdentifiedLog(
         *(log, result, predicted, source, fitted.fit.rejected),
-        *(base_parameters(fitted.fit.equations), findings, causes),
-        () if why is None else why.loads,
+        *(determined, findings, causes, loads),
         delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
 
@@ -276,14 +289,17 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
-    if identified.causes and all(
-        finding.name in edits.FINDINGS_CAUSED_BY_MISFIT for finding in findings
-    ):
+    no_load = any(cause.name == "no load" for cause in identified.causes)  # explains the record
+    caused = all(finding.name in edits.FINDINGS_CAUSED_BY_MISFIT for finding in findings)
+    if identified.causes and (no_load or caused):
         delay = own_delay if np.isfinite(deviation) else delay
         return replace(checks, findings=identified.causes, delay_s=delay)
     if identified.log.is_acceleration_unknown and identified.delay_source == "undetermined":
         findings, delay = tuple(x for x in findings if x.name != "lag"), own_delay
-    if all(finding.name == "lag" for finding in findings):
+    if any(finding.name == "misfit" for finding in identified.findings):
+        kept = (x for x in findings if x.fields or x.name not in edits.FINDINGS_CAUSED_BY_MISFIT)
+        findings = tuple(kept) or identified.findings
+    elif all(finding.name == "lag" for finding in findings):
         findings = (*findings, *identified.findings)
     description = identified.log.described
     if identified.delay_source == "estimated" and np.isfinite(deviation) and description:

@@ -234,8 +234,13 @@ class MisfitExplanation:
     @property
     def is_misfit(self) -> bool:
         """Whether the residual is clearly not noise: large, or explained by smooth signals."""
-        large = self.state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
-        return not self.explained and (large or self.state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT)
+        smooth = self.state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
+        return not self.explained and (self.is_residual_large or smooth)
+
+    @property
+    def is_residual_large(self) -> bool:
+        """Whether the residual is too large for coloured noise of the sensor."""
+        return self.state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
 
     @property
     def is_acceleration_missing(self) -> bool:

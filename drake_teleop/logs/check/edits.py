@@ -159,6 +159,9 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     columns: dict[str, Any] = {
         f"{stream}.{x}.columns": getattr(sensor, x).columns for x in ("force", "torque")
     }
+    exchanged = dict(zip(columns, [list(names) for names in columns.values()][::-1], strict=True))
+    text = "force and torque are exchanged"
+    yield _make_edit(description, "torque first", text, exchanged)
     for order in list(permutations(range(3)))[1:]:
         if all(len(names) == 3 for names in columns.values()):
             fields = {path: [names[i] for i in order] for path, names in columns.items()}
