@@ -29,7 +29,12 @@ from drake_teleop.logs.aligned_log import (
     read_aligned_log,
 )
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
-from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Finding, RecordPartWithLoad
+from drake_teleop.logs.causes.cause import (
+    CAUSES_AT_REST,
+    CAUSES_WITHOUT_CORRECTION,
+    Finding,
+    RecordPartWithLoad,
+)
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     ConventionCheckResult,
@@ -38,6 +43,7 @@ from drake_teleop.logs.check.conventions import (
     motion_findings,
 )
 from drake_teleop.logs.check.edits import FINDINGS_CAUSED_BY_MISFIT
+from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
@@ -176,6 +182,11 @@ def identify_log(
     motion, delay_s, source = fitted.motion, fitted.delay_s, fitted.delay_source
     possible = _is_explanation_possible(raw, motion is not None)
     why = explained_log.explain_log(raw, delay_s, motion) if possible else None
+    still = None
+    stated = () if why is None else why.causes
+    if any(finding.name not in CAUSES_AT_REST for finding in (*other, *stated)):
+        still = too_little_motion(raw)
+    why = why if still is None else None
     names = {cause.name for cause in why.causes} if why is not None else set()
     if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
@@ -188,6 +199,10 @@ def identify_log(
     log, result = fitted.log, fitted.fit.identification
     causes: tuple[Finding, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
+    if still is not None:
+        text = f"payload not identifiable: {still}; {MORE_MOTION_REMEDY}"
+        errors = (Finding("payload", text),)
+        result = replace(result, identifiable=np.zeros(16, bool))
     if not errors and why is not None and why.causes and why.is_misfit:
         errors = motion_findings(check)
     if errors:
