@@ -14,7 +14,7 @@ from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
-from drake_teleop.logs.causes.candidates import has_negative_mass
+from drake_teleop.logs.causes.candidates import MAX_PLAUSIBLE_MASS_KG, has_negative_mass
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.causes.explain import (
     MisfitExplanation,
@@ -34,7 +34,7 @@ from drake_teleop.logs.read.table_files import note_that_table_needs_description
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
-_MAX_PLAUSIBLE_MASS_KG, _UNIT_RATIO_TOLERANCE = 1000.0, 1e-3
+_UNIT_RATIO_TOLERANCE = 1e-3
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
 _FORCE_UNITS = ("N", "kgf", "lbf")
 _TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
@@ -69,7 +69,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
 
     None for a smaller one, or for a log without a description of its wrench.
     """
-    if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
+    if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected_and_touched_fields(causes, log, by_pose=True)[0]
     ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]

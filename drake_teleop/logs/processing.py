@@ -29,7 +29,12 @@ from drake_teleop.logs.aligned_log import (
     read_aligned_log,
 )
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
-from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Finding, RecordPartWithLoad
+from drake_teleop.logs.causes.cause import (
+    CAUSES_AT_REST,
+    CAUSES_WITHOUT_CORRECTION,
+    Finding,
+    RecordPartWithLoad,
+)
 from drake_teleop.logs.check import edits
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
@@ -38,6 +43,7 @@ from drake_teleop.logs.check.conventions import (
     findings_if_load_is_suspicious,
     motion_findings,
 )
+from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
@@ -176,6 +182,11 @@ def identify_log(
     motion, delay_s, source = fitted.motion, fitted.delay_s, fitted.delay_source
     possible = _is_explanation_possible(raw, motion is not None)
     why = explained_log.explain_log(raw, delay_s, motion) if possible else None
+    still = None
+    stated = () if why is None else why.causes
+    if any(finding.name not in CAUSES_AT_REST for finding in (*other, *stated)):
+        still = too_little_motion(raw)
+    why = why if still is None else None
     names = {cause.name for cause in why.causes} if why is not None else set()
     unknown_acceleration = why is not None and why.is_acceleration_missing
     by_gains = raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
@@ -193,6 +204,10 @@ def identify_log(
     causes: tuple[Finding, ...] = ()
     misfit = why if why is not None and why.is_misfit else None
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
+    if still is not None:
+        text = f"payload not identifiable: {still}; {MORE_MOTION_REMEDY}"
+        errors = (Finding("payload", text),)
+        result = replace(result, identifiable=np.zeros(16, bool))
     if not errors and misfit is not None and misfit.causes:
         errors = motion_findings(check)
     if unknown_acceleration:  # the residual may be that of the acceleration

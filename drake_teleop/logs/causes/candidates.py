@@ -40,6 +40,7 @@ _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
 _MIN_CHANNEL_GAIN_ERROR, _MAX_CHANNEL_GAIN_ERROR = 0.003, 0.25
 _MIN_POSE_SHIFT_M, _MAX_POSE_SHIFT_M = 0.010, 1.5
 _MIN_SENSOR_ROTATION_DEG, _MIN_LOAD_MASS_OVER_DEVIATION = 1.0, 10.0
+MAX_PLAUSIBLE_MASS_KG = 1000.0
 _MAX_CABLE_STIFFNESS_N_M, _MIN_DRIFT_OVER_NOISE = 1000.0, 3.0
 _NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
 _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERROR = 0.02, 0.06, 0.2
@@ -163,7 +164,7 @@ def is_plausible(state: FittedModel) -> bool:
     parts, mass = state.model.parameter_slices, state.x[6]
     # A removed weight or a cable requires an inertia to compare with.
     required = _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6])
-    if {"weight", "cable"} & parts.keys() and mass < required:
+    if {"weight", "cable"} & parts.keys() and not required <= mass < MAX_PLAUSIBLE_MASS_KG:
         return False
     if "weight" in parts and state.x[parts["weight"]][0] < -0.01 * mass:
         return False  # a robot adds no weight

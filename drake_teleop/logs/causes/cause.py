@@ -22,6 +22,7 @@ _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
 SUDDEN_CHANGES = ("zero change", "load change")  # they divide a record into parts
 CAUSES_WITHOUT_CORRECTION = (*SUDDEN_CHANGES, "drift", "contact", "cable", "no load")
 """Causes that no line of a description corrects."""
+CAUSES_AT_REST = ("zero change", "drift", "contact")  # that a record at rest determines
 
 
 @dataclass(frozen=True)

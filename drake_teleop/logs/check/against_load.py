@@ -16,9 +16,15 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
+from drake_teleop.logs.causes.candidates import MAX_PLAUSIBLE_MASS_KG
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import edits
 from drake_teleop.logs.check.edits import LogTables
+from drake_teleop.logs.check.motion_size import (
+    MORE_MOTION_REMEDY,
+    max_cutoff_by_pose_noise,
+    too_little_motion,
+)
 from drake_teleop.logs.read.alignment import (
     MAX_SEARCHED_DELAY_S,
     estimate_delay,
@@ -65,7 +71,8 @@ class LoadFitQuality:
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     """Fit load and offsets to the best fitting share of a log, below 15 Hz unless it is static."""
-    cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt)
+    limit = max_cutoff_by_pose_noise(log)
+    cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_FITTED_SAMPLES))
     wrench = smooth.wrench[rows]
@@ -133,6 +140,8 @@ def check_wrench_and_estimate_delay(
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFitQuality:
         # A wrong description may cause a wrong delay.
         log = _log_with_edited_wrench(thin, description, edited) or data.read_thinned_log(edited)
+        if edited is not description and (why := too_little_motion(log)) is not None:
+            raise DrakeTeleopError(why)
         fits = [fit_load(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
@@ -176,7 +185,7 @@ def _edits_with_far_better_fit(
     positive, negative = [], []
     for finding, edited in tried:
         fit = edits.call_or_none_if_unreadable(fit_description, edited)
-        if fit is None:
+        if fit is None or abs(fit.mass) > max(MAX_PLAUSIBLE_MASS_KG, 2.0 * abs(given.mass)):
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
@@ -229,6 +238,8 @@ def _findings_without_remedy(
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
     finding = undetermined_payload_finding(load, given.unexplained - given.noise_share)
+    if finding and (why := too_little_motion(log)) is not None:
+        finding = replace(finding, message=f"payload not identifiable: {why}; {MORE_MOTION_REMEDY}")
     if finding:
         return [finding], None
     kept = ~fit.rejected

@@ -24,6 +24,7 @@ from drake_teleop.logs.check.motion_checks import (
     check_imu_signals,
     position_unit_or_origin_findings,
 )
+from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.canonical import Log, describe_canonical
@@ -32,8 +33,6 @@ from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table
 
-_MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.3, 0.1
-"""Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
 _MIN_GRAVITY_DIRECTION_SPREAD = 0.15  # that separates offsets from a load
 _MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest reading
@@ -87,8 +86,8 @@ def findings_if_load_is_suspicious(
             raise DrakeTeleopError(found[-1].message, where=log.source)
         return tuple(found)
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
-    if worthless and not log.static:
-        _require_enough_motion(log)
+    if worthless and (why := too_little_motion(log)) is not None:
+        raise DrakeTeleopError(why, where=log.source, remedy=MORE_MOTION_REMEDY)
     if found and worthless:
         what = f"the fitted mass is {load.mass:.4g} kg"
         if not negative:
@@ -111,18 +110,6 @@ def _findings_except_lag(check: Callable[[], ConventionCheckResult]) -> list[Fin
     with suppress(ValueError, ArithmeticError):  # the log itself was readable
         return [finding for finding in check().findings if finding.name != "lag"]
     return []
-
-
-def _require_enough_motion(log: Log) -> None:
-    s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
-    if s < _MIN_MOTION_RMS_M_S2_AND_RAD_S[0] and omega < _MIN_MOTION_RMS_M_S2_AND_RAD_S[1]:
-        seconds = log.t[-1] - log.t[0]
-        raise DrakeTeleopError(
-            f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
-            " rms): load and offsets cannot be separated",
-            where=log.source,
-            remedy="record 10 s of brisk turns about all axes, as `drake-teleop excite` designs",
-        )
 
 
 def _are_signals_suspicious(log: Log) -> bool:
@@ -169,7 +156,8 @@ def _check_description(data: LogTables, description: Description) -> ConventionC
     more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more
     mounting = None
-    if description.imu and description.pose:
+    moves = too_little_motion(data.read_thinned_log(description)) is None
+    if description.imu and description.pose and moves:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
     fit = against_load.fit_load(data.read_thinned_log(description))
@@ -177,7 +165,7 @@ def _check_description(data: LogTables, description: Description) -> ConventionC
     weightless = "weight" in log.estimated
     if broken or weightless or (mounting is not None and mounting.is_mirrored):
         return ConventionCheckResult((*broken, *findings), fit, mounting, None)
-    if not findings:
+    if not findings and moves:
         more, description = against_load.clock_drift_finding_and_correction(description, data)
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s

@@ -1,0 +1,87 @@
+"""Records with little motion: noise of the poses counts neither as motion nor as a load."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from known_motion import GRAVITY_W
+from planted import OFFSETS, PHI, Columns, written
+
+from drake_teleop.common.rotations import rotation_matrices
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check import against_load
+from drake_teleop.logs.check.against_load import LoadFitQuality
+from drake_teleop.logs.check.motion_size import motion_rms, too_little_motion
+from drake_teleop.logs.processing import check_log, identify_log
+from drake_teleop.logs.read.reading import read_log
+
+
+def sway(size_mrad: float, noise_mm: float, sign: float = 1.0) -> Columns:
+    """Return a wrench and poses that turn slowly, about two axes, by `size_mrad` at most."""
+    rng, t = np.random.default_rng(3), np.arange(0, 20, 0.01)
+    phases = np.array([0.0, 1.0, 2.0]) + np.outer(t, 2 * np.pi * np.array([0.23, 0.31, 0.17]))
+    R = rotation_matrices([[0.4, -0.5, 0.2]], "rotation_vector")[0]
+    R = R @ rotation_matrices(1e-3 * size_mrad * np.sin(phases), "rotation_vector")
+    still = np.zeros((len(t), 3))
+    wrench = non_contact_wrench(-R.swapaxes(1, 2) @ GRAVITY_W, still, still, PHI) + OFFSETS
+    noise = rng.normal(size=(len(t), 12)) * np.repeat(
+        [0.08, 0.003, 1e-3 * noise_mm, 2e-3 * noise_mm], 3
+    )
+    R = R @ rotation_matrices(noise[:, 9:], "rotation_vector")
+    position = 0.3 + noise[:, 6:9]
+    wrench = sign * (wrench + noise[:, :6])
+    columns = {"t": t, "force": wrench[:, :3], "torque": wrench[:, 3:], "R": R, "p": position}
+    return columns | {"s": still, "omega": still}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("size_mrad", "noise_mm"), [(0.0, 0.1), (0.0, 0.3), (3.0, 0.05), (10.0, 0.05), (10.0, 0.3)]
+)
+def test_record_at_rest_causes_no_correction(
+    tmp_path: Path, size_mrad: float, noise_mm: float, sign: float
+) -> None:
+    path = written(tmp_path, sway(size_mrad, noise_mm, sign), imu=False)
+    found = check_log(path).findings
+    assert {finding.name for finding in found} <= {"payload"}
+    assert all(not finding.fields for finding in found)
+    assert all("hardly moves or turns" in finding.message for finding in found)
+    identified = identify_log(path)
+    load = identified.identification
+    assert {finding.name for finding in identified.findings} <= {"payload"}
+    if load.identifiable[6]:  # never a wrong load or wrong offsets
+        assert load.mass == pytest.approx(PHI[0], rel=0.1)
+    if load.identifiable[:6].any():
+        stds = np.maximum(load.standard_deviations[:6], 1e-12)
+        assert (np.abs(load.offsets - OFFSETS) < 6.0 * stds).all()
+
+
+@pytest.mark.parametrize("noise_mm", [0.02, 0.3])
+def test_slow_rotation_corrects_the_sign(tmp_path: Path, noise_mm: float) -> None:
+    path = written(tmp_path, sway(100.0, noise_mm, -1.0), imu=False)
+    (finding,) = check_log(path).findings
+    assert finding.fields == {"wrench.sign": -1}
+
+
+def test_noise_of_poses_is_no_motion(tmp_path: Path) -> None:
+    still = read_log(written(tmp_path, sway(0.0, 0.3), imu=False))
+    assert motion_rms(still) < (0.03, 0.03)
+    assert "hardly moves" in str(too_little_motion(still))
+    moving = read_log(written(tmp_path, sway(60.0, 0.3), imu=False))
+    assert motion_rms(moving)[0] == pytest.approx(0.06 * 9.81 / np.sqrt(2) * 1.4, rel=0.3)
+    assert too_little_motion(moving) is None
+
+
+def test_correction_with_an_implausible_mass_is_not_stated() -> None:
+    given = LoadFitQuality(unexplained=0.8, mass=1.4)
+
+    def fit(mass: float) -> Any:
+        found = LoadFitQuality(unexplained=0.01, mass=mass)
+        edited: Any = None
+        return against_load._edits_with_far_better_fit(lambda _: found, given, [(None, edited)])
+
+    assert fit(1276.0) == []
+    assert len(fit(1.5)) == 1
