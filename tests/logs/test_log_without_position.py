@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from known_motion import GRAVITY_W
+from scipy.spatial.transform import Rotation
 from test_causes_remedies import COM, INERTIA, MASS, NOISE, OFFSETS, Record, turned
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -80,3 +81,15 @@ def test_stated_gain_errors_do_not_explain_an_unknown_translation(tmp_path: Path
     record = Record.simulate(seconds=16.0)
     record.wrench_lines = {"gain_std": 0.01}
     assert_nothing_is_certain_and_wrong(identify(tmp_path, record))
+
+
+def test_oblique_rotation_of_the_sensor_is_not_named_as_a_permutation_of_axes(
+    tmp_path: Path,
+) -> None:
+    record = Record.simulate(seconds=16.0)
+    record.turn = Rotation.from_euler("z", -46.0, degrees=True).as_matrix()
+    record.wrench *= -1.0
+    found = identify(tmp_path, record)
+    assert [x.message.partition(";")[0] for x in found.causes] == [
+        "the wrench has the opposite sign"
+    ]

@@ -35,6 +35,7 @@ _MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S, _MAX_DELAY_ITERATIONS = 0.004, 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
+_MAX_RESIDUAL_OVER_OTHER_AXES = 2.0
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL, _MAX_CONTACT_RESIDUAL_SHARE = 0.2, 1.1, 0.5
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO, _MAX_EFFECTIVE_MISFIT_SHARE = 15.0, 0.9
@@ -291,17 +292,23 @@ def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
     A missing acceleration depends on the orientation, so that it does not average out. It may be
     that of a rotation about any point, so that the inertia remains undetermined.
     """
-    state = why.state
-    model = LoadModel(extensions=why.always_fitted, axes=state.model.axes)
-    rows = FittedModel.fit_record(state.data, model).rows
-    x = model.start_parameters(state.x, state.model)
-    for _ in range(2):  # the first one may be limited in its largest change
-        state = fit_model(model, rows, x, iterations=2)
-        x = state.x
-    covariance = float(rows.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]
+    data, axes = why.state.data, why.state.model.axes
+    fits = []
+    for Q in (axes, np.eye(3), -np.eye(3)):
+        model = LoadModel(extensions=why.always_fitted, axes=Q)
+        x = model.start_parameters(why.state.x, why.state.model)
+        state = FittedModel.fit_record(data, model, x)
+        for _ in range(2):  # the first one may be limited in its largest change
+            state = fit_model(model, state.rows, state.x, iterations=2)
+        fits.append(state)
+    # A rotation that is not right-angled resembles several permutations of axes.
+    limit = _MAX_RESIDUAL_OVER_OTHER_AXES * fits[0].residual_ratio
+    simple = (x for x in fits[1:] if x.x[6] > 0.0 and x.residual_ratio < limit)
+    state = next(simple, fits[0])
+    covariance = float(data.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]
     covariance = mark_undetermined(covariance, np.arange(16) >= 10)
     causes = tuple(cause.name_misfit_causes(state, why.always_fitted))
-    found = replace(why, theta=x[OFFSETS_AND_LOAD], covariance=covariance, causes=causes)
+    found = replace(why, theta=state.x[OFFSETS_AND_LOAD], covariance=covariance, causes=causes)
     return replace(found, state=state, delay_s=0.0, loads=())
 
 
