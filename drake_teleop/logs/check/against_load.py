@@ -238,7 +238,8 @@ def _findings_without_remedy(
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
     finding = undetermined_payload_finding(load, given.unexplained - given.noise_share)
-    if finding and (why := too_little_motion(log)) is not None:
+    fitted = np.isfinite(load.standard_deviations[6])
+    if finding and fitted and (why := too_little_motion(log)) is not None:
         finding = replace(finding, message=f"payload not identifiable: {why}; {MORE_MOTION_REMEDY}")
     if finding:
         return [finding], None
