@@ -106,6 +106,7 @@ def test_names_that_differ_only_in_spaces_are_refused(tmp_path):
 def log_file(folder, **changes: float):
     t = np.arange(60) * 1e-3
     table = np.column_stack([t, np.sin(np.outer(t, 2.0 + np.arange(15)))])
+    table[:, COLUMNS.index("s_z")] += 9.8
     for name, value in changes.items():
         table[17, COLUMNS.index(name)] = value
     path = folder / "log.csv"
