@@ -233,7 +233,7 @@ def identify_log(
             findings = (*findings, explained_log.missing_acceleration_finding(why))
     fitted_corrections = [
         finding
-        for finding in (findings if findings in (causes, other) else ())
+        for finding in (findings if findings == causes else ())
         if finding.name not in CAUSES_WITHOUT_CORRECTION
     ]
     if misfit is not None and result.identifiable[6:].any():  # vibrations leave a large residual
