@@ -318,7 +318,7 @@ def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Fi
 
 
 def ask_about_correction(correction: Finding) -> str:
-    """Return a correction that does not explain a record as a question, without its lines."""
+    """Return a question about a correction that does not explain the record."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
     return f"no single correction explains the record; check the best candidate: is it that {text}?"
 

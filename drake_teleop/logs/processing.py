@@ -207,7 +207,7 @@ def identify_log(
     if still is not None:
         text = f"payload not identifiable: {still}; {MORE_MOTION_REMEDY}"
         errors = (Finding("payload", text),)
-        result = replace(result, identifiable=np.zeros(16, bool))
+        result = result.with_nothing_identified()
     if not errors and misfit is not None and misfit.causes:
         errors = motion_findings(check)
     if unknown_acceleration:  # the residual may be that of the acceleration

@@ -67,6 +67,12 @@ def test_arrays_with_a_column_per_sample_are_turned(tmp_path: Path, suffix: str,
     assert len(table.finite_numbers(["square"], 3, "here")) == 3
 
 
+def test_array_with_samples_as_rows_stays_beside_a_short_vector(tmp_path: Path) -> None:
+    F = np.arange(210.0).reshape(70, 3)
+    np.savez(tmp_path / "x.npz", F=F, gravity=np.zeros(3))
+    assert read_table(tmp_path / "x.npz").finite_numbers(["F"], 3, "here").tolist() == F.tolist()
+
+
 def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "1,2,3\n4,5,6\n"), header=False)
     assert table.finite_numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]

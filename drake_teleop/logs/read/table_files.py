@@ -312,14 +312,14 @@ def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
 
 
 def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Move the last axis of arrays (k, N) and (j, k, N) to the front if a vector has N numbers."""
+    """Move the last axis of arrays (k, N), (j, k, N) to the front if a vector has N > k numbers."""
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
-    return {
-        name: np.moveaxis(array, -1, 0)
-        if array.ndim > 1 and len(array) not in lengths and array.shape[-1] in lengths
-        else array
-        for name, array in arrays.items()
-    }
+
+    def is_turned(array: NDArray) -> bool:
+        rows, last = len(array), array.shape[-1]
+        return array.ndim > 1 and rows < last and rows not in lengths and last in lengths
+
+    return {name: np.moveaxis(x, -1, 0) if is_turned(x) else x for name, x in arrays.items()}
 
 
 TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
