@@ -310,7 +310,7 @@ class Description(StrictModel):
 
     @property
     def gravity_W(self) -> Array:
-        """Gravity (3,) in W [m/s^2]; along -z for `gravity: auto`."""
+        """Gravity (3,) in W [m/s^2]; along -z if the description asks for "auto"."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def unit_in_si(self, unit: str) -> float:
