@@ -51,7 +51,7 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 def add_description_lines(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
-    """Add the corrected lines of the log description to the messages of causes."""
+    """Return the causes with corrected lines of the log description in messages and fields."""
     fields, touched = _corrected_and_touched_fields(causes, log, by_pose)
     note, out = note_that_table_needs_description(log.source), []
     for cause, names in zip(causes, touched, strict=True):
@@ -67,7 +67,7 @@ def add_description_lines(
 def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
     """Return a message on wrong units for a mass of at least 1000 kg.
 
-    None for a smaller one, or for a log without a description of its wrench.
+    Return None for a smaller one, or for a log without a description of its wrench.
     """
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
@@ -200,9 +200,10 @@ _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
-    """Search for causes why a rigid load does not explain the wrench; None for a short log.
+    """Return causes why a rigid load does not explain the wrench of a log; None for a short log.
 
-    `delay_s` [s] is that of the motion, which is from splines of `found` or, for None, the log.
+    `delay_s` [s] is that of the motion. The motion is from the splines of `found`, or from the log
+    if None.
     """
 
     def instants_at_delay(more: float) -> BlockMeans:
@@ -252,7 +253,7 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 
 
 def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> Identification:
-    """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
+    """Return the load fitted with the causes, else `load` with intervals widened by a misfit."""
     if why.causes or why.always_fitted or why.is_acceleration_missing:
         load = _load_fitted_with_causes(load, why)
     elif not why.explained and load.identifiable.any():
@@ -300,7 +301,7 @@ def _load_fitted_with_causes(load: Identification, why: MisfitExplanation) -> Id
 
 
 def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
-    """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
+    """Return the causes; `finding` replaces those about frames if no other extension is fitted."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (finding, *kept)
@@ -308,7 +309,7 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Find
 
 
 def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Finding:
-    """Return the finding of a misfit that none of the fitted corrections explains."""
+    """Return the finding that none of the fitted `corrections` explains the misfit."""
     ratio = why.state.residual_ratio
     text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"
@@ -318,7 +319,7 @@ def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Fi
 
 
 def ask_about_correction(correction: Finding) -> str:
-    """Return a question about a correction that does not explain the record."""
+    """Return a text that asks to check the likeliest correction of an unexplained record."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
     return f"no single correction explains the record; check the best candidate: is it that {text}?"
 

@@ -95,7 +95,7 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
 
 
 def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
-    """Write two PNG files of equal width, one above the other, to `page`."""
+    """Write two PNG files of equal width, one above the other, to the PNG file `page`."""
     from matplotlib.image import imread, imsave
 
     with replace_file_on_success(page) as unfinished:

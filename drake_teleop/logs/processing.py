@@ -292,7 +292,7 @@ def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
-    """Check a log and its description, including causes that identification finds."""
+    """Return the checks of a log and its description, with causes that identification finds."""
     checks = check_conventions_of_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
@@ -546,7 +546,7 @@ def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
 
 
 def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias set to those of a point mass, and their names."""
+    """Return phi (10,) with undetermined inertias of a point mass instead, and their names."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
@@ -555,7 +555,7 @@ def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tu
 
 
 def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
-    """Return notes on parameters of a load that are not identified: moments, and inertias."""
+    """Return notes on unidentified parameters: mass and moments, and inertias."""
     named = zip(PARAMETER_NAMES[6:10], load.verdicts[6:10], strict=True)
     moments = [name for name, verdict in named if verdict == "not"]
     return tuple(
@@ -608,7 +608,7 @@ def _checked_scales(
 
 @dataclass(frozen=True)
 class DetectedLog(Detection):
-    """Contacts of a log, and the log after removal of the load's wrench (`eliminated`)."""
+    """Contacts of a log, and `eliminated`, the log after removal of the load's wrench."""
 
     eliminated: EliminatedLog = field(kw_only=True)
 

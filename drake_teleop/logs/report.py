@@ -67,9 +67,10 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, with fit.png and knowledge.png of its folder.
+    """Write the HTML report of an identification to `path`.
 
-    `alone` is the load of the object alone, if the gripper is known.
+    Its folder must contain fit.png and knowledge.png. `alone` is the load of the object alone, if
+    the gripper is known.
     """
     log, result = found.log, found.identification
     text = (

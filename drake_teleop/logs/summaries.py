@@ -88,7 +88,7 @@ def notes_on_grasped_object(alone: Identification) -> list[str]:
 
 
 def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:
-    """Return RMS and peak of |force|, |torque| and each channel, away from ends and gaps."""
+    """Return RMS and peak of |force|, |torque| and each channel; ends and gaps are excluded."""
     figures: dict[str, Any] = {}
     for name, suffix, wrench in (
         ("raw", "rms", found.measured),
@@ -138,7 +138,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
 
 
 def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return the shares of samples with |F| > `threshold` [N], of raw and corrected wrenches."""
+    """Return shares of samples with |F| > `threshold` [N]: tared, without weight, and contact."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

@@ -1,4 +1,4 @@
-"""Findings about a log, and causes of a misfit in words."""
+"""Findings about a log, and texts of the causes of a misfit."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
 
 
 def direction_std_deg(x: Array, covariance: Array) -> float:
-    """Return the largest standard deviation of the direction of a vector x (3,) [deg]."""
+    """Return the standard deviation of x's direction about the least certain axis [deg]."""
     size = float(np.linalg.norm(x))
     across = np.eye(3) - np.outer(x, x) / size**2
     spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])

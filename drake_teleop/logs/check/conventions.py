@@ -1,4 +1,4 @@
-"""Wrong units, signs, axes and clocks in a log description, found by the laws of motion."""
+"""Wrong units, signs, axes and clocks in a log description, found in the data by laws of motion."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest rea
 
 @dataclass(frozen=True)
 class ConventionCheckResult:
-    """Findings of the checks, fit of a load after IMU corrections, and delay of the motion [s]."""
+    """Findings on a description, load fit, IMU mounting, motion delay behind the wrench [s]."""
 
     findings: tuple[Finding, ...]
     fit: LoadFitQuality
@@ -62,10 +62,10 @@ def findings_if_load_is_suspicious(
     delay: float | None,
     check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
-    """Return findings, except "lag", of a log whose identified load is suspicious.
+    """Return findings, except "lag", on the description of a log whose load is suspicious.
 
-    The load predicts the wrench `predicted` (N, 6). `check` checks the log's description against
-    its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
+    `predicted` (N, 6) is the wrench by the load. `check` compares the description with the data.
+    Raise DrakeTeleopError if the load is useless and a remedy is known.
     """
     if _is_wrench_constant(log):
         what = "the wrench is the same in all samples: no load can be identified"

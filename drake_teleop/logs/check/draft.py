@@ -115,7 +115,7 @@ class Draft(NamedTuple):
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
-    """Join drafts of a log description; the first draft with a stream provides it."""
+    """Join drafts of a log description: each stream is from the first draft that contains it."""
     streams: dict[str, Any] = {}
     for draft in drafts:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
@@ -137,7 +137,7 @@ _Columns = dict[str, list[str]]  # names of the columns of each recognized vecto
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
-    """Guess a log description from the names and magnitudes of a table's columns."""
+    """Return a log description guessed from the names and magnitudes of a table's columns."""
     plain = {name: _split_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
@@ -231,7 +231,7 @@ def _find_vectors(plain: _NamesAndUnits) -> _Columns:
 
 
 def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
-    """Return the columns of each vector of this kind, whole ones if there are any, by its name."""
+    """Return the columns of each vector of a `kind`, by its name; only complete vectors, if any."""
     axes = "wxyz" if kind == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
     groups: dict[str, dict[str, str]] = {}

@@ -1,4 +1,4 @@
-"""Edits of a log description, each for one suspected error, and the log that they give."""
+"""Edits of a log description, each for one suspected error, and logs read with these edits."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _lists_to_tuples(value: Any) -> Any:
 def correct_accelerometer_unit(
     description: Description, log: Log
 ) -> tuple[list[Finding], Description]:
-    """Return a finding for an accelerometer in a wrong unit, and the corrected description.
+    """Return a finding if the accelerometer is in a wrong unit, and the corrected description.
 
     If no unit fits, the finding has no fields, and the description is unchanged.
     """
@@ -121,7 +121,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
 
 
 def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -> Edit:
-    """Return finding and description of an edit, with the sign of the wrench inverted, too."""
+    """Return an edit's finding and description with the opposite sign of the wrench in addition."""
     stream = "static" if description.static else "wrench"
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
@@ -178,7 +178,7 @@ _THIN_TIME_PREFIX = "thinned time stamps of"
 
 
 class LogTables:
-    """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
+    """Tables of a log in memory, complete and thinned to about 100 Hz."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source, self.tables = source, tables
@@ -198,7 +198,7 @@ class LogTables:
         return read_described_log(description, self._source, tables=self.tables)
 
     def read_thinned_log(self, description: Description) -> Log:
-        """Return the log at about 100 Hz, as a description defines it."""
+        """Return the thinned log (about 100 Hz), read as `description` defines it."""
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
@@ -211,10 +211,10 @@ class LogTables:
     def start_lag_and_clock_drift_correction(
         self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
     ) -> tuple[float, str, Description]:
-        """Return a stream's lag at its first row [s], lines to set, and the edited description.
+        """Return a stream's lag at its first row [s], corrected lines, and the edited description.
 
-        The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row, and by
-        `drift` [s/s] more each second.
+        The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row. The
+        lag grows by `drift` [s/s].
         """
         time = getattr(description, name).time
         start = self._start_time_of_stream(getattr(description, name))

@@ -76,7 +76,7 @@ def dataset_command(
         load: identification.json of the load.
         identify: identify the load from the episodes instead.
         description: log description whose `file` is omitted or one of the episodes.
-        jobs: number of processes as in joblib.
+        jobs: number of parallel processes.
     """
     if (load is None) != identify:
         what = "exactly one of --load and --identify is required"

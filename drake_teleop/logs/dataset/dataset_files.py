@@ -1,6 +1,6 @@
 """Files of robot-learning datasets: episodes of LeRobot, robomimic, Zarr and folders of tables.
 
-The copy has two more columns; its other tables have the same values, and other files are links.
+The copy has two more columns; its other values are unchanged, and its other files are hard links.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Dataset(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
-    """Return the columns of a Parquet file without text and images; the last file is kept."""
+    """Return the numeric and array columns of a Parquet file, from a cache of the last file."""
     import polars as pl
 
     frame = pl.scan_parquet(file)
@@ -145,7 +145,7 @@ def _open_zarr(path: Path) -> Dataset:
 
 
 def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
-    """Write the dataset with the columns of each episode to `out`; the dataset stays unchanged."""
+    """Write a copy of the dataset with the new columns of each episode to `out`."""
     if dataset.kind == "hdf5":
         _write_hdf5(dataset, out, columns)
         return

@@ -30,7 +30,7 @@ class EpisodeFault(NamedTuple):
 def list_faults(
     x: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
-    """Return the faults of an episode that a hypothesis contains.
+    """Return the faults of an episode, in words, from the hypothesis x about its wrench.
 
     `usual_lag` [frames] is that of other episodes, `usual_phi` (10,) the usual load.
     """
@@ -89,7 +89,7 @@ def _unit_faults(gain: Array) -> list[EpisodeFault]:
 
 
 def saturation_faults(wrench: Array) -> list[EpisodeFault]:
-    """Return the fault of channels of a wrench (N, 6) that are constant or stay at a range end."""
+    """Return a fault for wrench channels (N, 6) that are constant or stay at a range end, or []."""
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():

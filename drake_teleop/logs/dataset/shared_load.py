@@ -54,7 +54,7 @@ class SharedLoad:
 
 
 def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
-    """Return the load that most episodes of a dataset share, or the given load."""
+    """Return the load that most episodes of a dataset share, or `load` if given."""
     signals = map(EpisodeSignals, logs)
     episodes = [_FittedEpisode(x, fit_own_load_of_episode(x)) for x in signals]
     if load is None:
@@ -97,7 +97,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
 
 def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
-    """Return the hypothesis of the load and lag that explain an episode best."""
+    """Return the hypothesis with the load and lag that explain one episode best."""
     search = episode_verdict.HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
@@ -109,7 +109,7 @@ class _FittedEpisode(NamedTuple):
     own: WrenchHypothesis
 
     def faultless_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
-        """Return the hypothesis of load phi (10,), at the best lag near that of the own load."""
+        """Return the faultless hypothesis of load phi (10,) at the best lag, and its residual."""
         search = episode_verdict.HypothesisSearch(
             self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
         )
@@ -123,7 +123,7 @@ class _FittedEpisode(NamedTuple):
         return best, search.unexplained_reading(best)
 
     def excess_spread(self, phi: Array) -> float:
-        """Return the log spread with load phi (10,) beyond that with the own load."""
+        """Return how much load phi (10,) increases the log spread, compared with the own load."""
         usual = self.faultless_hypothesis_and_residual(phi)[0]
         return float(usual.spread.sum() - self.own.spread.sum())
 
