@@ -67,10 +67,9 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification to `path`.
+    """Write the HTML report of an identification, with fit.png and knowledge.png from its folder.
 
-    Its folder must contain fit.png and knowledge.png. `alone` is the load of the object alone, if
-    the gripper is known.
+    `alone` is the load of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
     text = (

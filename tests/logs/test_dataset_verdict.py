@@ -43,13 +43,13 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"gains": np.array([1.05, 0.95])}, []),
         (
             {"gains": np.array([0.1, 1.0])},
-            ["the force is 0.1 times that in N: its unit is daN"],
+            ["the force is 0.1 times the value in N: its unit is daN"],
         ),
         (
             {"gains": np.array([1.0, 8.85])},
-            ["torque is 8.85 times that in N m: its unit is lbf in"],
+            ["torque is 8.85 times the value in N m: its unit is lbf in"],
         ),
-        ({"gains": np.array([1.3, 1.0])}, ["the force is 1.3 times that in N"]),
+        ({"gains": np.array([1.3, 1.0])}, ["the force is 1.3 times the value in N"]),
         ({"phi": 2.0 * TRUE_PHI}, ["another one: "]),
     ],
 )  # fmt: skip

@@ -120,8 +120,8 @@ def fit_steps_at_middle_of_ramps(
     found = FittedModel.fit_record(state.data, model, start, (*spans, *around))
     steps = []
     for both, span in zip(kinds, around, strict=True):
-        own = range(first + len(steps), first + len(steps) + len(both))
-        middle = _estimate_ramp_middle(found, own, span)
+        added = range(first + len(steps), first + len(steps) + len(both))
+        middle = _estimate_ramp_middle(found, added, span)
         steps += [StepChange(kind, middle) for kind in both]
     model = replace(model, steps=(*state.model.steps, *steps))
     return FittedModel.fit_record(state.data, model, found.x, found.contact_spans)
@@ -150,14 +150,14 @@ def _squared_step_over_variance(state: FittedModel, i: int) -> float:
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _estimate_ramp_middle(state: FittedModel, own: range, span: tuple[float, float]) -> float:
+def _estimate_ramp_middle(state: FittedModel, added: range, span: tuple[float, float]) -> float:
     data = state.data
     rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
     def residual_with_steps_at(time: float) -> Array:
-        times = tuple(time if i in own else x.time for i, x in enumerate(state.model.steps))
+        times = tuple(time if i in added else x.time for i, x in enumerate(state.model.steps))
         y = data.append_step_signals(times)[rows][:, state.model.columns]
         return np.asarray(y @ state.residual.T)
 

@@ -35,7 +35,7 @@ _MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S, _MAX_DELAY_ITERATIONS = 0.004, 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
-_MAX_RESIDUAL_OVER_OTHER_AXES = 2.0
+_MAX_RESIDUAL_RATIO_OF_SIMPLE_AXES = 2.0
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL, _MAX_CONTACT_RESIDUAL_SHARE = 0.2, 1.1, 0.5
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO, _MAX_EFFECTIVE_MISFIT_SHARE = 15.0, 0.9
@@ -302,7 +302,7 @@ def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
             state = fit_model(model, state.rows, state.x, iterations=2)
         fits.append(state)
     # A rotation that is not right-angled resembles several permutations of axes.
-    limit = _MAX_RESIDUAL_OVER_OTHER_AXES * fits[0].residual_ratio
+    limit = _MAX_RESIDUAL_RATIO_OF_SIMPLE_AXES * fits[0].residual_ratio
     simple = (x for x in fits[1:] if x.x[6] > 0.0 and x.residual_ratio < limit)
     state = next(simple, fits[0])
     covariance = float(data.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]
@@ -318,5 +318,5 @@ def _no_load_cause(state: FittedModel, covariance: Array) -> list[Finding]:
     if not (mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1):
         return []
     most = mass + 1.96 * deviation
-    text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
+    text = f"the load on the sensor is below {1e3 * most:.2g} g; only the offsets are identified"
     return [Finding("no load", text, values={"mass_limit": most})]

@@ -93,8 +93,8 @@ _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS 
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 _NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
 # (18, 27) from rotation-position products to the signals of a symmetric stiffness.
-_STIFFNESS_ENTRIES = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
-_STIFFNESS_SIGNALS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRIES])
+_STIFFNESS_ENTRY_MASKS = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
+_STIFFNESS_SIGNAL_ROWS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRY_MASKS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ class FittedModel:
         if self.data.gravity_W is not None:
             parts.append(y[:, instants.ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
+            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNAL_ROWS.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_four_predecessors, self.noise_filters

@@ -70,11 +70,7 @@ class LoadFitQuality:
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
-    """Fit load and offsets to a log; return the quality of the fit.
-
-    The log is low-passed at 15 Hz or less, unless static. Only its best fitting `kept_share`
-    counts.
-    """
+    """Return a load's fit to the best fitting share of a log, below 15 Hz unless it is static."""
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
@@ -162,7 +158,7 @@ def check_wrench_and_estimate_delay(
         without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
         found = _edits_with_far_better_fit(without_contact, without_contact(description), tried)
     if not found and given.is_good:
-        return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
+        return lag_findings(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
         return _findings_without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
@@ -174,10 +170,10 @@ def check_wrench_and_estimate_delay(
         if shift:  # of the clock of the wrench, to the nearest 20 ms
             delay = shift + (delay or 0.0)
     if finding is None:
-        return lag_finding(description, delay), delay
+        return lag_findings(description, delay), delay
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
-    return [replace(finding, message=message), *lag_finding(description, delay)], delay
+    return [replace(finding, message=message), *lag_findings(description, delay)], delay
 
 
 def _edits_with_far_better_fit(
@@ -256,7 +252,7 @@ def _findings_without_remedy(
         # Contacts bias the delay.
         lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
         delay = estimate_delay(replace(log, bridged=lost), 30.0)
-    return lag_finding(description, delay), delay
+    return lag_findings(description, delay), delay
 
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
@@ -292,7 +288,7 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
         yield None, edits.edit_field(description, "wrench.time.offset", offset)
 
 
-def lag_finding(description: Description, delay: float | None) -> list[Finding]:
+def lag_findings(description: Description, delay: float | None) -> list[Finding]:
     if delay is None or abs(delay) <= MIN_REPORTED_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"

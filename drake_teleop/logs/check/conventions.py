@@ -218,7 +218,6 @@ _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 def _dead_or_repeated_channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
-    """Return findings about dead and repeated channels of the stream "wrench" or "imu"."""
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}
@@ -236,7 +235,7 @@ def _dead_or_repeated_channel_findings(
             parts = [f"{column}[{i}]" for i in range(len(x))] if len(x) > 1 else [str(column)]
             numbers |= zip(parts, x, strict=True)
         remedy = f"name another column in {where}.columns, or record again"
-        text = "in all rows, and its neighbours are not: the channel is dead or not connected"
+        text = "in all rows, but other channels vary: the channel is dead or not connected"
         for name in _dead_channels(numbers):
             value = f"{name!r} is {numbers[name][0]:.4g}"
             found.append(Finding("dead channel", f"{value} {text}; {remedy}"))
@@ -255,7 +254,7 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
         if before is not None:
             both = "twice" if before == where else f"in {before}.columns too"
             text = f"{where}.columns names {column!r} {both}: one number cannot be two channels"
-            remedy = f"set {where}.columns to three columns of their own"
+            remedy = f"set {where}.columns to three different columns"
             found.append(Finding("repeated channel", f"{text}; {remedy}"))
     return found
 

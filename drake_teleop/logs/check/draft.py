@@ -138,7 +138,7 @@ _Columns = dict[str, list[str]]  # names of the columns of each recognized vecto
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
     """Return a log description guessed from the names and magnitudes of a table's columns."""
-    plain = {name: _split_name_and_unit(name) for name in table.columns}
+    plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
     found |= _find_vectors_in_array_columns(table, plain)
@@ -148,8 +148,8 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
-        beside = next(iter(groups.values()))["columns"][0]
-        return {**file, "time": _draft_time(table, plain, beside), **groups}
+        vector_column = next(iter(groups.values()))["columns"][0]
+        return {**file, "time": _draft_time(table, plain, vector_column), **groups}
 
     pair = {x: found.get(x, [_FILL_IN_TEXT] * 3) for x in ("force", "torque")}
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
@@ -198,7 +198,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     return Draft(draft, head)
 
 
-def _split_name_and_unit(name: str) -> tuple[str, str]:
+def _normalized_name_and_unit(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
     if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
@@ -379,15 +379,15 @@ def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[st
     return pose
 
 
-def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, Any]:
+def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict[str, Any]:
     named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
     named = named or _clock_columns(table, plain)
     if not named:
         return {"column": _FILL_IN_TEXT}
-    if beside in table.columns:
-        structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
+    if vector_column in table.columns:
+        structure, rows = vector_column.rpartition(".")[0], len(table.columns[vector_column])
         named.sort(key=lambda name: len(table.columns[name]) != rows)
         named.sort(key=lambda name: name.rpartition(".")[0] != structure)
     unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")

@@ -92,7 +92,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
         text = "the accelerometer reads g - a: gravity is reversed"
-        note = " (or turn the vector `gravity` if z points down)"
+        note = " (or reverse the vector `gravity` if z points down)"
         yield _make_edit(description, "reversed gravity", text, {"imu.sign": -imu.sign}, note)
     where = "static.orientation" if description.static else "pose.orientation"
     orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
@@ -112,7 +112,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
         yield _make_edit(description, "quaternion order", text, fields)
     for axes in EULER_AXES if orientation.form == "euler" else ():
         if axes != orientation.axes:
-            text = f"the Euler angles do not turn about {orientation.axes}"
+            text = f"the Euler angles are not about the axes {orientation.axes}"
             yield _make_edit(description, "Euler axes", text, {f"{where}.axes": axes})
     if orientation.form in ("rotation_vector", "euler"):
         text = f"the angles are not in {orientation.unit}"
@@ -170,7 +170,7 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         fields = {f"{stream}.frame": (R @ old).tolist()}
-        yield _make_edit(description, "swapped axes", "the wrench is in other axes", fields)
+        yield _make_edit(description, "swapped axes", "the axes of the wrench are rotated", fields)
 
 
 _THINNED_RATE_HZ = 100.0

@@ -241,7 +241,7 @@ def check_imu_against_pose(
         frame = R @ (np.array(old) if isinstance(old, tuple) else np.eye(3))
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        text = f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S;"
+        text = f"the IMU is rotated by {given.rotation_angle_deg:.0f} deg relative to S;"
         oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
         findings.append(Finding(kind, f"{text} set imu.frame: {shown}{oblique}"))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
@@ -303,8 +303,8 @@ def position_unit_or_origin_findings(
     columns = np.concatenate([(s + g)[:, :, None], lever_matrix(omega, alpha)], axis=2)
     columns, by_pose = (low_pass(x, sensed.dt, _ACCELERATION_CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
-    independent = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
-    fit = _fit_centred_signals(columns[inner], by_pose[inner], independent)
+    num_samples = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
+    fit = _fit_centred_signals(columns[inner], by_pose[inner], num_samples)
     if fit is None or abs(fit[0][0]) <= _MIN_ERROR_OVER_DEVIATION * fit[1][0]:
         return []
     x, deviations = fit
@@ -331,7 +331,7 @@ def position_unit_or_origin_findings(
 def _position_unit_finding(described: str, scale: float, deviation: float) -> Finding | None:
     if not abs(scale) > _MIN_ERROR_OVER_DEVIATION * deviation:
         return None
-    text = f"the acceleration of the positions is {1.0 / scale:.3g} times the measured one:"
+    text = f"the acceleration by the positions is {1.0 / scale:.3g} times the measured one:"
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[described]
         if unit != described and _UNIT_MATCH_RANGE[0] < scale / ratio < _UNIT_MATCH_RANGE[1]:
@@ -340,11 +340,11 @@ def _position_unit_finding(described: str, scale: float, deviation: float) -> Fi
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(scale) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
     remedy = f"multiply pose.position.scale (1 by default) by {scale:.4g}"
-    return Finding("units", f"{text} their unit is not known; {remedy}")
+    return Finding("units", f"{text} their unit is unknown; {remedy}")
 
 
 def _fit_centred_signals(
-    columns: Array, target: Array, independent: float
+    columns: Array, target: Array, num_samples: float
 ) -> tuple[Array, Array] | None:
     if len(columns) == 0:
         return None
@@ -358,7 +358,7 @@ def _fit_centred_signals(
         return None
     inverse = np.linalg.inv(gram)
     x = inverse @ ((A / size).T @ b)
-    variance = float(np.sum((b - (A / size) @ x) ** 2)) / (target.shape[1] * max(1.0, independent))
+    variance = float(np.sum((b - (A / size) @ x) ** 2)) / (target.shape[1] * max(1.0, num_samples))
     return x / size, np.sqrt(variance * np.diag(inverse)) / size
 
 

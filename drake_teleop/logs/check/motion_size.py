@@ -12,7 +12,7 @@ from drake_teleop.logs.read.canonical import Log
 
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.17, 0.06
 """Least rms of specific force [m/s^2] (gravity turned by 1 deg) and angular velocity [rad/s]."""
-MORE_MOTION_REMEDY = "record 10 s of brisk turns about all axes, as `drake-teleop excite` designs"
+MORE_MOTION_REMEDY = "record 10 s of fast rotations about all axes (see `drake-teleop excite`)"
 _BLOCK_S, _MIN_BLOCKS, _CUTOFF_HZ = 0.1, 8, 5.0
 _MAX_NOISE_OVER_MOTION, _MIN_CUTOFF_HZ = 0.1, 2.0
 

@@ -154,8 +154,8 @@ def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactCol
         written |= {dataset.path / "meta" / name for name in ("info.json", "stats.json")}
     for file in sorted(p for p in dataset.path.glob("**/*") if p.is_file()):
         if file not in written:
-            copied = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
-            _hard_link_or_copy(file, out / file.relative_to(dataset.path), copied=copied)
+            must_copy = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
+            _hard_link_or_copy(file, out / file.relative_to(dataset.path), must_copy=must_copy)
     if dataset.kind == "zarr":
         _write_zarr(out, columns)
         return
@@ -176,12 +176,12 @@ def _join_columns(columns: Sequence[ContactColumns]) -> ContactColumns:
     return ContactColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
-def _hard_link_or_copy(file: Path, target: Path, *, copied: bool) -> None:
+def _hard_link_or_copy(file: Path, target: Path, *, must_copy: bool) -> None:
     make_folder(target.parent)
     with replace_file_on_success(target) as temporary:
         temporary.unlink(missing_ok=True)
         with suppress(OSError):  # on another file system
-            if not copied:
+            if not must_copy:
                 os.link(file.resolve(), temporary)
                 return
         shutil.copyfile(file, temporary)

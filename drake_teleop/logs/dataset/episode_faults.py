@@ -83,7 +83,7 @@ def _unit_faults(gain: Array) -> list[EpisodeFault]:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
         near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_FACTOR_TOLERANCE
-        text = f"the {what} is {factor:.4g} times that in {si}"
+        text = f"the {what} is {factor:.4g} times the value in {si}"
         found.append(EpisodeFault("unit", text + (f": its unit is {unit}" if near else ""), factor))
     return found
 

@@ -1,9 +1,9 @@
 """Faults of an episode's wrench, found by comparison with the wrench of a known load.
 
 A hypothesis predicts the reading G M p(t + lag) + offsets, with the load's wrench p, a rotation or
-mirroring M and a factor G of forces and of torques. The simplest hypothesis is chosen unless
-another one reduces the spread of the residual decisively. The spread is that of the calmer half of
-the frames, so that contact has no influence.
+mirroring M and factors G of force and torque. The simplest hypothesis is chosen unless another one
+reduces the spread of the residual decisively. The spread is that of the calmer half of the frames,
+so that contact has no influence.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class HypothesisSearch:
         """
         both = self.predict(x.kind, x.lag)
 
-        def fit(rows: NDArray[np.bool_]) -> WrenchHypothesis:
+        def fit_from_rows(rows: NDArray[np.bool_]) -> WrenchHypothesis:
             found = x
             for _ in range(_NUM_REFITS):
                 w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
@@ -197,13 +197,13 @@ class HypothesisSearch:
                 rows = self._best_rows_of(found)
             return found
 
-        return self._best_fit(fit)
+        return self._best_fit(fit_from_rows)
 
     def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
         first_weights = np.exp(-ln_half_width_and_centre_of_calm_half(wrench, self.floor)[0])
 
-        def fit(rows: NDArray[np.bool_]) -> WrenchHypothesis:
+        def fit_from_rows(rows: NDArray[np.bool_]) -> WrenchHypothesis:
             x, weights = hypothesis_without_fault(lag), first_weights
             for _ in range(_NUM_REFITS):
                 w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
@@ -214,7 +214,7 @@ class HypothesisSearch:
                 rows, weights = self._best_rows_of(x), np.exp(-x.spread)
             return x
 
-        return self._best_fit(fit)
+        return self._best_fit(fit_from_rows)
 
     def best_lag(self, x: WrenchHypothesis) -> float:
         """Return the lag [frames] at which hypothesis x has the least spread."""

@@ -28,7 +28,7 @@ from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
-_MAX_COUNTED_EXCESS_SPREAD, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
+_EXCESS_SPREAD_LIMIT, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
 _LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0
 _MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
 _THRESHOLD_OVER_LARGEST_FREE_LEVEL = 1.1
@@ -64,10 +64,10 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
             remedy = "write wrench.sign: -1 into a --description file, or remove it if it is there"
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
-        def counted_excess(phi: Array) -> float:
-            return sum(min(x.excess_spread(phi), _MAX_COUNTED_EXCESS_SPREAD) for x in episodes)
+        def sum_of_limited_excess_spreads(phi: Array) -> float:
+            return sum(min(x.excess_spread(phi), _EXCESS_SPREAD_LIMIT) for x in episodes)
 
-        phi = min(candidates, key=counted_excess)
+        phi = min(candidates, key=sum_of_limited_excess_spreads)
         for _ in range(2):
             load = _fit_shared_load(_episodes_sharing_load(episodes, phi), phi)
             phi = load.phi
