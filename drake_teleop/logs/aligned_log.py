@@ -105,8 +105,7 @@ class AlignedLog:
         log: aligned log; if the robot has removed the weight, `specific_force` is the acceleration.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
-        log_with_differentiated_motion: the same with numerically differentiated motion, if
-            requested.
+        log_with_differentiated_motion: the same with differentiated motion, if requested.
         edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
         clock_notes: note on the clock rate of the poses, if it was corrected.
     """
@@ -131,8 +130,8 @@ def read_aligned_log(
     """Return the log in a file, without the delay between motion and wrench.
 
     The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
-    The removed delay is `delay` [s], or for "auto" its estimate, or `fallback_delay_s` if the
-    record does not determine it. `differentiate` also returns numerically differentiated motion.
+    The removed delay is `delay` [s], or its estimate for "auto", or `fallback_delay_s` if the
+    record does not determine it. `differentiate` adds numerically differentiated motion.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated

@@ -308,7 +308,7 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Find
 
 
 def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Finding:
-    """Return the finding that none of the fitted `corrections` explains the misfit."""
+    """Return the finding of a misfit that none of the fitted `corrections` explains."""
     ratio = why.state.residual_ratio
     text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"

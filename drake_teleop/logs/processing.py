@@ -161,8 +161,8 @@ def identify_log(
 ) -> IdentifiedLog:
     """Identify the load and the sensor offsets from a log.
 
-    With positions, the motion is from splines. Otherwise wrench and motion pass one zero-phase
-    low-pass, and the motion counts as exact. Static poses are unfiltered.
+    With positions, "robust" and "consistent" use motion from splines. Otherwise wrench and motion
+    pass one zero-phase low-pass, and the motion counts as exact. Static poses are unfiltered.
 
     Args:
         path: canonical table or log description.
@@ -546,7 +546,7 @@ def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
 
 
 def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias of a point mass instead, and their names."""
+    """Return phi (10,) with undetermined inertias as of a point mass, and the names of these."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))

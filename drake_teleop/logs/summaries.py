@@ -138,7 +138,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
 
 
 def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return shares of samples with |F| > `threshold` [N]: tared, without weight, and contact."""
+    """Return shares of samples with |F| > `threshold` [N] in tared, weightless, contact wrench."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

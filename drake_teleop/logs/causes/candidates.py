@@ -144,7 +144,7 @@ def has_negative_mass(state: FittedModel) -> bool:
 
 
 def has_negative_inertia(state: FittedModel) -> bool:
-    """Return True for a clearly negative mass, or inertia about So of a well determined mass."""
+    """Return True if mass, or inertia about So of a well determined mass, is clearly negative."""
     if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
@@ -215,7 +215,7 @@ def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
 
 
 def drift_amplitudes(state: FittedModel) -> Array:
-    """Return upper bounds (6,) of the offsets' distance from their means during drift [N, N m]."""
+    """Return upper bounds (6,) of the offsets' drift about their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
     return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
 
@@ -252,7 +252,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
 
 
 def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
-    """Return nearly as likely fits with unit factors of 0.5 to 2 times the found torque factor."""
+    """Return nearly as likely fits with other unit factors, 0.5 to 2 times the torque factor."""
     factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:

@@ -70,7 +70,7 @@ class LoadFitQuality:
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
-    """Return a load's fit to the best fitting share of a log, below 15 Hz unless it is static."""
+    """Return the quality of a load's fit to the best fitting `kept_share` of a low-passed log."""
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))

@@ -1,6 +1,6 @@
 """Files of robot-learning datasets: episodes of LeRobot, robomimic, Zarr and folders of tables.
 
-The copy has two more columns; its other values are unchanged, and its other files are hard links.
+The copy has two more columns; other values are unchanged, and other files are hard links.
 """
 
 from __future__ import annotations

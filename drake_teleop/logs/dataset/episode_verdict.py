@@ -165,7 +165,8 @@ class HypothesisSearch:
         return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
 
     def _best_fit(self, fit: Callable[[NDArray[np.bool_]], WrenchHypothesis]) -> WrenchHypothesis:
-        """Return the best result of `fit` from two kinds of start: all frames, and each quarter."""
+        """Return the best result of `fit`, started from all frames and each quarter of them."""
+
         at = np.arange(self.frames) * _NUM_START_FIT_PARTS // self.frames
         quarters = (at == part for part in range(_NUM_START_FIT_PARTS))
         return min(map(fit, [at >= 0, *quarters]), key=lambda x: x.cost)
