@@ -100,8 +100,7 @@ class BlockMeans:
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
-        """Return block sums of products of y (M, W) with earlier rows of y: (blocks, lags, W, W)."""
-
+        """Return block sums of products of y (M, W) with earlier rows: (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))

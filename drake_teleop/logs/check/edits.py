@@ -174,7 +174,7 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
 
 
 _THINNED_RATE_HZ = 100.0
-_THIN_TIME_PREFIX = "thinned time stamps of"
+_THINNED_TIME_COLUMN_PREFIX = "thinned time stamps of"
 
 
 class LogTables:
@@ -202,7 +202,7 @@ class LogTables:
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
-                column = {"column": f"{_THIN_TIME_PREFIX} {name}", "unit": "s"}
+                column = {"column": f"{_THINNED_TIME_COLUMN_PREFIX} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
                 stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
@@ -256,7 +256,7 @@ class LogTables:
         if getattr(stream, "time", None) is not None:
             t, rows = self._times_and_rows(stream)
             means = _means_of_consecutive_rows(t[:, None], block_rows)
-            thinned.columns[f"{_THIN_TIME_PREFIX} {name}"] = means
+            thinned.columns[f"{_THINNED_TIME_COLUMN_PREFIX} {name}"] = means
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):

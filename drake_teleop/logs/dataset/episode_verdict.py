@@ -166,7 +166,6 @@ class HypothesisSearch:
 
     def _best_fit(self, fit: Callable[[NDArray[np.bool_]], WrenchHypothesis]) -> WrenchHypothesis:
         """Return the best result of `fit`, started from all frames and each quarter of them."""
-
         at = np.arange(self.frames) * _NUM_START_FIT_PARTS // self.frames
         quarters = (at == part for part in range(_NUM_START_FIT_PARTS))
         return min(map(fit, [at >= 0, *quarters]), key=lambda x: x.cost)
