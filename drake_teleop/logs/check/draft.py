@@ -91,9 +91,7 @@ _RAW_ACCELERATION_NOTE = (
     " m/s^2, or one for each axis; the gyroscope is probably in counts too."
 )
 _NO_TORQUE_NOTE = "A force alone is not enough: the commands need force and torque."
-_NO_TIME_NOTE = (
-    "No column of time was recognized; without one, set the rate [Hz]: time: {rate: 500}."
-)
+_NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate: 500}, in Hz."
 
 
 class Draft(NamedTuple):

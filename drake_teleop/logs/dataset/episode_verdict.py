@@ -284,7 +284,7 @@ def _rotation_cost(M: Array) -> float:
 def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
     """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
 
-    All frames fit to one of two constant offsets, whereas contact begins gradually.
+    Frames beside the jump fit to one of two constant offsets; contact begins gradually.
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
