@@ -33,7 +33,7 @@ def motion_rms(log: Log) -> tuple[float, float]:
 
 
 def max_cutoff_by_pose_noise(log: Log) -> float:
-    """Return the cut-off [Hz] below which position noise is small in specific force; inf if unknown."""
+    """Return the cut-off [Hz] below which position noise is small in specific force, or inf."""
     by_pose = None if log.posed is None else _motion_rms_of_poses(log.posed)
     if log.posed is None or by_pose is None:
         return np.inf
