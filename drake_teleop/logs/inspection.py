@@ -325,9 +325,9 @@ def _inspect_clock_and_flag_usable_rows(
         finite = np.flatnonzero(np.isfinite(stamps))
         row = table.line_in_file(finite[int(np.argmax(steps <= 0)) + 1])
         text = (
-            f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
-            " rows with repeated stamps are omitted if their values repeat, else spread evenly; a"
-            " log with decreasing stamps is refused: split it where they decrease, or give time.rate"
+            f"{at}: {back} time stamps repeat or decrease, the first in row {row}; rows with"
+            " repeated stamps are omitted if their values repeat, else spread evenly; a log with"
+            " decreasing stamps is refused: split it where they decrease, or give time.rate"
         )
         findings.append(Finding("clock jump", text))
     return findings, usable

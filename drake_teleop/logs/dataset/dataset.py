@@ -51,8 +51,6 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class DatasetAndLoad(NamedTuple):
-    """Dataset, its described streams and the load shared by its episodes."""
-
     dataset: Dataset
     streams: dict[str, Any]
     shared_load: SharedLoad
