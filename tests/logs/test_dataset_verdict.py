@@ -38,8 +38,8 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"kind": "weight removed"}, ["already removed the load's weight"]),
         ({"axes": (-I3, -I3)}, ["the wrench is negated"]),
         ({"axes": (FLIP, FLIP)}, ["axis y of the wrench is reversed"]),
-        ({"axes": (I3, SKEW)}, ["the torque is turned by 30 deg about [0, 1, 0]"]),
-        ({"axes": (-SKEW, I3)}, ["the force is negated", "the force is turned by 30 deg"]),
+        ({"axes": (I3, SKEW)}, ["the torque is rotated by 30 deg about [0, 1, 0]"]),
+        ({"axes": (-SKEW, I3)}, ["the force is negated", "the force is rotated by 30 deg"]),
         ({"gains": np.array([1.05, 0.95])}, []),
         (
             {"gains": np.array([0.1, 1.0])},

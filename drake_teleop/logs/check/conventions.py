@@ -195,7 +195,7 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     if not log.static:
         return []
     if len(log) < _MIN_CHECKED_POSES:
-        remedy = "record 12, turned about two horizontal axes"
+        remedy = "record 12 poses, rotated about two horizontal axes"
         text = f"{len(log)} poses at rest are too few to check the fit; {remedy}"
         return [Finding("static poses", text)]
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
@@ -205,7 +205,7 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     text = (
         "the poses are too alike: along one direction gravity in S varies by only"
         f" {np.degrees(np.arcsin(least)):.2g} deg, which does not separate offsets from the load;"
-        " add poses that are turned by 45 deg or more about two horizontal axes"
+        " add poses that are rotated by 45 deg or more about two horizontal axes"
     )
     return [Finding("static poses", text)]
 

@@ -71,7 +71,7 @@ def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
     angle = float(np.linalg.norm(turn))
     if angle > _MIN_WRENCH_ROTATION_DEG:
         axis = ", ".join(f"{a:.2g}" for a in turn / angle)
-        text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
+        text = f"{what} is rotated by {angle:.3g} deg about [{axis}] of S"
         found.append(EpisodeFault("frame", text, M.tolist()))
     return found
 
