@@ -439,7 +439,7 @@ def _read_and_eliminate_log(
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
         what = "a contact-free start requires `causal`, wrenches as in a control loop"
-        remedy = "give `causal` as well, or remove causal_tare_s"
+        remedy = "give causal as well, or remove causal_tare_s"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     phi = phi_with_inertia_replaced(identification)[0]
     removed, late_s = identification.weight_removed, identification.delay_s
