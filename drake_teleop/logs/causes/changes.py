@@ -92,7 +92,6 @@ class _StepTimeScan:
 
 
 def _weighted_normal_equations(J: Array, residual: Array, sums: Array) -> tuple[Array, Array]:
-    """Return gram (..., p, p) and right side (..., p) of p parameters, summed over channels."""
     gram = [J[:, c] @ sums @ J[:, c].T for c in range(6)]
     right = [sums @ residual[c] @ J[:, c].T for c in range(6)]
     return np.sum(gram, axis=0), np.sum(right, axis=0)

@@ -137,6 +137,7 @@ _Columns = dict[str, list[str]]  # names of the columns of each recognized vecto
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
+    """Return a log description guessed from names and magnitudes of columns."""
     plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)

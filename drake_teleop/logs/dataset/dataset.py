@@ -51,6 +51,8 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class DatasetAndLoad(NamedTuple):
+    """Dataset, its described streams and shared load."""
+
     dataset: Dataset
     streams: dict[str, Any]
     shared_load: SharedLoad
