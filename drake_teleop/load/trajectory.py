@@ -62,7 +62,6 @@ class FourierTrajectory:
         return q, qd, qdd
 
     def with_scaled_amplitudes(self, factor: float) -> FourierTrajectory:
-        """Return the trajectory with `factor` times the amplitudes; q0 is unchanged."""
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
@@ -107,7 +106,7 @@ class FourierTrajectory:
         wrong = numbers[~(np.abs(numbers) <= _MAX_FILE_NUMBER)]
         if len(wrong):
             what = f"contains {wrong[0]:g}, outside +-{_MAX_FILE_NUMBER:g}"
-            raise DrakeTeleopError(what, where=where, remedy="give rad and Hz")
+            raise DrakeTeleopError(what, where=where, remedy="give angles in rad, Hz")
         if not frequency > 0:
             what, remedy = f"{frequency:g} Hz is not above 0", "give the frequency of a motion"
             raise DrakeTeleopError(what, where=f"{where}:frequency", remedy=remedy)

@@ -58,7 +58,7 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
-        equations: second moments of the kept samples.
+        equations: second moments of the other samples.
     """
 
     identification: Identification
@@ -160,7 +160,7 @@ def _std_growth_by_rejection(whole: EstimatorFit, kept: SecondMoments) -> float:
 
 
 class Method(NamedTuple):
-    """Batch estimator: name for results, and fitting function."""
+    """Batch estimator: value of `Identification.method`, and function that fits a record."""
 
     name: str
     fit: Callable[[SampleRecord, EstimatorOptions], EstimatorFit]
@@ -196,14 +196,14 @@ def identify_batch(
     delay_s: float = 0.0,
     gain_std: float = 0.0,
 ) -> BatchResult:
-    """Return load and sensor offsets of a free motion, by a batch estimator.
+    """Return load and sensor offsets of a free motion, fitted by the batch estimator `method`.
 
     Args:
         wrench, s, omega, alpha, delay_s: as for `identify`.
         noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
-        resolution: (2,) quantisation step of forces and torques [N, N m], with `shared_noise` only.
+        resolution: (2,) quantisation step of forces and torques [N, N m], for `shared_noise` only.
         gain_std: relative standard deviation of the sensor's 36 gains.
     """
     METHODS.check(method, "method")

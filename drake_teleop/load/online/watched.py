@@ -1,4 +1,4 @@
-"""Monitor of a known load in use, which selects the load to eliminate, sample by sample.
+"""Monitor of a known load in use, which selects the load whose wrench is removed from a sample.
 
 Its states::
 
@@ -24,7 +24,7 @@ STATE_LEARNING, STATE_SETTLED, STATE_DISTURBED, STATE_OTHER_LOAD = range(4)
 LOAD_FADE_TIME_S, MIN_REST_TIME_S, OFFSET_TIME_CONSTANT_S, MIN_CHANGE_TIME_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
-MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
+MAX_RESIDUAL_OF_OFFSET_DRIFT = np.array([0.3] * 3 + [0.015] * 3)
 """Largest residual that offsets follow, three times `change.OFFSET_DRIFT_STD` [N, N m]."""
 MIN_FORCE_CHANGE_N = 0.5
 """Smallest change of the low-passed force that noise cannot cause [N]."""
@@ -95,10 +95,9 @@ def _is_com_of_change_within_reach(known, new):
 
 @njit(cache=True)
 def monitor_load(out, memory, sample, fallback, period, block, noise, window, hold, mass_std_ratio):
-    """Process one sample: monitor the known load and write the load to eliminate into `out` (16,).
+    """Process one sample (15,): ramp `out` (16,), [offsets; phi], to the load to remove.
 
-    `fallback` (10,) is the phi for a changed load; the last arguments are from
-    `change_detector_parameters`.
+    `fallback` (10,) is the phi for a changed load; `block` and on: `change_detector_parameters`.
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
@@ -113,7 +112,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     if verdict == change.STATE_KNOWN:
         memory[STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
-        if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
+        if at_rest and (low_passed <= MAX_RESIDUAL_OF_OFFSET_DRIFT).all():
             for i in range(6):
                 known[i] += period / OFFSET_TIME_CONSTANT_S * residual[i]
     elif memory[STATE_INDEX] != STATE_OTHER_LOAD:
