@@ -62,7 +62,7 @@ TimedMotion = tuple[float, Array]
 
 
 class DelayTracker:
-    """Estimator of the motion's delay behind the wrench, `delay_s` [s]."""
+    """Estimator of `delay_s` [s], by which the motion's time stamps lag behind the wrench's."""
 
     def __init__(
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
@@ -85,7 +85,7 @@ class DelayTracker:
     def update_delay(
         self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
     ) -> None:
-        """Update the delay with a wrench (6,), its motion `at`, and the neighbouring motions."""
+        """Update the delay by a wrench (6,), its motion `at`, and motions `before` and `after`."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
         if 0.0 <= elapsed < DELAY_SAMPLE_PERIOD_S or step <= 0.0:
@@ -157,7 +157,7 @@ class ArmKinematics(Protocol):
 
 
 class WrenchAndMotionStreams(Source):
-    """Source of wrenches and motions, from one or two sources; `where` names that of the motion.
+    """Source of wrenches and motions, from one or two sources; errors name `where`.
 
     The kinematics `arm` convert joint positions to poses of the sensor frame S.
     """
@@ -221,8 +221,8 @@ class MotionWindow:
 
     Args:
         cutoff_hz: cut-off of the smoothing; None for the shortest window.
-        X_FS: (7,) pose of the sensor in F.
-        gravity_W: (3,) gravity [m/s^2].
+        X_FS: (7,) pose of S in F.
+        gravity_W: (3,) gravity in the world frame [m/s^2].
     """
 
     def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY_W) -> None:
@@ -246,7 +246,7 @@ class MotionWindow:
             self.reset()
 
     def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
-        """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
+        """Add a sample; return new times [s], motions [s, omega, alpha, gravity (of poses)]."""
         row = self._row_of_valid_motion(sample)
         if row is None:
             return []
@@ -296,7 +296,7 @@ class MotionWindow:
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
-    """Return the pose (7,), [w x y z, position], from x, y, z [m], roll, pitch, yaw [deg]."""
+    """Return [w x y z, position] for x, y, z [m], roll, pitch, yaw about fixed axes [deg]."""
     R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
     return np.concatenate([quaternions_from_matrices(R)[0], numbers[:3]])
 

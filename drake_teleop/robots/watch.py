@@ -33,14 +33,14 @@ _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def white_wrench_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return the white noise (6,) of a reading, rms [N, N m], from the filtered residual."""
+    """Return the rms (6,) [N, N m] of white noise that explains the load's filtered residual."""
     bandwidth_hz = _NOISE_BANDWIDTH_OVER_CUTOFF * (math.inf if cutoff_hz is None else cutoff_hz)
     noise = load.residual_rms / math.sqrt(min(1.0, 2.0 * bandwidth_hz * dt))
     return np.maximum(noise, MIN_WRENCH_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt))
 
 
 class ContactAndLoadMonitor:
-    """Detector of contact and of another load than the identified one."""
+    """Detector of contact, and of another load than the identified one."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = white_wrench_noise(load, dt, cutoff_hz)
@@ -60,7 +60,6 @@ class ContactAndLoadMonitor:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Restart with other sensor offsets (6,)."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched.initial_monitor_memory(self._out, self._covariance)
 
@@ -83,7 +82,7 @@ _FREE_LOG_RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
-    """Contact detector with the noise floor of a free-motion log."""
+    """Contact detector with the noise floor of the free-motion log `free`."""
 
     def __init__(
         self,

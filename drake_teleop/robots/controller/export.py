@@ -34,7 +34,7 @@ from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
-"""Options of a C compiler for the bits of Python."""
+"""Options of a C compiler for results that are bit-equal to those of Python."""
 _TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
@@ -48,7 +48,7 @@ ExportedFiles = Mapping[str, str | bytes]
 
 
 class ExportedCompensation(NamedTuple):
-    """Load, rate, low-pass and sensor of an export.
+    """Load, rate, low-pass and sensor range of an export.
 
     Attributes:
         dt: period of the readings [s].
@@ -239,7 +239,6 @@ def _model_variables(target: ExportedCompensation) -> list[tuple[str, str, str, 
 
 
 def ros2_filter_files(target: ExportedCompensation) -> ExportedFiles:
-    """Return the files of a ROS 2 package with a filter of wrenches."""
     shipped = {
         f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
         "package.xml": "package.xml",
