@@ -289,8 +289,8 @@ def _check_numbers(where: str, value: Any, expected: str = "") -> None:
         raise _file_error(what, where)
 
 
-SIGNIFICANT_STDS_BELOW_ZERO = 3.0
-"""Standard deviations below zero at which a mass counts as negative."""
+MIN_SIGNIFICANT_STDS = 3.0
+"""Distance from zero of a significant value [standard deviations]."""
 
 _IS_LOAD_PARAMETER = np.arange(16) >= 6
 
@@ -303,7 +303,7 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     undetermined = np.isinf(np.diag(covariance))
     covariance = mark_undetermined(covariance, undetermined)
     deviations = np.sqrt(np.diag(covariance))
-    if phi[0] < -SIGNIFICANT_STDS_BELOW_ZERO * deviations[6] or phi[0] == 0.0:
+    if phi[0] < -MIN_SIGNIFICANT_STDS * deviations[6] or phi[0] == 0.0:
         what = f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)"
         remedy = "give the gripper alone as gripper, and the record with the object as the load"
         raise DrakeTeleopError(what, where="gripper", remedy=remedy)

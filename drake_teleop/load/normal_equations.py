@@ -45,7 +45,7 @@ _MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_DISTANCE_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
-_MAX_ROUNDING_RESIDUAL = 1e-6
+_MAX_ROUNDING_ERROR = 1e-6
 # Indices of wrench, specific force and products w_i w_j in z.
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
 _OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
@@ -217,7 +217,7 @@ class SecondMoments:
         n = float(self.num_samples)
         square_sums = self.residual_square_sums(theta)
         if self._resolution is not None:
-            absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
+            absorbed = self._degrees_of_freedom_of_fit(grams, inverse)
             rest_variances = self._residual_variances_of_poses_at_rest(square_sums, absorbed, theta)
             return *rest_variances, np.zeros(6, dtype=bool)
         variances, degrees, sample_absorbed = self._unbiased_residual_variances(
@@ -260,7 +260,7 @@ class SecondMoments:
         weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
         variances = np.where(weaker, longest, variances)
         degrees = np.where(weaker, longest_degrees, degrees)
-        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_RESIDUAL**2 * wrench)
+        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_ERROR**2 * wrench)
 
     def _residual_variances_of_poses_at_rest(
         self, square_sums: Array, absorbed: Array, theta: Array
@@ -285,14 +285,14 @@ class SecondMoments:
         variances = np.maximum(squares / np.maximum(degrees, 1.0), min_variance)
         return variances.repeat(3), degrees.repeat(3)
 
-    def _absorbed_degrees_of_freedom(self, between: Array, inverse: Array) -> Array:
+    def _degrees_of_freedom_of_fit(self, between: Array, inverse: Array) -> Array:
         return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
     def _unbiased_residual_variances(
         self, square_sums: Array, count: float, between: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array, Array]:
         w = self._weights
-        absorbed = self._absorbed_degrees_of_freedom(between, inverse)
+        absorbed = self._degrees_of_freedom_of_fit(between, inverse)
         shares = np.einsum("cij,kji->ck", between, inverse @ grams @ inverse) * w**2
         degrees = np.maximum(count - absorbed, 0.0)
         equations = np.diag(count - 2.0 * absorbed) + shares

@@ -159,7 +159,7 @@ def advise_motion(
     gram = gram + _RELATIVE_GRAM_REGULARIZATION * size**2 * np.eye(16)
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
-    for words, of_motion in _candidate_information_matrices(last, noise, rate):
+    for words, of_motion in _information_of_advised_motions(last, noise, rate):
         left = tolerances.deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
@@ -167,7 +167,7 @@ def advise_motion(
     return best
 
 
-def _candidate_information_matrices(
+def _information_of_advised_motions(
     up: Array, noise: Array, rate: float
 ) -> Iterator[tuple[str, Array]]:
     s0 = _GRAVITY_M_S2 * up / max(float(np.linalg.norm(up)), 1e-9)

@@ -32,7 +32,7 @@ MIN_CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 MAX_CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
-RATE_TOLERANCE = 0.05
+RELATIVE_RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
@@ -78,7 +78,7 @@ class _RateCheck:
         self._count += 1
         if self._count > self._readings:
             spacing = (reading.t - self._start_t) / max(1, reading.number - self._start_number)
-            wrong = abs(spacing / self._dt - 1.0) > RATE_TOLERANCE
+            wrong = abs(spacing / self._dt - 1.0) > RELATIVE_RATE_TOLERANCE
             self._flag, self._count = _WRONG_RATE_FLAG if wrong else 0, 0
         return self._flag
 

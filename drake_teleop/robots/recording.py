@@ -104,7 +104,7 @@ class Recorder:
         if same_clock or other.is_clock_jump(t):
             self.left_out += len(other.t)
             other = self._other_clock[stream] = _SampleSeries()
-        self.left_out += not (samples if same_clock else other).add(reading)
+        self.left_out += not (samples if same_clock else other).add_if_newer(reading)
         if len(other.t) == _NEW_CLOCK_CONFIRMATION_SAMPLES:
             self.clock_changes += 1
             self._longest = self._longest_part()
@@ -157,7 +157,7 @@ class _SampleSeries:
     def is_clock_jump(self, t: float) -> bool:
         return bool(self.t) and abs(t - self.t[-1]) > MIN_CLOCK_JUMP_S
 
-    def add(self, reading: Reading) -> bool:
+    def add_if_newer(self, reading: Reading) -> bool:
         if self.t and reading.t <= self.t[-1]:
             return False
         self.t.append(reading.t)

@@ -27,7 +27,7 @@ LOAD_WRENCH_ERROR_FRACTION = 0.02
 MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
 # Accuracy at which another load would replace the present one.
-_MASS_STD_RATIO_TO_REPLACE_LOAD = 1e-12
+_UNREACHABLE_MASS_STD_RATIO = 1e-12
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
@@ -50,7 +50,7 @@ class ContactAndLoadMonitor:
             np.zeros(9),
             dt,
             relative_wrench_error=LOAD_WRENCH_ERROR_FRACTION,
-            mass_std_ratio=_MASS_STD_RATIO_TO_REPLACE_LOAD,
+            mass_std_ratio=_UNREACHABLE_MASS_STD_RATIO,
         )
         self._phi = phi_with_inertia_replaced(load)[0]
         self._covariance = limit_covariance_to_scales(self._phi, load.covariance)
@@ -78,7 +78,7 @@ MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
 _CONTACT_STATISTIC = "level"
-_FREE_LOG_RATE_TOLERANCE = 0.05
+_RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
@@ -96,7 +96,7 @@ class StreamContactDetector:
             what = f"needs a low-pass below half the stream's rate, {0.5 / dt:g} Hz"
             raise DrakeTeleopError(what, where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
-        if abs(source.dt / dt - 1.0) > _FREE_LOG_RATE_TOLERANCE:
+        if abs(source.dt / dt - 1.0) > _RELATIVE_FREE_LOG_RATE_TOLERANCE:
             what = f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz"
             remedy = "use the log that `calibrate` wrote from this stream"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)

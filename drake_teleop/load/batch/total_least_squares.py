@@ -149,7 +149,7 @@ class SampleRecord:
         moments.add_samples(*self.wrench_and_motion)
         return moments
 
-    def decimate(self, step: int) -> SampleRecord:
+    def with_row_step(self, step: int) -> SampleRecord:
         return SampleRecord(*(table[::step] for table in self.wrench_and_motion))
 
     def residual(self, theta: Array, part: slice) -> Array:

@@ -210,7 +210,7 @@ def covariance_for_random_walks(
     covariance = np.zeros((16, 16))
     if not step_covariance.any():
         return covariance
-    backwards, used = record.decimate(-1), kept[::-1]
+    backwards, used = record.with_row_step(-1), kept[::-1]
     after = np.zeros((6, 16))
     for start in range(0, len(used), SAMPLES_PER_CHUNK):
         part = slice(start, start + SAMPLES_PER_CHUNK)

@@ -48,7 +48,7 @@ _CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
 # Factor of this limit for first moments relative to that of the mass, and smallest size [m].
 _FIRST_MOMENT_BOUND_FACTOR, _MIN_LOAD_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_MAX_NEGATIVE_MASS_OVER_STD = 4.0
+_MAX_MASS_STDS_BELOW_ZERO = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
@@ -61,10 +61,10 @@ _MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_
 
 MEMORY_SIZE = _KNOWN_LOAD_START + 816
 """Length of the memory of `update_change_detector`."""
-KNOWN_LOAD = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
-NEW_LOAD = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
+KNOWN_LOAD_SLICE = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
+NEW_LOAD_SLICE = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
 """Parts of the memory: [offsets; phi] of the known and of the new load."""
-_NEW_LOAD_COVARIANCE = slice(NEW_LOAD.stop, MEMORY_SIZE)
+_NEW_LOAD_COVARIANCE_SLICE = slice(NEW_LOAD_SLICE.stop, MEMORY_SIZE)
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
@@ -169,7 +169,7 @@ def _restart_filter_from_known_load(memory, filter_start):
 
 @njit(cache=True)
 def _is_new_load_identified(memory, mass_std_ratio):
-    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD_SLICE], memory[_NEW_LOAD_COVARIANCE_SLICE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = mass_std_ratio * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
@@ -179,7 +179,7 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 @njit(cache=True)
 def _add_alpha_noise_to_inertia_variances(memory, noise, block):
-    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD_SLICE], memory[_NEW_LOAD_COVARIANCE_SLICE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
@@ -242,7 +242,7 @@ def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
     # A clearly negative mass is not a load.
     mass = memory[_NEW_FILTER_START + 6]
     deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
-    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_MASS_OVER_STD * deviation:
+    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_MASS_STDS_BELOW_ZERO * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_filter_from_known_load(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
@@ -323,7 +323,7 @@ def initial_change_memory(
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
     memory = np.zeros(MEMORY_SIZE)
-    memory[KNOWN_LOAD] = np.concatenate([theta[:6], phi])
+    memory[KNOWN_LOAD_SLICE] = np.concatenate([theta[:6], phi])
     memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START] = P.ravel()
     copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
     return memory
@@ -360,7 +360,7 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    theta = memory[KNOWN_LOAD].copy()
+    theta = memory[KNOWN_LOAD_SLICE].copy()
     covariance = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START].reshape(16, 16).copy()
     return replace(
         known,

@@ -27,7 +27,7 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `normal_equations`.
 _WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
-_ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
+_INDICES_IN_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
@@ -39,7 +39,7 @@ _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 @cache
 def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
     """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
-    T = regressor_coefficients()[:, :, _ORDER_OF_BATCH_MOMENTS].swapaxes(1, 2)
+    T = regressor_coefficients()[:, :, _INDICES_IN_BATCH_MOMENTS].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
     return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]

@@ -28,7 +28,7 @@ MAX_RESIDUAL_OF_OFFSET_DRIFT = np.array([0.3] * 3 + [0.015] * 3)
 """Largest residual that offsets follow, three times `change.OFFSET_DRIFT_STD` [N, N m]."""
 MIN_FORCE_CHANGE_N = 0.5
 """Smallest change of the low-passed force that noise cannot cause [N]."""
-MAX_COM_DISTANCE_M = 1.0
+MAX_COM_DISTANCE_FROM_SENSOR_M = 1.0
 """Largest distance of So from the centre of mass of a grasped or released object [m]."""
 
 # Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
@@ -90,7 +90,7 @@ def _update_and_test_force_change(memory, residual, age, period):
 @njit(cache=True)
 def _is_com_of_change_within_reach(known, new):
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
-    return moment < (MAX_COM_DISTANCE_M * (new[6] - known[6])) ** 2
+    return moment < (MAX_COM_DISTANCE_FROM_SENSOR_M * (new[6] - known[6])) ** 2
 
 
 @njit(cache=True)
@@ -101,7 +101,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
-    known, residual, target = watch[change.KNOWN_LOAD], np.empty(6), np.empty(16)
+    known, residual, target = watch[change.KNOWN_LOAD_SLICE], np.empty(6), np.empty(16)
     wrench, motion = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
@@ -116,7 +116,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
             for i in range(6):
                 known[i] += period / OFFSET_TIME_CONSTANT_S * residual[i]
     elif memory[STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD])
+        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD_SLICE])
         other = verdict == change.STATE_CHANGED and force_changed and near
         memory[STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
