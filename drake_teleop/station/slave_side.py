@@ -1,4 +1,4 @@
-"""Slave side of the station: arm, inverse kinematics, wrist sensor, removal of the load."""
+"""Slave side of the station: arm, inverse kinematics, wrist sensor, compensation of the load."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ _JOINT_RANGE_TOLERANCE_SHARE = 0.01
 
 
 def used_ik_method(name: str, arm: ArmModel) -> str:
-    """Return the `IK_METHODS` key for setting `name`; raise DrakeTeleopError if it does not fit."""
+    """Return the `IK_METHODS` key of setting `name`; raise DrakeTeleopError if the arm lacks it."""
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):

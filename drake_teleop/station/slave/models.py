@@ -142,8 +142,8 @@ def ParseModel(
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
     S is `sensor_frame`. A free base is welded to the world at `X_WBase`. Joints in `hold` are
-    welded at the given positions [rad, m], other joints, such as a gripper's, at their defaults.
-    Unreadable or contradictory models raise DrakeTeleopError.
+    welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at their
+    defaults. Unreadable or contradictory models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)

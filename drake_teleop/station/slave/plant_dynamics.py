@@ -111,7 +111,10 @@ def _place_box_at_body(pair, bodies, placed):
 
 @njit(cache=True)
 def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
-    """Return PROXIMITY_NEAR_MONITORED, PROXIMITY_TOUCHING or PROXIMITY_FAR for pairs of shapes."""
+    """Return PROXIMITY_NEAR_MONITORED, PROXIMITY_TOUCHING or PROXIMITY_FAR, the first that applies.
+
+    The tool is near within 2 cm of one of `monitored_pairs`, and touches one of `pairs`.
+    """
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)

@@ -105,7 +105,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
-        """Return pairs of overlapping bodies with their signed distance [m], minus the depth.
+        """Return pairs of overlapping bodies with their signed distance [m] (minus the depth).
 
         Pairs that nearly always overlap are left out.
         """
@@ -182,7 +182,7 @@ class PostureShapes:
 
 
 def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return finite joint limits (n,): +-pi if infinite, or if the range exceeds -pi and pi."""
+    """Return finite lower and upper limits (n,): +-pi if infinite, or if beyond both -pi and pi."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)

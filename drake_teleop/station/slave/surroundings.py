@@ -89,7 +89,7 @@ def MakeToolContactModel(
     """Return the contact model of tool and environment, in a finalized plant.
 
     `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
-    a hydroelastic model without such shapes, or a moving body without mass.
+    hydroelastic contact without hydroelastic shapes, or a moving body without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes, context = ToolShapes(plant, scene_graph, tool), plant.CreateDefaultContext()

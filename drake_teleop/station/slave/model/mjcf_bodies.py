@@ -183,7 +183,7 @@ class BodyReader:
         return about_centre.in_frame(self._mjcf.read_pose(given))
 
     def mass_properties_of_body(self, body: Body) -> mjcf_meshes.MassProperties:
-        """Return a body's mass properties from its `inertial` element or shapes, as MuJoCo does."""
+        """Return a body's mass properties from its `inertial` element or shapes, as in MuJoCo."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):

@@ -128,7 +128,7 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
 def _mass_properties_of_simplices(
     corners: Array, weight: Array, centre: Array, count: int = 3
 ) -> MassProperties:
-    """Return mass properties of triangles (count 3), or of tetrahedra with tips at `centre` (4).
+    """Return mass properties of triangles (`count` 3) or tetrahedra with tips at `centre` (4).
 
     `corners` (m, 3, 3) are relative to `centre`; `weight` (m,) are their masses.
     """

@@ -75,7 +75,7 @@ class ModelFiles:
         self._bases = {""}
 
     def merge_packages_with_map(self, known: PackageMap) -> None:
-        """Merge `packages` with Drake's map `known` in both; omit the one that Drake downloads."""
+        """Merge `packages` and Drake's map `known` into both, without the downloaded package."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
