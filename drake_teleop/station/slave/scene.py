@@ -25,7 +25,7 @@ class Scene(Environment):
     """Surroundings from a file, with pose, and point or hydroelastic contact."""
 
     file: str = plain(
-        "door.sdf", ".sdf, .urdf, .dmd.yaml, relative to the scenario, or door.sdf", is_path=True
+        "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
     position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "free roots' position in W")
     rotation: list[float] = quantity(

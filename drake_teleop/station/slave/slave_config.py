@@ -120,10 +120,10 @@ class Slave:
         IK_METHODS,
     )
     model: str = plain(
-        "", "URDF, SDF, MJCF or .dmd.yaml, relative to the scenario; default: RX90", is_path=True
+        "", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90", is_path=True
     )
     package_paths: list[str] = plain(
-        [], "folders for package:// addresses, relative to the scenario", is_path=True
+        [], "folders for package:// addresses, from the scenario's folder", is_path=True
     )
     base_pose: list[float] = quantity(
         [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
