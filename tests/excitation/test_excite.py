@@ -619,7 +619,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "model contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
-        (["--sensor-frame", "l0"], "no moving joint"),
+        (["--sensor-frame", "l0"], "no joint moves l0"),
         ([], "--sensor-frame"),
     ],
 )

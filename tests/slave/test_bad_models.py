@@ -338,7 +338,7 @@ def test_rounded_inertia_is_preserved(tmp_path):
     ("change", "expected"),
     [
         ({"sensor_frame": "nose"}, "arm.urdf: no frames are named 'nose'; name one of l0, l1"),
-        ({"sensor_frame": "l0"}, "sensor_frame: no moving joint"),
+        ({"sensor_frame": "l0"}, "sensor_frame: no joint moves"),
         ({"home": [], "position": [3.0, 0.0, 0.4]}, "slave.position: the arm cannot reach"),
         ({"home": [3.0, *HOME[1:]]}, "home: joint j1 at 3 is outside its limits, -2.5 to 2.5"),
         ({"home": HOME[:5]}, "slave.home: has 5 numbers, but the arm has 6 joints"),
