@@ -93,7 +93,7 @@ class ServedCompensator:
                 continue
             lowest = -math.inf if each.name in SCALE_NAMES[2:] else 0.0
             if not (math.isfinite(each.value) and each.value >= lowest):
-                reason = f"{each.name}: {each.value} is outside {lowest:g} to infinity"
+                reason = f"{each.name}: {each.value} is outside {lowest:g} to inf"
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
