@@ -29,7 +29,7 @@ from drake_teleop.station.channel.network import (
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
-    METHOD_INTEGRAL,
+    METHOD_VALUES,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     PACKET_SIZE,
@@ -436,7 +436,7 @@ def test_packet_is_held_zero_or_extrapolated_during_silence(silence, silent):
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
     # Counters and integrals are constant for any policy: silence adds no energy.
-    for part in (METHOD_INTEGRAL, slice(CUMULATIVE_ENERGY.start, PACKET_LOAD_WRENCH.start)):
+    for part in (METHOD_VALUES, slice(CUMULATIVE_ENERGY.start, PACKET_LOAD_WRENCH.start)):
         np.testing.assert_array_equal(received[part], packet[part])
 
 

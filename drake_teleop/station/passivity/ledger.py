@@ -1,7 +1,4 @@
-"""Master's end of the passivity method "ledger", steps M1 to M7.
-
-docs/theory.md, "The energy ledger", has the equations of these steps.
-"""
+"""Master's end of method "ledger": steps M1 to M7 of docs/theory.md, "The energy ledger"."""
 
 import math
 from dataclasses import dataclass
@@ -58,11 +55,11 @@ _MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE = _layout.vector(6), _layout.v
 _UNMODELLED_FRICTION, _FRICTION_COEFFICIENT = _layout.vector(6), _layout.vector(2)
 _HAND_RETREAT_DISTANCE = _layout.number()  # of the hand out of the wall since its last rest
 _LAST_SLAVE_POSE, _SLAVE_DISPLACEMENT = _layout.vector(7), _layout.vector(6)
-# Work on the hand since it last rested; withheld share of the wrench.
+# Work on the hand since its last rest; withheld share of the wrench.
 _WORK_ON_HAND_SINCE_REST, _WITHHELD_WRENCH_SHARE = _layout.vector(2), _layout.vector(2)
 _IS_DRAG_ACTIVE = _layout.vector(2)
 _HAND_MOTION_IN_DEADBAND, _HAND_STEP_BEYOND_DEADBAND = _layout.vector(6), _layout.vector(6)
-# Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
+# Number of the newest packet; 1 while the wrench cross-fades; wrench before the energy limit.
 _LAST_RECEIVED_PACKET_NUMBER, _IS_WRENCH_CROSS_FADING = _layout.number(), _layout.vector(2)
 _LAST_UNLIMITED_WRENCH = _layout.vector(6)
 
@@ -105,7 +102,7 @@ class LedgerConfig:
 
 
 def initialize(p: Array, memory: Array) -> None:
-    """Write half of the initial energy, and the servo model's pose, into one end's memory."""
+    """Store half of E_0, and the command as the servo model's pose, in one end's memory."""
     memory[slots.STORED_ENERGY] = p[shared.INITIAL_LEDGER_ENERGY] / 2.0
     memory[shared.SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
 
@@ -167,7 +164,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _store_hand_step_beyond_deadband(dx, p, memory):
-    """Write the hand's displacement beyond the dead band into memory (docs/theory.md, M2)."""
+    """Store the hand's displacement beyond the encoder dead band (docs/theory.md, M2)."""
     lost, steady = memory[_HAND_MOTION_IN_DEADBAND], memory[_HAND_STEP_BEYOND_DEADBAND]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
@@ -193,7 +190,7 @@ def _update_hand_group_ledger(g, dx, in_contact, p, memory):
 
 @njit(cache=True)
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
-    """Write the predicted contact wrench (docs/theory.md, M2, M3) into `wrench`.
+    """Write the contact wrench predicted for the hand's pose (docs/theory.md, M2, M3) to `wrench`.
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
@@ -274,9 +271,10 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 @njit(cache=True)
 def _render_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the wall's friction, as rendered to the hand, into `wrench` (6,), docs/theory.md (T68).
+    """Write the friction to render at the hand into `wrench` (6,), docs/theory.md (T68).
 
-    It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
+    It is modelled friction at the hand plus (measured - modelled) friction at the slave. `size` and
+    `force` are normal forces at slave and hand [N].
     """
     near, far = memory[_MODEL_FRICTION_AT_HAND], memory[_MODEL_FRICTION_AT_SLAVE]
     rest, normal = memory[_UNMODELLED_FRICTION], memory[shared.CONTACT_DIRECTION]

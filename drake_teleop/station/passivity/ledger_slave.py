@@ -1,7 +1,4 @@
-"""Slave's end of the passivity method "ledger", steps S1 to S6.
-
-docs/theory.md, "The energy ledger", has the equations of these steps.
-"""
+"""Slave's end of method "ledger": steps S1 to S6 of docs/theory.md, "The energy ledger"."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ UNUSED_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never used
 RESERVE_SHARE_AT_MASTER = 0.7  #: of the slave's reserve, which the master may hold in contact
 _MIN_KEPT_SLAVE_RESERVE_SHARE = 0.05
 _SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1.05
-_MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # over the reserve
+_MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # in multiples of the reserve
 _SLAVE_MEASUREMENT_FILTER_S = 3e-3
 _SLAVE_REST_SPEED = 0.05  # m/s
 _ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 5.0, 50.0  # 1/s
@@ -47,16 +44,16 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-_indices = range(fields.METHOD_INTEGRAL.start, fields.METHOD_INTEGRAL.stop)
+_indices = range(fields.METHOD_VALUES.start, fields.METHOD_VALUES.stop)
 PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _indices[:3]
-NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _indices[-1], fields.SECOND_ENERGY_COUNTER
+NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _indices[-1], fields.SENDER_ENERGY
 
 # Parameters, in the master's power units.
 _layout = slots.own_parameters()
 INITIAL_LEDGER_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
 DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
-# Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
+# Memory. Filtered velocity; 1 in contact; mean contact wrench and its direction; servo model.
 _layout = slots.own_memory()
 FILTERED_OWN_VELOCITY, IN_CONTACT_FLAG = _layout.vector(6), _layout.number()
 MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
@@ -96,13 +93,13 @@ def is_in_contact(wrench, p):
 
 @njit(cache=True)
 def wrench_component_along(a, b, p):
-    """Return the component of the wrench `a` (6,) along the unit wrench `b` (6,) [N]."""
+    """Return the component [N] of wrench `a` (6,) along unit wrench `b` (6,) in `WRENCH_METRIC`."""
     return p[WRENCH_METRIC][0] * dot_of_group(a, b, 0) + p[WRENCH_METRIC][1] * dot_of_group(a, b, 1)
 
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return wrench (6,) times displacement (6,): work [J]; a length [m] for unit wrenches."""
+    """Return wrench (6,) times displacement (6,): work [J], or a length [m] for a unit wrench."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 
@@ -355,7 +352,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_command_to_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) towards `pose` until the motors' energy suffices; return if moved."""
+    """Move the command (7,) towards `pose` until the motor energy suffices; return if moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     fields.pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
