@@ -208,7 +208,7 @@ class ForceScaling(LeafSystem):
     """Block that scales contact wrench and load wrench, and transforms their sum to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj), with contact wrench F_c, regressor V;
-    phi_gr is `config.gripper_phi`, or if null the whole estimate; phi_obj is the estimate minus phi_gr.
+    phi_gr is `config.gripper_phi` (null: the whole estimate), phi_obj the estimate minus phi_gr.
 
     .. pydrake_system::
 
