@@ -105,12 +105,12 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 
 
 def slave_wrench_power_scale(scenario: Scenario) -> Array:
-    """Return factors (2,), for force and torque, from slave wrench to the master's power units."""
+    """Return factors (2,) from slave wrench to master's power units (T29): force, torque."""
     scales = scenario.kinematic_scaling.scales
     return _rendered_force_per_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
 def _rendered_force_per_contact_force(scenario: Scenario) -> float:
-    """Return rendered over measured contact force: force_scale times gamma (1 if gamma is 0)."""
+    """Return rendered over measured contact force: force_scale times gamma, with 1 for gamma 0."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

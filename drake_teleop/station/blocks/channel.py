@@ -30,7 +30,7 @@ class NetworkChannel(SteppedBlock):
         - packet: (N,) numbers to send
         output_ports:
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
-        - arriving: (N + 1,) `received` one period later; with direct feedthrough
+        - arriving: (N + 1,) value of `received` in the next period; direct feedthrough
 
     Connect `arriving` to a block with the same period and without direct feedthrough.
 

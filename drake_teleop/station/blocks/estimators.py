@@ -1,4 +1,4 @@
-"""Blocks of load estimator and contact detector with one input port per wrist-sensor signal."""
+"""Blocks of load estimator and contact detector with one input port per sensor signal."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def _zero_vector_of_type(T: Any, size: int) -> Any:
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
     class NonContactWrenchT(LeafSystem_[T]):
-        """Block that outputs the wrench V phi of a load's weight and inertia (Eq. (12)).
+        """Block that outputs the wrench V phi of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
 
@@ -48,7 +48,7 @@ def NonContactWrench_(T: Any) -> Any:
             - non_contact_wrench_S: (6,) wrench on the load [N, N m]
 
         Args:
-            phi: (10,) inertial parameters of the load about So, in S; a numeric parameter of Drake.
+            phi: (10,) inertial parameters of the load about So, in S; a numeric parameter.
         """
 
         __slots__ = NO_EXTRA_SLOTS

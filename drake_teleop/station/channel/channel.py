@@ -237,9 +237,9 @@ def step_slave_end(
 
 @njit(cache=True)
 def _update_pose_and_twist(pose, before, T, dx, twist):
-    """Write pose change `dx` (6,) and twist (6,), 0 if this or the last `pose` (7,) is not finite.
+    """Write pose change `dx` (6,) and twist (6,), 0 if this or the last `pose` (7,) is invalid.
 
-    Return whether `pose` is finite.
+    Return whether `pose` is valid.
     """
     valid = are_valid_port_values(pose)
     if valid:

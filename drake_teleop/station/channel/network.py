@@ -115,8 +115,8 @@ def network_parameters(
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
         min_steps: smallest delay of a packet [steps].
-        delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace; after
-            packet M it is repeated.
+        delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
+            repeated after its end.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
@@ -311,7 +311,7 @@ def packet_delay_steps(p, num_steps):
 def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return, for each step, the send step of the newest packet received, (steps,); -1: none."""
+    """Return the send step of the newest received packet at each step, (steps,); -1: none."""
     p = network_parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_STEPS])
     for travel in packet_delay_steps(p, steps).T:

@@ -17,7 +17,7 @@ _DAMPING_RIDGE_SHARE = 0.05
 def update_contact_fit(sums, force_change, displacement, speed_change, kept_weight):
     """Add one displacement [m] to the fit; return stiffness [N/m] and damping [N s/m], both >= 0.
 
-    Before, the old `sums` (NUM_CONTACT_FIT_SUMS,) are multiplied by `kept_weight`, 0 to 1.
+    First, `sums` (NUM_CONTACT_FIT_SUMS,) are multiplied by `kept_weight`, 0 to 1.
     """
     for i in range(NUM_CONTACT_FIT_SUMS):
         sums[i] *= kept_weight

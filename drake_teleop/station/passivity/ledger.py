@@ -75,10 +75,10 @@ class LedgerConfig:
     )  # fmt: skip
     reserve: list[float] = quantity(
         [0.1, 0.01], "J", 1e-9, 1e3,
-        "reserve of the slave: scaled kinetic energy of its fastest motion",
+        "energy reserve of the slave: scaled kinetic energy of its fastest motion",
     )  # fmt: skip
     hand_reserve: list[float] = quantity(
-        [0.02, 1e-3], "J", 1e-9, 1e3, "reserve of the master, to push the hand back"
+        [0.02, 1e-3], "J", 1e-9, 1e3, "energy reserve of the master, to push the hand"
     )
     drag: list[float] = quantity(
         [0.28, 5e-3], "N, N m", 0.0, 10.0, "drag on the hand until both reserves are full"
@@ -102,7 +102,7 @@ class LedgerConfig:
 
 
 def initialize(p: Array, memory: Array) -> None:
-    """Store half of E_0, and the command as the servo model's pose, in one end's memory."""
+    """Store half the initial energy, and the command as servo-model pose, in one end's memory."""
     memory[slots.STORED_ENERGY] = p[shared.INITIAL_LEDGER_ENERGY] / 2.0
     memory[shared.SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
 

@@ -352,7 +352,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_command_to_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) towards `pose` until the motor energy suffices; return if moved."""
+    """Move the command (7,) towards `pose` until the motor energy suffices; return if it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     fields.pose_difference_into(command, pose, motor_wrench)
     for g in range(2):

@@ -36,7 +36,7 @@ _LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
 
 
 def initial_master_monitor(device_limits: Array | None = None) -> Array:
-    """Return the state (MASTER_MONITOR_SIZE,) of the master's silence monitor: a silent master.
+    """Return the silence monitor's state (MASTER_MONITOR_SIZE,) of a silent master.
 
     With `device_limits` (2,), the device's largest force and torque [N, N m], return the state in
     normal operation instead.
@@ -51,7 +51,7 @@ def initial_master_monitor(device_limits: Array | None = None) -> Array:
 
 
 def initial_slave_monitor(pose: Array) -> Array:
-    """Return the state (SLAVE_MONITOR_SIZE,) of the monitor: a slave at rest at `pose` (7,)."""
+    """Return the silence monitor's state (SLAVE_MONITOR_SIZE,) of a slave at rest at `pose`."""
     state = np.zeros(SLAVE_MONITOR_SIZE)
     state[SILENCE_TIME] = np.inf
     state[_COMMAND_AT_STOP_START] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
@@ -71,7 +71,7 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
     """Write `limits` (2,) of rendered force and torque; during silence they fall to zero.
 
     `healthy`: a new packet of a healthy sender came. `fault`: an end is not healthy. `timeout` [s]:
-    longest time without packets. `displayed` (6,): last displayed wrench. `state`: updated.
+    longest time without packets. `displayed` (6,): last displayed wrench. `state` is updated.
     """
     _update_silence_time(healthy, fault, T, state)
     connected = state[SILENCE_TIME] <= timeout
@@ -93,7 +93,7 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
 
 @njit(cache=True)
 def slave_command_into(healthy, fault, T, timeout, requested, state, command):
-    """Write the slave's command X_WS (7,): `requested`, or during silence a brake to standstill.
+    """Write the slave's command X_WS (7,): `requested`, or during silence a braking motion.
 
     `requested` (7,) is the passivity method's command. Other arguments are those of
     `master_wrench_limits_into`.
@@ -132,10 +132,10 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
 
 @njit(cache=True)
 def fade_retreat_wrench(twist, T, p, memory, wrench):
-    """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow; store it.
+    """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow.
 
-    It falls to 0 for hand speeds along the wrench from `RETREAT_SPEED` to twice this, but not below
-    `SLAVE_MASS` times the hand's deceleration.
+    It falls to 0 for hand speeds along it from `RETREAT_SPEED` to twice this, but not below
+    `SLAVE_MASS` times the hand's deceleration. `memory` stores it.
     """
     velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):

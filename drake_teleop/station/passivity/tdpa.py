@@ -68,7 +68,7 @@ class TdpaConfig:
     )  # fmt: skip
     speed: list[float] = quantity(
         [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
-        "largest speed of the slave's command; its kinetic energy may be created at an impact",
+        "largest speed of the slave's command; an impact may create its kinetic energy",
     )  # fmt: skip
     reserve: list[float] = quantity(
         [2e-3, 1e-4], "J", 0.0, 1e3, "energy from the hand that the master keeps"

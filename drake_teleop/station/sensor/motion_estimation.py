@@ -258,7 +258,7 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
     """Convert true values to a sample by sensor chain and motion estimator.
 
     Implausible values flag the last sample instead. `sensor` is (constants of the chain, constants
-    of the estimator, ideal). Others: `read_sensor_into`, `estimate_sample_into`.
+    of the estimator, ideal). Others: see `read_sensor_into`.
     """
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX

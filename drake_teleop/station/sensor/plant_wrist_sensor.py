@@ -324,7 +324,7 @@ def _weld_properties(
     """Return reaction index and body index (body B of S) in the plant's ports, and geometry.
 
     The geometry is p_BoSo_B, R_BS, R_SJc (Jc: frame of the reaction), p_SoJc_S, gravity in W, and
-    the sign of the reaction on the load.
+    the sign from the reaction to the load's wrench.
     """
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:

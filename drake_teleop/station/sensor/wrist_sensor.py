@@ -162,6 +162,7 @@ def take_due_samples(
         applied_W: (6,) additional wrench on the tool.
         memory: [last two samples (16 + n each) | sensor chain | motion estimator | `tail`:
             number of samples, number of queued steps, time and state of each queued step's end].
+        until_now: True to include a sample at `time`.
         touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
             calculate it with `physics`.
         result: written: [last sample before now (16 + n) | its time [s] | memory].
@@ -235,7 +236,7 @@ class WristSensor(LeafSystem):
         input_ports:
         - slave_state: state [q; v] of the arm
         - joint_torque: (n,) present torque of the motors [N m]
-        - torque_rate: (n,) rate of joint_torque [N m/s] (only with argument `ramps`)
+        - torque_rate: (n,) rate of joint_torque [N m/s] (only with `ramps`)
         - slave_acceleration: (n,) vdot of the arm, to detect forces that no input contains
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
