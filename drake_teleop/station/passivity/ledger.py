@@ -31,7 +31,7 @@ _MAX_WALL_FORCE_N = 10.0
 _MAX_SAME_WALL_DISTANCE_M, _MIN_SAME_WALL_COSINE = 5e-3, 0.7
 _MAX_FORGET_WALL_DEPTH_M, _FORGET_WALL_FORCE_N, _MIN_FORGET_WALL_DEPTH_M = 3e-3, 1.0, 1e-3
 _MIN_WALL_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
-_HAND_INPUT_SENDING_RESERVE_SHARE = 0.5  # of the master's reserve
+_MIN_RESERVE_SHARE_TO_SEND_HAND_INPUT = 0.5  # of the master's reserve
 _UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_RATE = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
@@ -40,7 +40,8 @@ _MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED = 0.02  # m/s
 _FADE_TIME_AT_HAND_REST_S = 0.1
 _HAND_DEADBAND_ENCODER_STEPS = 1.1
-_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - shared.RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
+# Shares of a reserve below and above which the drag begins and ends.
+_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - shared.SLAVE_RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
 # Memory. The first places are those of `ledger_slave`, up to `CONTACT_DIRECTION`.
@@ -112,7 +113,7 @@ def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
-    left = (1.0 - shared.UNUSED_RESERVE_SHARE) * np.asarray(config.reserve)
+    left = (1.0 - shared.UNUSED_SLAVE_RESERVE_SHARE) * np.asarray(config.reserve)
     return np.sqrt(2.0 * left / (shared.SLAVE_MASS_FACTOR * mass))
 
 
@@ -147,7 +148,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _limit_wrench_to_energy_of_group(g, dx, T, p, memory, wrench)
         level = p[shared.MASTER_RESERVE][g]
         if memory[shared.IN_CONTACT_FLAG] > 0.0:
-            level += shared.RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
+            level += shared.SLAVE_RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
         surplus = max(memory[slots.STORED_ENERGY][g] - level, 0.0)
         memory[slots.SENT_ENERGY][g] += surplus
         memory[slots.STORED_ENERGY][g] -= surplus
@@ -181,7 +182,7 @@ def _store_hand_step_beyond_deadband(dx, p, memory):
 def _update_hand_group_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g), memory[slots.STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
-    sending_level = _HAND_INPUT_SENDING_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
+    sending_level = _MIN_RESERVE_SHARE_TO_SEND_HAND_INPUT * p[shared.MASTER_RESERVE][g]
     if work < 0.0 and in_contact and ledger[g] > sending_level:
         memory[slots.SENT_ENERGY][g] -= work
     else:

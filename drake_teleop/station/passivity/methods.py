@@ -73,7 +73,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _method_functions(module: Any) -> tuple[Any, Any, Any, Any]:
+def _functions_of_module(module: Any) -> tuple[Any, Any, Any, Any]:
     return module.master_step, module.slave_step, module.record_command, module.initialize
 
 
@@ -85,8 +85,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(*_method_functions(two_layer), balance_at_motors=True),
-        "pspm": PassivityMethod(*_method_functions(pspm), balance_at_motors=True),
+        "two_layer": PassivityMethod(*_functions_of_module(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_functions_of_module(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
