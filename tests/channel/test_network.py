@@ -494,7 +494,7 @@ def test_losses_add_to_those_of_a_trace(tmp_path):
     [
         ("time,dealy\n0,0.1\n", ["net.csv", "'delay'", "dealy"]),
         ("delay\n0.1\n", ["net.csv", "'time'"]),
-        ("time,delay\n0,0.1\n1,-0.1\n", ["net.csv:delay", "row 3, -0.1, is", "0 to 10 s"]),
+        ("time,delay\n0,0.1\n1,-0.1\n", ["net.csv:delay", "row 3: -0.1 is outside", "0 to 10 s"]),
         ("time,delay\n0,0.1\n1,0.1\n2,120\n", ["net.csv:delay", "row 4", "seconds"]),
         ("time,delay\n0,0.1\n1,soon\n", ["net.csv:delay", "row 3", "soon"]),
         ("time,delay\n0,inf\n", ["net.csv:delay", "row 2"]),
