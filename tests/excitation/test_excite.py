@@ -664,7 +664,7 @@ def test_model_options_require_a_model(capsys, tmp_path):
         main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
     assert (stop.value.code, capsys.readouterr().err) == (
         2,
-        "error: --payload: requires --model; add --model or remove it\n",
+        "error: --payload: requires --model; add --model or remove --payload\n",
     )
 
 
