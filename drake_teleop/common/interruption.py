@@ -20,7 +20,7 @@ _DELAYED_SIGNALS = _DelayedSignalState()
 
 
 def install_interrupt_handlers() -> None:
-    """Let SIGTERM (and SIGINT unless ignored) set INTERRUPTED_EVENT, raise KeyboardInterrupt."""
+    """Let SIGTERM, and SIGINT unless ignored, set INTERRUPTED_EVENT and raise KeyboardInterrupt."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _raise_interrupt)

@@ -364,7 +364,7 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
     fitting = replace(scenario, simulation__duration=2.4)
     with pytest.raises(DrakeTeleopError, match=r"trajectory: uses 1\d\d\.\d% of the"):
         identify_load(fitting, trajectory=short.trajectory.with_scaled_amplitudes(1.1))
-    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm 6"):
+    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm has 6"):
         less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
 

@@ -85,7 +85,7 @@ class StartPlace(NamedTuple):
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
         is_set_by_position: True if `slave.position` alone defines this start.
-        q: (n,) joint positions at the start [rad].
+        q: (n,) joint positions at the start [rad, m].
         cube_half_m: half edge of the reachable cube around the start [m].
         joint_margin: smallest distance of a joint to its limit, over half the joint's range.
         posture_score: score of the posture (`posture_scores`) minus the costs of overlaps and wall.
@@ -145,7 +145,7 @@ def find_start_place(
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
         plane: height of the base plane, below which the arm has no joints [m].
-        axis: axis of S along the tool, one of `TOOL_AXES`.
+        axis: axis of S that points down, one of `TOOL_AXES`.
     """
     table, rotation = arm.table.copy(), slice(ROTATION_COLUMN, TRANSLATION_COLUMN)
     table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ TOOL_AXES[axis].matrix()).ravel()
