@@ -407,6 +407,6 @@ def tool_frame_advice(
     what = f"the tool points along {axis}_S" if is_along_tool else f"{axis}_S points down"
     return (
         f"{what}, so the start is in slave.home and the contact point in"
-        f" slave.tip; to use position, or another direction, add{place}"
+        f" slave.tip; to use slave.position, or another direction of the tool, add{place}"
         f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame {name}"
     )
