@@ -29,7 +29,7 @@ ALL_READERS = {
     "an inner field twice": ("a: {b: {c: 1, c: 2}}", ":a.b.c: is defined twice"),
     "a number for a name": ("3: 1", "a field's name must be a word, not '3'"),
     "a flag for a name": ("true: 1", "a field's name must be a word, not 'true'"),
-    "a list for a name": ("[1, 2]: 1", "a field's name is a word"),
+    "a list for a name": ("[1, 2]: 1", "a field's name must be a word"),
     "octal": ("simulation: {duration: 010}", ":simulation.duration: '010' may be octal"),
     "400 digits": (f"a: {'9' * 400}", ":a: an integer of 400 digits is too long"),
     "an open end": ("[" * 2000, "nested too deeply"),
