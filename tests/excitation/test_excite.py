@@ -364,7 +364,7 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
     fitting = replace(scenario, simulation__duration=2.4)
     with pytest.raises(DrakeTeleopError, match=r"trajectory: uses 1\d\d\.\d% of the"):
         identify_load(fitting, trajectory=short.trajectory.with_scaled_amplitudes(1.1))
-    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm 6"):
+    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm has 6"):
         less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
 
@@ -664,7 +664,7 @@ def test_model_options_require_a_model(capsys, tmp_path):
         main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
     assert (stop.value.code, capsys.readouterr().err) == (
         2,
-        "error: --payload: requires --model; add --model or remove it\n",
+        "error: --payload: requires --model; add --model or remove --payload\n",
     )
 
 

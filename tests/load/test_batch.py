@@ -379,9 +379,9 @@ def test_result_of_each_method_is_saved_and_loaded(tmp_path):
 def test_complex_and_masked_numbers_are_refused(what):
     wrench, *motion = record(50, noise=1.0)
     other = wrench + 0j if what == "complex" else np.ma.masked_greater(wrench, 1.0)
-    with pytest.raises(DrakeTeleopError, match=rf"wrench: holds no numbers \({what}\)"):
+    with pytest.raises(DrakeTeleopError, match=rf"wrench: contains no real numbers \({what}\)"):
         identify_batch(other, *motion)
-    with pytest.raises(DrakeTeleopError, match=rf"t: holds no numbers \({what}\)"):
+    with pytest.raises(DrakeTeleopError, match=rf"t: contains no real numbers \({what}\)"):
         SimulationResult(other[:, 0], {}, [])
     kept = identify_batch(np.ma.array(wrench), *motion)  # no element is masked
     np.testing.assert_array_equal(
