@@ -51,7 +51,7 @@ class DeviceGuard:
     def limit_wrench(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
-        """Return the displayed wrench (6,); `age` of the command, `period` between calls [s]."""
+        """Return `wrench` (6,) after all limits; `age` of the command, `period` of calls [s]."""
         x = np.array(position, dtype=float)
         motion = np.zeros(3) if self._position is None else x - self._position
         work = -float(self._force @ motion)

@@ -1,4 +1,4 @@
-"""Hand of a live session: simulated, on a smooth path to the newest target, or at a real device."""
+"""Hand of a live session: simulated, or at a real device."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 
 @njit(cache=True)
 def _intended_motion_into(path, time, pose, out):
-    """Write intended X_BE (7,), twist (6,), acceleration (3,) of a smooth path to the target."""
+    """Write intended X_BE (7,), twist (6,), acceleration (3,) on the path at a time to `out`."""
     if path[_IS_HELD_INDEX] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
@@ -133,7 +133,7 @@ def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, 
 
 
 class LiveHand(operator.Operator):
-    """Hand of an operator that follows external targets.
+    """Simulated hand of an operator, on smooth paths to the targets of `SetTarget`.
 
     .. pydrake_system::
 
@@ -170,7 +170,7 @@ class LiveHand(operator.Operator):
     def KeepWrench(
         self, context: Context, before: operator.HandImpedance, after: operator.HandImpedance
     ) -> None:
-        """Shift the intended motion so that the new impedance causes no step of the wrench."""
+        """Shift the intended motion so that changing the impedance causes no step of the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_IS_HELD_INDEX] < 0.5:
             return
@@ -210,7 +210,7 @@ class LiveHand(operator.Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the master side with a `LiveHand`; `cross_fade`: with a block `CrossFade`."""
+    """Return the master side with a `LiveHand` and, if `cross_fade`, a block `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

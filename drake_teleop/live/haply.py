@@ -1,4 +1,4 @@
-"""Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
+"""Client of a Haply Inverse3, through the websocket of Haply's Inverse Service 3.
 
 Tested only with a virtual service, not with the device.
 """
@@ -20,7 +20,7 @@ _GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_v
 
 
 def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
-    """Return the device's name and its state in its base frame B, or None without a valid pose."""
+    """Return device name and state, in the device's base frame B; None without a valid pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:

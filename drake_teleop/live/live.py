@@ -51,11 +51,11 @@ _SCHEDULE_STATISTICS_SLICES = 400  # slices
 
 
 class SliceSchedule:
-    """Schedule of the simulation slices of `slice_s` simulated seconds; times `now` in s.
+    """Schedule of slices of `slice_s` simulated seconds; `now`: clock time [s].
 
     Attributes:
         slowdown: clock time per simulated time; 1: real time.
-        lost_time_s: lost time that is not caught up [s].
+        lost_time_s: total lateness that was not caught up [s].
     """
 
     def __init__(self, slice_s: float, now: float) -> None:
@@ -83,7 +83,7 @@ class SliceSchedule:
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated over clock time of the last slices, at most 400; 0 before the second one."""
+        """Ratio of simulated to clock time of the last 400 slices; 0 before the second one."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
@@ -95,7 +95,7 @@ class SliceSchedule:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, which would delay slices."""
+    """Disable Python's garbage collector, which would delay slices, in a `with` block."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -107,7 +107,7 @@ def without_garbage_collection() -> Iterator[None]:
 
 
 class Live:
-    """Event handler of a live session: messages of pages and ticks of a clock; times `now` in s.
+    """Event handler of a live session for messages and clock ticks; `now`: clock time [s].
 
     Attributes:
         refused: number of invalid messages.
@@ -116,7 +116,7 @@ class Live:
         recorded: folders of completed records.
 
     Args:
-        record: folder of the record; if not empty, the next free one; None: no record.
+        record: folder of the record (NAME-2 ... if it is not empty); None: no record.
         show: function that returns the 3D scene's part of a frame.
         link: link to a haptic device; None: the page moves the hand.
     """
@@ -263,7 +263,7 @@ class Live:
         return max(0.0, due)
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate at most four due slices of time; return a frame for the pages if one is due."""
+        """Simulate the due slices, at most four; return a frame for the pages if one is due."""
         for _ in range(_MAX_SLICES_PER_TICK):
             now = clock()
             if self.is_halted or self.pace.time_to_next_slice(now) > 0:
@@ -391,7 +391,7 @@ def _unused_folder_path(folder: Path) -> Path:
 
 
 def parse_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a message of either page, or None."""
+    """Return the valid requests in a message of a page, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:

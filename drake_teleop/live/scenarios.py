@@ -57,7 +57,7 @@ def with_task_space_device(scenario: Scenario) -> Scenario:
 
 
 def scenario_of_scene(name: str, user_scenario: Scenario) -> Scenario:
-    """Return the scenario of a scene in `SCENE_NAMES`; "own" is that of the user."""
+    """Return the scenario of a scene in `SCENE_NAMES`; "own" is `user_scenario`."""
     if name == "own":
         return user_scenario
     scenario = LoadScenario(_SHIPPED_SCENES[name])
@@ -71,7 +71,7 @@ def scenario_of_scene(name: str, user_scenario: Scenario) -> Scenario:
 def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
     """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`.
 
-    Contact detection requires the noise floor of `load`, which belongs to the scenario's sensor.
+    Contact detection is off if `load` has no noise floor or the inputs select another sensor.
     """
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {"passivity__method": method}
@@ -114,7 +114,7 @@ def _payload_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenario) -> Array | None:
-    """Return the estimate (16,) of `load` for `before`, adapted to payload, sensor of `after`."""
+    """Return the estimate (16,) of `load`, corrected for payload and sensor offset of `after`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
@@ -130,7 +130,7 @@ def _wrist_sensor_offset(scenario: Scenario) -> Array:
 
 
 def channel_fill_time_s(scenario: Scenario) -> float:
-    """Return the longest round trip of a new channel plus its time to resume [s]; 0: no channel."""
+    """Return the time [s] in which a new channel delivers packets and resumes; 0: no channel."""
     if scenario.has_no_network_or_passivity:
         return 0.0
     return RESUME_TIME_S + sum(map(longest_delay, scenario.channel.networks_of_directions()))

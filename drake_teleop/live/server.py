@@ -331,7 +331,7 @@ def _identify_load(scenario: Scenario, progress: bool | StartStage) -> Identifie
 
 
 def compile_slice_functions(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile the functions of the first simulation slices, which takes a minute once."""
+    """Compile the functions of the first simulation slices, which takes a minute."""
     session, cockpit = Session(scenario, load, device=device), PageValueCalculator(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.page_values(session.new_rows(), session.inputs)

@@ -59,7 +59,7 @@ _NO_EVENT_STATUS = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Integrate in steps of `shortest` [s] for 4 ms after a step is rejected."""
+    """Let the integrator use steps of `shortest` [s] for 4 ms after each rejected step."""
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
     shortest = min(shortest, longest)
@@ -87,7 +87,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log with signals that some stations lack: commands as received, else zeros."""
+    """Return the log with missing signals added: pose_received = pose_command, others zero."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -138,9 +138,9 @@ class _Station:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
     def take_over_state(self, replaced: _Station, new_channel: bool) -> float:
-        """Take over the replaced station's state and fade to this station's force.
+        """Copy the replaced station's state; cross-fade from its force to that of this one.
 
-        With a new channel, open the clutch and return how long it must stay open [s]; else 0.
+        Return the time [s] for which the clutch stays open: 0 without a new channel.
         """
         excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
@@ -208,7 +208,7 @@ class Session:
         self._station.simulator.Initialize()
 
     def apply_inputs(self, inputs: Inputs) -> None:
-        """Set and record the inputs from now on; a changed choice replaces the station."""
+        """Apply and record the inputs; a change of `station_choices` replaces the station."""
         before = self.inputs
         if inputs == before:
             return
@@ -278,7 +278,7 @@ class Session:
         return rows
 
     def contact_force(self) -> float:
-        """Return the last contact force at the hand's scale [N]; 0 if unknown."""
+        """Return the last contact force times the force scale [N]; 0 if unknown."""
         part, sink = self._station.columns.get("contact_wrench_S"), self._station.sink
         if part is None or not sink.num_samples():
             return 0.0
@@ -286,7 +286,7 @@ class Session:
         return self.inputs.force_scales["force_scale"] * math.sqrt(float(force @ force))
 
     def inputs_at_stylus(self) -> Inputs:
-        """Return the inputs of a hand that takes the stylus at its present pose."""
+        """Return the inputs of a hand that holds the stylus at its present pose."""
         return self.inputs.with_hand_at_pose(self._station.signal_value("pose_master"), self._start)
 
     def device_wrench(self) -> Array:
@@ -294,7 +294,7 @@ class Session:
         return self._station.signal_value("force_to_master")
 
     def force_above_limit(self) -> float:
-        """Return the force [N] that the force limit after a channel change removes."""
+        """Return by how much the limit after a channel change reduces the force [N]."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block_and_context("cross_fade")
@@ -344,7 +344,7 @@ class RecordedDrive:
     def repeat(
         self, progress: UpdateProgress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
-        """Simulate the session again in steps of at most `slice_ms`; return the same log."""
+        """Simulate the session again, in slices of at most `slice_ms`; return its log."""
         session = Session(self.scenario, self.load, log=log, device=self.device)
         end = self.changes[-1][0]
         for ms, inputs in self.changes:

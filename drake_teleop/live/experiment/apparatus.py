@@ -32,10 +32,10 @@ def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task and condition.
+    """Station of a task under a condition; `base`: scenario of the task without the condition.
 
-    `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1,
-    `base` the scenario of the task.
+    `load_mass_at_hand` [kg] is the mass of the load (with `eta`, of the held object) that the hand
+    perceives at scale 1.
     """
 
     task: design.Task
@@ -46,9 +46,9 @@ class Apparatus:
     base: Scenario
 
     def stimulus_scales(self, level: float, contact_force: float) -> dict[str, int]:
-        """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
+        """Return the inputs sigma, sigma_object and gamma [%] that render a stimulus.
 
-        `level` is the rendered force [N] or mass [kg], `contact_force` the expected one [N].
+        `level`: rendered contact force [N] or added mass [kg]; `contact_force`: expected [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -65,9 +65,9 @@ class Apparatus:
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval with the intended level `target` (0: no stimulus).
+        """Return the result of an interval from its log `rows` and `stimulus_scales` `inputs`.
 
-        `inputs` are its `stimulus_scales`.
+        `target`: intended level; 0: no stimulus.
         """
         force = rows.largest_mean_contact_force()
         if isinstance(self.task, design.PegInSlot):
@@ -150,7 +150,7 @@ class IntervalLog:
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def largest_rendered_force_change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N] after time `after` [s].
+        """Return the largest 20 ms mean of the rendered force's change [N], from `after` [s] on.
 
         The reference is the mean force of the 0.1 s before.
         """

@@ -54,7 +54,7 @@ class _TaskFields:
 @settings
 @dataclass
 class ContactDetection(_TaskFields):
-    """Task to name the one of two intervals with rendered contact; both have contact."""
+    """Task to identify the interval (of two) with rendered contact; the tool touches in both."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -67,7 +67,7 @@ class ContactDetection(_TaskFields):
 @settings
 @dataclass
 class ApparentMass(_TaskFields):
-    """Task to name the one of two intervals with a heavier tool; it moves in both."""
+    """Task to identify the interval (of two) with the heavier tool; the hand moves in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
@@ -77,7 +77,7 @@ class ApparentMass(_TaskFields):
 @settings
 @dataclass
 class PegInSlot(_TaskFields):
-    """Insertion of the tool into a slot, with completion time and largest contact force."""
+    """Task to insert the tool into a slot; measures are time and largest contact force."""
 
     scenario: str = plain("insert", "as for other tasks, with an operator's task !Insert")
     trials: int = quantity(8, "1", 1, 1000, "number of trials of each condition")
@@ -91,7 +91,7 @@ Task: TypeAlias = ContactDetection | ApparentMass | PegInSlot
 @settings
 @dataclass
 class SimulatedParticipant:
-    """Participant of `--simulated`, who compares changes of the rendered force."""
+    """Participant of `--simulated`, who compares rendered forces of two intervals."""
 
     noise: float = quantity(0.06, "N", 1e-4, 100.0, "standard deviation at rest, at the hand")
     weber: float = quantity(0.1, "1", 0.0, 1.0, "standard deviation as a share of the response")
@@ -151,7 +151,7 @@ class Experiment:
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
-    """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
+    """Return the checked experiment of a file or shipped name, and the scenario of each task."""
     path = find_shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
     experiment = settings_without_range_check(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))

@@ -42,7 +42,7 @@ PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 class GuidedExperiment:
-    """Event handler of an experiment, with the interface of `Live`; times `now` in s.
+    """Event handler of an experiment, with the interface of `Live`; `now`: clock time [s].
 
     Each interval is a recorded live session; the page receives only the rendered force.
     """
@@ -236,7 +236,7 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests that participants may make, or None."""
+    """Return the valid requests of a message that participants may make, or None."""
     message = parse_message(text) or {}
     found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:

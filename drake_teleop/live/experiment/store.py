@@ -48,7 +48,7 @@ class TrialRow:
 
 
 def table_schema(row: type) -> dict[str, type[pl.DataType]]:
-    """Return the column types of a table whose rows have the annotated fields of a class."""
+    """Return the column types of a table whose rows are instances of the class `row`."""
     types: dict[type, type[pl.DataType]] = {int: pl.Int64, float: pl.Float64, str: pl.String}
     return {name: types[kind] for name, kind in get_type_hints(row).items()}
 

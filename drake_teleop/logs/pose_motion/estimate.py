@@ -1,4 +1,4 @@
-"""Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md)."""
+"""Load, delay and pose frame from a wrench and poses (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PoseFrame:
         R_SP: (3, 3) rotation from axes of P to those of S.
         position_stds_m: (3,) standard deviations of `p_SoPo_S` [m]; inf if undetermined.
         rotation_stds_deg: (3,) standard deviations of R_SP about the axes of S [deg].
-        is_shifted, is_rotated: whether origin, axes differ significantly from the description.
+        is_shifted, is_rotated: whether origin, axes differ significantly from the given ones.
     """
 
     p_SoPo_S: Array
@@ -87,11 +87,11 @@ class PoseEstimate(PoseMotion):
     """Load, delay and pose frame from a wrench and poses.
 
     Attributes:
-        fit: load for the given pose frame, which is estimated where None.
-        free_frame_fit: load, with the pose frame always estimated.
-        frame: pose frame of `free_frame_fit`.
+        fit: fit with the given origin and axes of the pose frame, if given.
+        free_frame_fit: fit with an estimated pose frame, `frame`.
         units_and_axes: unit of positions, axes and masses from the linear model's fit.
         t, rejected: (M,) instants [s], and True for disturbed ones.
+        note: text if no disturbance could be rejected, or "".
     """
 
     fit: RigidFit
@@ -127,9 +127,9 @@ def estimate_from_poses(
 ) -> PoseEstimate:
     """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
-    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Origin
-    `p_SoPo_S` [m], rotation `R_SP`, and delay of the poses behind the wrench [s] are estimated
-    where None. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
+    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Each of
+    `p_SoPo_S` [m], `R_SP` and the delay of the poses behind the wrench [s] is estimated if None,
+    else kept. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
     are excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():

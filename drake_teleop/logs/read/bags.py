@@ -1,7 +1,7 @@
 """ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
 Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
-(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two.
+(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp` (`header.stamp` or `received`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Topic(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a folder with metadata.yaml, or a .mcap, .db3 or .bag file."""
+    """Return whether a path is a folder with metadata.yaml, or ends in .mcap, .db3 or .bag."""
     return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in BAG_SUFFIXES
 
 

@@ -60,7 +60,7 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        estimated: those of "gravity" and "weight" that are estimated from the data.
+        estimated: "gravity", "weight", if the data determine them.
         resolution: quantization step of force and torque, for static poses [N, N m].
     """
 
@@ -162,8 +162,8 @@ def write_log(log: Log, path: str | Path) -> None:
 def describe_canonical(path: Path, table: Table) -> Description:
     """Return the description of a canonical table (columns `t`, `f_x` ...).
 
-    Rows are static poses if `t` is absent, or if they are slower than 5 Hz and gravity turns by
-    more than 10 deg in a fifth of the steps.
+    Rows with orientation or specific force are static poses unless the sensor rotates: if `t` is
+    absent, or slower than 5 Hz with rotations by more than 10 deg in a fifth of the steps.
     """
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"

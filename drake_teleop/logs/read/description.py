@@ -224,7 +224,7 @@ class Pose(_RecordedStream):
 
     @property
     def R_SP(self) -> Array | None:
-        """Rotation (3, 3) from the axes of the posed frame P to those of S; None if equal."""
+        """Rotation (3, 3) from the axes of the posed frame P to those of S; None: identity."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
                 return np.array(rotation)
@@ -320,7 +320,7 @@ class Description(StrictModel):
 
 
 def load_description(path: str | Path) -> Description:
-    """Read a log description; its paths are relative to its folder."""
+    """Return the log description of a YAML file, with paths joined to its folder."""
     path = Path(path)
     if not os.path.exists(path):
         raise DrakeTeleopError("no such log description", where=str(path), remedy="check the path")

@@ -49,7 +49,7 @@ _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are re
 
 
 def note_that_table_needs_description(source: str) -> str:
-    """Return a note on lines of a description for the log of a canonical table, otherwise ""."""
+    """Return the remark that a canonical table needs a description to set fields, else ""."""
     if Path(source).suffix.lower() not in TABLE_READERS:
         return ""
     return " (in a log description of this table; the canonical form has no such line)"
@@ -85,7 +85,7 @@ def _read_text(path: Path, header: bool = True) -> Table:
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
-    """Return the table of a CSV file, and the number of its first data line."""
+    """Return the table of a CSV file, and the line number of its first data row."""
     import polars as pl
 
     with path.open("rb") as file:
@@ -312,7 +312,7 @@ def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
 
 
 def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Move the last axis of arrays (k, N), (j, k, N) to the front if a vector has N > k numbers."""
+    """Move the last axis of arrays (k, ..., N > k) to the front if a vector has N numbers."""
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
 
     def is_turned(array: NDArray) -> bool:
