@@ -101,9 +101,9 @@ def _zeros_if_any_not_finite(a: Sequence[float]) -> Array:
     return vector if math.isfinite(vector.sum()) else np.zeros(3)
 
 
-def _limit_norm(a: Array, longest: float) -> Array:
+def _limit_norm(a: Array, max_norm: float) -> Array:
     length = math.hypot(*a)
-    return a if length <= longest else longest / length * a
+    return a if length <= max_norm else max_norm / length * a
 
 
 def _limit_slew(last: Array, requested: Array, max_change: float) -> Array:

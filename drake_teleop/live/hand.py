@@ -45,7 +45,7 @@ POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # largest slew rate [1/s].
 _WRENCH_LIMIT_FADE_S, _LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
 # Path of a device: held flag, start time [s], start pose (7,), displacement, rotation vector (3,).
-_START_POSE_INDEX, _DISPLACEMENT_INDEX, _TURN_INDEX = 2, 9, 12
+_START_POSE_INDEX, _DISPLACEMENT_INDEX, _ROTATION_VECTOR_INDEX = 2, 9, 12
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT_INDEX, _ALLOWED_SHARE_INDEX, _DISPLAY_STATE_SIZE = 6, 7, 8
 _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
@@ -221,7 +221,7 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
 @njit(cache=True)
 def _pose_and_twist_on_path_into(path, time, out):
     share = min(max((time - path[_START_TIME_INDEX]) / POSE_PERIOD_S, 0.0), 1.0)
-    r = vectors.scale_vector(share, vectors.vector_at(path, _TURN_INDEX))
+    r = vectors.scale_vector(share, vectors.vector_at(path, _ROTATION_VECTOR_INDEX))
     rotation = vectors.quaternion_product(
         vectors.quaternion_exponential(r), vectors.quaternion_at(path, _START_POSE_INDEX)
     )
@@ -231,7 +231,7 @@ def _pose_and_twist_on_path_into(path, time, out):
     for k in range(3):
         out[4 + k] = path[_START_POSE_INDEX + 4 + k] + share * path[_DISPLACEMENT_INDEX + k]
         out[7 + k] = moves * path[_DISPLACEMENT_INDEX + k]
-        out[10 + k] = moves * path[_TURN_INDEX + k]
+        out[10 + k] = moves * path[_ROTATION_VECTOR_INDEX + k]
 
 
 @njit(cache=True)

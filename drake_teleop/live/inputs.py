@@ -23,9 +23,9 @@ from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
-AS_IN_SCENARIO = "as in the scenario"
-NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")
-SENSOR_NAMES = (AS_IN_SCENARIO, *SENSOR_PRESETS)
+AS_IN_SCENARIO_NAME = "as in the scenario"
+NETWORKS = (AS_IN_SCENARIO_NAME, *NETWORK_PRESETS, "custom")
+SENSOR_NAMES = (AS_IN_SCENARIO_NAME, *SENSOR_PRESETS)
 
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
@@ -218,7 +218,7 @@ def read_inputs(
     recorded = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
         if recorded.get(name) != value:
-            what = f"was recorded with {name} {recorded.get(name, 'unknown')}, and this is {value}"
+            what = f"was recorded with {name} {recorded.get(name, 'unknown')}, not with {value}"
             changed = "the models or other files that its scenario names have changed"
             raise _not_repeatable(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
@@ -230,7 +230,7 @@ def read_inputs(
 
 def _not_repeatable(what: str, path: Path) -> DrakeTeleopError:
     folder = shlex.quote(str(path.parent))
-    remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {folder}"
+    remedy = f"it cannot be repeated exactly; to see its log, run drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSOR_NAMES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORKS, SENSOR_NAMES, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
@@ -87,7 +87,7 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
         delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter
         loss = _LOSS_INPUT_UNIT * inputs.loss
         changes["channel"] = Channel(delay=delay, jitter=jitter, distribution="gamma", loss=loss)
-    elif name != AS_IN_SCENARIO:
+    elif name != AS_IN_SCENARIO_NAME:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSOR_NAMES[inputs.sensor]]
@@ -118,13 +118,13 @@ def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenari
     if load is None:
         return None
     estimate = load.estimate.copy()
-    estimate[:6] += _wrist_sensor_offset(after) - _wrist_sensor_offset(before)
+    estimate[:6] += _sensor_wrench_offset(after) - _sensor_wrench_offset(before)
     arms = (NominalSlave(scenario.slave).arm for scenario in (after, before))
     estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
     return estimate
 
 
-def _wrist_sensor_offset(scenario: Scenario) -> Array:
+def _sensor_wrench_offset(scenario: Scenario) -> Array:
     sensor = scenario.wrist_sensor
     return np.zeros(6) if sensor.ideal else np.array(sensor.offset)
 

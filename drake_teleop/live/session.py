@@ -69,7 +69,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
     station: Any = weakref.ref(simulator)
     rejected, until = 0, math.inf
 
-    def set_step_mode(context: Context) -> EventStatus:
+    def select_step_mode(context: Context) -> EventStatus:
         nonlocal rejected, until
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
@@ -83,7 +83,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
             integrator.set_fixed_step_mode(False)
         return _NO_EVENT_STATUS
 
-    simulator.set_monitor(set_step_mode)
+    simulator.set_monitor(select_step_mode)
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
@@ -195,7 +195,7 @@ class Session:
         self.scenario, self._load, self._device = scenario, load, device
         self.inputs, self.ms = Inputs.from_scenario(scenario), 0
         self._start = np.array(scenario.master.position)
-        self._station_count, self._rows_read, self._filled_at_ms = 1, 0, 0
+        self._station_count, self._rows_read, self._channel_filled_at_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
         self._station = _Station(scenario, estimate, load, 0, device=device)
         self._record: SessionRecord | None = None
@@ -219,7 +219,7 @@ class Session:
             hand, context = self._station.block_and_context("live_hand")
             hand.SetTarget(context, inputs.intended_pose(self._start))
         if inputs.clutch != before.clutch or inputs.station_choices != before.station_choices:
-            self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
+            self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._channel_filled_at_ms)
         if inputs.force_scales != before.force_scales:
             scaling, context = self._station.block_and_context("force_scaling")
             scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_S)
@@ -234,7 +234,7 @@ class Session:
         has_new_channel = inputs.channel_choices != self.inputs.channel_choices
         wait_s = station.take_over_state(self._station, has_new_channel)
         if wait_s:
-            self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
+            self._channel_filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
             self._on_disk.write_and_clear_rows()
             self._on_disk.switch_simulator(station.simulator)
@@ -247,12 +247,12 @@ class Session:
     @property
     def is_channel_filling(self) -> bool:
         """Whether the clutch is open until a new channel delivers packets."""
-        return self.ms < self._filled_at_ms
+        return self.ms < self._channel_filled_at_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
         end = self.ms + ms
-        if self.ms < self._filled_at_ms <= end:
-            self._advance_to(self._filled_at_ms)
+        if self.ms < self._channel_filled_at_ms <= end:
+            self._advance_to(self._channel_filled_at_ms)
             self._station.set_clutch(bool(self.inputs.clutch))
         self._advance_to(end)
         if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _ROWS_PER_LOG_PART:

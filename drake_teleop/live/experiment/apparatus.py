@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment import design
 from drake_teleop.live.experiment.procedure import IntervalResult
-from drake_teleop.live.inputs import AS_IN_SCENARIO, INPUT_RANGES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, INPUT_RANGES, Inputs
 from drake_teleop.live.scenarios import adapt_estimate, live_scenario, scenario_of_inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
@@ -88,9 +88,9 @@ def make_apparatus(
     changes: dict[str, object] = {}
     if condition.delay is not None:
         changes["channel"] = Channel(delay=condition.delay)
-    elif condition.network != AS_IN_SCENARIO:
+    elif condition.network != AS_IN_SCENARIO_NAME:
         changes["channel"] = Channel(network=condition.network)
-    if condition.method != AS_IN_SCENARIO:
+    if condition.method != AS_IN_SCENARIO_NAME:
         changes["passivity__method"] = condition.method
     setup = replace(setup, contact_detection=None, **changes)
     mass = NominalSlave(setup.slave).arm.phi_load[0]

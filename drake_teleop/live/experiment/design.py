@@ -7,7 +7,7 @@ from typing import NoReturn, TypeAlias
 from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORKS
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import (
@@ -34,12 +34,12 @@ class Condition:
         None, "1", 0.0, 1.0, "rendered share of a held object, with sigma = 0"
     )
     network: str = choice(
-        AS_IN_SCENARIO,
+        AS_IN_SCENARIO_NAME,
         tuple(name for name in NETWORKS if name != "custom"),
         "network between master and slave",
     )
     delay: float | None = quantity(None, "s", 0.0, 2.0, "delay of one way, in place of a network")
-    method: str = choice(AS_IN_SCENARIO, (AS_IN_SCENARIO,), "passivity method", METHODS)
+    method: str = choice(AS_IN_SCENARIO_NAME, (AS_IN_SCENARIO_NAME,), "passivity method", METHODS)
 
 
 @dataclass
@@ -145,7 +145,7 @@ class Experiment:
                 fail(f"{place}.name", what, "give each condition its own name")
             if condition.eta is not None and condition.sigma != 0.0:
                 fail(f"{place}.eta", "cannot be combined with sigma > 0", "set sigma: 0")
-            if condition.delay is not None and condition.network != AS_IN_SCENARIO:
+            if condition.delay is not None and condition.network != AS_IN_SCENARIO_NAME:
                 what = f"cannot be combined with network {condition.network!r}"
                 fail(f"{place}.delay", what, "remove delay or network")
 
@@ -170,5 +170,5 @@ def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
         raise DrakeTeleopError(f"{task.scenario} has no slot", where=place, remedy=remedy)
     if isinstance(task, ContactDetection) and scenario.surroundings is None:
         what = f"{task.scenario} has no object to touch"
-        raise DrakeTeleopError(what, where=place, remedy="use one such as touch")
+        raise DrakeTeleopError(what, where=place, remedy="use a scenario such as touch")
     return scenario

@@ -35,7 +35,7 @@ _SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_BLANK_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
+_HIDDEN_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
 
 #: Names of the inputs that move the hand.
 PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
@@ -218,7 +218,7 @@ class GuidedExperiment:
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
-            **_BLANK_FRAME_VALUES,
+            **_HIDDEN_FRAME_VALUES,
             "f": [rendered] * 3,
             "scene": "own",
             "state": "stopped" if inner["stopped"] else "running",

@@ -73,13 +73,13 @@ class TrialStore:
         path = self.participant_file(participant)
         if not path.exists():
             return []
-        remedy = "remove it; the participant then starts again"
+        remedy = "remove this file; the participant then starts again"
         with wrap_read_errors(path, remedy):
             table = pl.read_csv(path, schema=_TRIAL_SCHEMA)
         rows = [TrialRow(**row) for row in table.iter_rows(named=True)]
         gaps = [index for index, row in enumerate(rows) if row.trial != index]
         if gaps or table.null_count().sum_horizontal()[0]:
-            what = f"row {gaps[0]} is of another trial" if gaps else "lacks values"
+            what = f"row {gaps[0]} is not that of trial {gaps[0]}" if gaps else "has empty cells"
             raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         return rows
 

@@ -34,7 +34,7 @@ _KINEMATIC_COLUMNS = {
     "position": POSITION_COLUMNS,
 }
 _MAX_REST_SPEED_RAD_S = 0.05  # rad/s
-_MIN_TURN_BETWEEN_POSES_RAD = np.radians(10.0)
+_MIN_ROTATION_BETWEEN_POSES_RAD = np.radians(10.0)
 _VECTOR_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration", "gravity")
 _ROW_SHAPE_OF_FIELD: dict[str, tuple[int, ...]] = {"t": (), "wrench": (6,)}
 _ROW_SHAPE_OF_FIELD |= dict.fromkeys(_VECTOR_FIELDS, (3,)) | {"bridged": (), "R_WS": (3, 3)}
@@ -223,4 +223,4 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         vertical = table.finite_numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
     turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _MIN_TURN_BETWEEN_POSES_RAD)
+    return bool(np.quantile(turned, 0.8) > _MIN_ROTATION_BETWEEN_POSES_RAD)

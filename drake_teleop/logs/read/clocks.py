@@ -88,7 +88,7 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
     """
     if time.column is None:
         assert time.rate is not None
-        rows = _row_numbers_without_other_streams(table)
+        rows = _row_numbers_excluding_other_streams(table)
         spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
         return rows / spacing / time.rate, 1
     whole = table.whole_table or table
@@ -108,7 +108,7 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
     return (t if table.kept_rows is None else t[table.kept_rows]), episodes
 
 
-def _row_numbers_without_other_streams(table: Table) -> NDArray[np.intp]:
+def _row_numbers_excluding_other_streams(table: Table) -> NDArray[np.intp]:
     whole, kept = table.whole_table, table.kept_rows
     if whole is None or kept is None:
         return np.arange(table.rows)

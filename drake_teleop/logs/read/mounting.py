@@ -346,7 +346,7 @@ def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mountin
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
-        R_SI=_rotated_about_fixed_axes(R, x[:3]),
+        R_SI=_rotate_about_fixed_axes(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
         mid_record_lag_s=float(x[3]),
         mid_record_time_s=centre,
@@ -367,7 +367,7 @@ def _refine_mounting(
 
     def pose_residual(x: Array) -> Array:
         resampled = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3)
-        rotated = resampled @ _rotated_about_fixed_axes(R, x[:3]).T
+        rotated = resampled @ _rotate_about_fixed_axes(R, x[:3]).T
         left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
         return left.reshape(len(t), -1) + x[7:]
@@ -389,7 +389,7 @@ def _kabsch_rotation_and_is_mirrored(x: Array, y: Array) -> tuple[Array, bool]:
     return R, bool(reflected < 0.25 * direct and reflected < 0.05)
 
 
-def _rotated_about_fixed_axes(R: Array, vector: Array) -> Array:
+def _rotate_about_fixed_axes(R: Array, vector: Array) -> Array:
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 

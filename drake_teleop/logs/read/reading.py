@@ -129,14 +129,14 @@ class _LogReader:
             return log
         without = stream.model_copy(update={"weight": None})
         other = self.description.model_copy(update={"wrench": without})
-        return restore_removed_weight(log, np.array(weight), self._read_edited_log(other))
+        return restore_removed_weight(log, np.array(weight), self._read_log_with(other))
 
     def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
-        read = partial(self._read_edited_log, differentiate=differentiate)
+        read = partial(self._read_log_with, differentiate=differentiate)
         self.description, notes = describe(self.description, self.source, read)
         self.notes += notes
 
-    def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
+    def _read_log_with(self, description: Description, *, differentiate: bool = True) -> Log:
         for stream in self.description.streams.values():
             self._table_of_stream(stream)
         reader = _LogReader(description, self.source, 30.0, dict(self.tables))

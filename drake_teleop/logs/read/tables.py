@@ -56,11 +56,11 @@ class Table:
         if not 0 < len(rows) < self.rows:
             return self
 
-        def selected(name: str) -> NDArray:
+        def kept_part_of_column(name: str) -> NDArray:
             column = self.columns[name]
             return column[rows] if rows[-1] < len(column) else column
 
-        columns = ColumnsOnAccess(self.columns, selected)
+        columns = ColumnsOnAccess(self.columns, kept_part_of_column)
         return replace(self, columns=columns, whole_table=self, kept_rows=rows)
 
     @property
@@ -156,7 +156,7 @@ class Table:
         if bad.any():
             row = self.line_in_file(int(np.argmax(bad)))
             what = f"no finite number in {int(bad.sum())} rows, the first is row {row}"
-            remedy = "cut the log before it or repair the rows"
+            remedy = "cut the log before this row, or repair the rows"
             raise DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
         return numbers
 
