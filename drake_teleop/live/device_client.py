@@ -51,7 +51,7 @@ class HapticDevice(Protocol):
 class DeviceClient:
     """Connection of a haptic device to a station.
 
-    `force_ages_s` contains the age [s] of the position that each displayed force answers.
+    `force_ages_s`: age [s] of the position that each displayed force answers.
     """
 
     def __init__(self, device: HapticDevice, address: str, *, observe: bool = True) -> None:
@@ -67,7 +67,7 @@ class DeviceClient:
     def exchange_packets(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
-        """Send the pose; display and return the newest wrench (6,) in limits; None: no pose."""
+        """Send the pose; limit, display and return the newest wrench (6,); None without a pose."""
         pose = self._device.read()
         now = clock()
         self._receive_force_commands()

@@ -36,7 +36,7 @@ _CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 class DeviceLink:
     """UDP link to one device client on this machine; another may follow after 50 ms of silence.
 
-    The address haply://HOST:PORT starts the client itself, udp://127.0.0.1:PORT does not.
+    An address haply://HOST:PORT also starts the client, as a child process.
 
     Attributes:
         refused: number of invalid packets and packets of other senders.
@@ -120,7 +120,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return `Inputs` values of the device's motion from its origin; not held if silent."""
+        """Return `Inputs` values for the device's motion from its origin; held = 0 if silent."""
         state = self.receive_state(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}

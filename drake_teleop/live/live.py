@@ -95,7 +95,7 @@ class SliceSchedule:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, which would delay slices, in a `with` block."""
+    """Disable Python's garbage collector, which would delay slices."""
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -114,7 +114,7 @@ def _payload_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenario) -> Array | None:
-    """Return the estimate (16,) of `load`, corrected for payload and sensor offset of `after`."""
+    """Return the estimate (16,) of `load` for `before`, corrected to payload, sensor of `after`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
@@ -130,7 +130,7 @@ def _sensor_wrench_offset(scenario: Scenario) -> Array:
 
 
 def channel_fill_time_s(scenario: Scenario) -> float:
-    """Return the time [s] in which a new channel delivers packets and resumes; 0: no channel."""
+    """Return the longest round trip of the channel plus its resume time [s]; 0: no channel."""
     if scenario.has_no_network_or_passivity:
         return 0.0
     return RESUME_TIME_S + sum(map(longest_delay, scenario.channel.networks_of_directions()))

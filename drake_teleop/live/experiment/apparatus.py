@@ -48,7 +48,7 @@ class Apparatus:
     def stimulus_scales(self, level: float, contact_force: float) -> dict[str, int]:
         """Return the inputs sigma, sigma_object and gamma [%] that render a stimulus.
 
-        `level`: rendered contact force [N] or added mass [kg]; `contact_force`: expected [N].
+        `level`: rendered contact force [N] or added mass [kg]; `contact_force`: expected force [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -65,7 +65,7 @@ class Apparatus:
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval from its log `rows` and `stimulus_scales` `inputs`.
+        """Return the result of an interval from its log `rows` and its scales `inputs` [%].
 
         `target`: intended level; 0: no stimulus.
         """

@@ -77,7 +77,7 @@ class ApparentMass(_TaskFields):
 @settings
 @dataclass
 class PegInSlot(_TaskFields):
-    """Task to insert the tool into a slot; measures are time and largest contact force."""
+    """Task to insert the tool into a slot; measured: time and contact force."""
 
     scenario: str = plain("insert", "as for other tasks, with an operator's task !Insert")
     trials: int = quantity(8, "1", 1, 1000, "number of trials of each condition")

@@ -172,7 +172,6 @@ class GuidedExperiment:
 
     @property
     def ms(self) -> int:
-        """Simulated time of the present interval [ms]."""
         return self._live.ms
 
     @property

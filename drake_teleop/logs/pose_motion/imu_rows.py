@@ -34,7 +34,7 @@ class _ImuSensorModel:
 
 
 def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
-    """Return IMU data with bias, axes and clock corrected to splines; None if both disagree."""
+    """Return IMU data with bias, axes and clock corrected to splines; None if they disagree."""
     position_std, rotation_std = splines.estimate_pose_noise()
     powers = position_std**2 / splines.rate, rotation_std**2 / splines.rate
     averaged = imu.average_to_rate(_COMPARED_IMU_RATE_HZ)

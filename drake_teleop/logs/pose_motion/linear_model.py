@@ -184,7 +184,7 @@ def delay_std(spectra: Spectra) -> float:
 def guess_knot_spacing_and_delay(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return the likeliest knot distance and delay [s] on a coarse grid; not if `known`."""
+    """Return likeliest knot distance and delay [s] on a coarse grid; a `known` delay is kept."""
     found, reach = [], window.delay_search_half_range_s
     for h in _knot_spacings_for_pose_rate(cache)[::2]:
         spectra, late = window.spectra_at_delay(cache.splines_with_spacing(h), delay), delay

@@ -73,8 +73,7 @@ class ImuData:
 class PosesOfLog:
     """Poses of S in a log, with gravity (3,) in the world [m/s^2].
 
-    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are the pose of the recorded frame P in the log
-    description.
+    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are those of the log description.
     """
 
     poses: Poses

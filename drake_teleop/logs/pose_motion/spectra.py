@@ -40,7 +40,7 @@ SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
 
 @dataclass(frozen=True, eq=False)
 class WrenchGrid:
-    """Instants t (M,) of the motion signals [s], at 100 to 200 Hz, and samples of the wrench.
+    """Instants t (M,) of the motion signals [s], below 200 Hz, and samples of the wrench.
 
     `wrench` (N, 6) has `stride` samples for each instant. `known_load` (6, 16) are the
     coefficients of a known load, Eq. (T73).

@@ -51,7 +51,7 @@ class ImuSplineRows:
     def with_data_in_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
-        """Return the rows with data s, omega (K, 3) in S, transformed by the pose of `splines`."""
+        """Return the rows with acceleration, quaternion rate from data s, omega (K, 3) in S."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None

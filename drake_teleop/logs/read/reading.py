@@ -43,7 +43,7 @@ _EstimateAuto = Callable[..., auto_frames.Estimate]
 def read_log(
     path: str | Path, *, bandwidth_hz: float | None = 30.0, differentiate: bool = True
 ) -> Log:
-    """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
+    """Read a canonical table (.csv, .parquet ...) or a log description (.yaml, .yml).
 
     Signals are resampled to the wrench's clock at its median rate. Angular velocity is from the
     gyroscope, else from the orientation; angular acceleration from the file, else differentiated;

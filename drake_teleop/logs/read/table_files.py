@@ -49,7 +49,7 @@ _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are re
 
 
 def note_that_table_needs_description(source: str) -> str:
-    """Return the remark that a canonical table needs a description to set fields, else ""."""
+    """Return a remark that fields of a table need a log description; "" for other files."""
     if Path(source).suffix.lower() not in TABLE_READERS:
         return ""
     return " (in a log description of this table; the canonical form has no such line)"
@@ -312,7 +312,7 @@ def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
 
 
 def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Move the last axis of arrays (k, ..., N > k) to the front if a vector has N numbers."""
+    """Move the last axis of arrays (k, ..., N > k) to the front if vectors have N numbers."""
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
 
     def is_transposed(array: NDArray) -> bool:
