@@ -64,7 +64,7 @@ class PageValueCalculator:
             ("speed", "slave_state", slice(n, None), _WARNED_LIMIT_FRACTION * arm.velocity_limit),
             ("torque", "joint_torque", slice(None), _WARNED_LIMIT_FRACTION * arm.effort_limit),
         )
-        self._peak = scenario.master.device(0.0, 0.0).parameters.peak_force
+        self._peak_force = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
         self._last_row = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))
@@ -104,8 +104,8 @@ class PageValueCalculator:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak:
-            yield f"the device renders its largest force, {self._peak:g} N"
+        if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak_force:
+            yield f"the device renders its largest force, {self._peak_force:g} N"
         hand = np.empty(2)
         norm_range_into(rows["hand_wrench_E"], zeros, hand)
         if hand[1] > _WARNED_HAND_FORCE_N:

@@ -141,7 +141,7 @@ class Live:
         self._drives, self._paused, self.stopped = 0, False, ""
         self.recorded: list[str] = []
         self._write_error = ""
-        self._alone_since = now
+        self._idle_since = now
         self.pace = SliceSchedule(1e-3 * self._slice_ms, now)
         self._frame_due, self._last_frame_at, self._show_now = now, now, False
         self._start_session(now)
@@ -161,7 +161,7 @@ class Live:
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=device)
         self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
-        self._refusal, self._pressed = "", False
+        self._refusal, self._touched = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()
         self._last_target = self._requested.hand_pose_and_held
         self._last_frame: dict[str, Any] = {}
@@ -210,7 +210,7 @@ class Live:
     def leave(self, client: int, now: float) -> None:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
-            self._driver, self._alone_since = None, now
+            self._driver, self._idle_since = None, now
             self._requested = self._requested.with_changes({"held": 0, "clutch": 0})
             self._rates = RateInputs()
 
@@ -272,7 +272,7 @@ class Live:
             self._simulate_slice(now)
         now = clock()
         self._wake_if_device_sends(now)
-        if self._driver is None and not self._asleep and now - self._alone_since >= _MAX_UNDRIVEN_S:
+        if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
             self._stop_on_failure(self._session.write_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
@@ -287,7 +287,7 @@ class Live:
     def _wake_if_device_sends(self, now: float) -> None:
         if self._link is None or self._link.receive_state(now) is None:
             return
-        self._alone_since = now
+        self._idle_since = now
         if self._asleep:
             self._asleep = False
             self.pace.restart(now)
@@ -319,8 +319,8 @@ class Live:
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.contact_force() > MIN_DISPLAYED_TOUCH_FORCE_N
-            self._show_now |= pressed and not self._pressed
-            self._pressed = pressed
+            self._show_now |= pressed and not self._touched
+            self._touched = pressed
         if self._link is not None and not self.stopped:
             self._link.send_wrench(self._session.device_wrench())
         if self._session.ms >= live_inputs.MAX_DURATION_MS:

@@ -74,20 +74,20 @@ class MotionLimiter:
 class _AxisLimiter:
     def __init__(self, speed: float, change: float, ends: tuple[float, float]) -> None:
         self._speed, self._change, self._ends = speed, change, ends
-        self._at = self._target = self._moved = 0.0
+        self._at = self._target = self._last_change = 0.0
 
     def limit_target(self, target: float, may_jump: bool) -> float:
         last, self._target = self._target, target
         if may_jump:
-            self._at, self._moved = target, 0.0
+            self._at, self._last_change = target, 0.0
             return target
         behind = last - self._at
         speed = target - last + math.copysign(self._max_braking_speed(abs(behind)), behind)
         least, most = (self._max_braking_speed(abs(end - self._at)) for end in self._ends)
         speed = min(max(speed, -min(least, self._speed)), min(most, self._speed))
-        change = min(max(speed - self._moved, -self._change), self._change)
-        self._moved += change
-        self._at += self._moved
+        change = min(max(speed - self._last_change, -self._change), self._change)
+        self._last_change += change
+        self._at += self._last_change
         return self._at
 
     def _max_braking_speed(self, distance: float) -> float:

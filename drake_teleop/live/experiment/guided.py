@@ -60,7 +60,7 @@ class GuidedExperiment:
         self._stations, self._link = stations, link
         self._drives = procedure.store.folder / "drives" / f"{procedure.participant:02}"
         self._driver: int | None = None
-        self._intervals, self._since, self._frame_due = 0, now, now
+        self._intervals, self._phase_start, self._frame_due = 0, now, now
         self._prepare_interval(now)
 
     def _prepare_interval(self, now: float) -> None:
@@ -151,13 +151,13 @@ class GuidedExperiment:
         before = procedure.phase, procedure.trial_number
         if "answer" in message:
             with self._catch_write_error():
-                procedure.store_answer(message["answer"], now - self._since)
+                procedure.store_answer(message["answer"], now - self._phase_start)
         elif "go" in message:
             procedure.advance_phase()
         if (procedure.phase, procedure.trial_number) == before:
             return
         self._prepare_interval_if_changed(now)
-        self._since = now
+        self._phase_start = now
         if procedure.phase == INTERVAL_PHASE:
             self._live.pace.restart(now)
 
@@ -182,7 +182,7 @@ class GuidedExperiment:
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP_PHASE and now - self._since >= _INTERVAL_PAUSE_S:
+        if self._procedure.phase == GAP_PHASE and now - self._phase_start >= _INTERVAL_PAUSE_S:
             self._procedure.start_second_interval()
             self._live.pace.restart(now)
         if self._is_interval_running:
@@ -204,7 +204,7 @@ class GuidedExperiment:
         level = self._procedure.current_level
         result = self._apparatus.interval_result(level, self._stimulus, self._rows)
         self._procedure.finish_interval(dataclasses.replace(result, lost_s=live.pace.lost_time_s))
-        self._since = self._frame_due = now
+        self._phase_start = self._frame_due = now
         self._prepare_interval_if_changed(now)
 
     def frame(self) -> dict[str, Any]:

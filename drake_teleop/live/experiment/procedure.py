@@ -85,7 +85,7 @@ class Procedure:
             if not isinstance(task, PegInSlot)
             for c in range(len(experiment.conditions))
         }
-        self._pressed: list[float] = []
+        self._contact_forces: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
             self._update_estimates(trial, row)
         self.phase, self.is_answer_right, self.is_repeated = CONSENT_PHASE, False, False
@@ -113,8 +113,8 @@ class Procedure:
     def expected_contact_force(self) -> float:
         """Median of the participant's contact forces [N]; without any, the task's `pressed`."""
         task = self.task
-        if self._pressed:
-            return float(np.median(self._pressed))
+        if self._contact_forces:
+            return float(np.median(self._contact_forces))
         return task.pressed if isinstance(task, ContactDetection) else 0.0
 
     def _prepare_trial(self) -> None:
@@ -190,7 +190,7 @@ class Procedure:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
-            self._pressed.append(row.force_N)
+            self._contact_forces.append(row.force_N)
         if not trial.practice:
             self._psi[trial.task, trial.condition].update_posterior(row.level, bool(row.correct))
 
