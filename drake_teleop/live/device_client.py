@@ -35,6 +35,8 @@ HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]
 
 
 class HapticDevice(Protocol):
+    """Interface of a haptic device."""
+
     @property
     def limits(self) -> DeviceLimits: ...
 
@@ -160,6 +162,8 @@ def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
 
 
 class RealTimeVirtualDevice:
+    """Virtual device in real time."""
+
     limits = DeviceLimits(force=10.0)
 
     def __init__(self, virtual: VirtualDevice) -> None:

@@ -246,7 +246,7 @@ def parse_experiment_message(text: Any) -> dict[str, Any] | None:
 
 
 class ExperimentDrive(LiveDrive):
-    """Live session of one participant, with its server."""
+    """Live session and server of one participant."""
 
     def __init__(
         self, procedure: Procedure, scenarios: list[Scenario], port: int, device: str | None

@@ -91,7 +91,7 @@ class PoseEstimate(PoseMotion):
         free_frame_fit: fit with an estimated pose frame, `frame`.
         units_and_axes: unit of positions, axes and masses from the linear model's fit.
         t, rejected: (M,) instants [s], and True for disturbed ones.
-        note: text if no disturbance could be rejected, or "".
+        note: text if disturbances could not be rejected.
     """
 
     fit: RigidFit

@@ -30,7 +30,7 @@ MAX_PLAUSIBLE_VALUES = {
 class Stream:
     """Signals (N, ...) of one stream in S, at its times `t` [s]; None for absent signals.
 
-    `recorded_poses` are the poses of S, `imu_data` the IMU data in S.
+    `recorded_poses` are poses of S.
     """
 
     name: str
