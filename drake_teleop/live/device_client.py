@@ -75,6 +75,7 @@ class DeviceClient:
         self._receive_force_commands()
         if pose is None:
             self._device.set_wrench((0.0,) * 6)
+            self.guard.reset_force_and_motion()
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf

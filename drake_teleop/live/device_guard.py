@@ -76,6 +76,11 @@ class DeviceGuard:
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
+    def reset_force_and_motion(self) -> None:
+        """Set the last force and velocity to zero, after a tick without a pose."""
+        self._force, self._torque, self._velocity = np.zeros((3, 3))
+        self._position = None
+
     def _allowed_force_fraction(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True

@@ -218,14 +218,14 @@ class Spectra:
     motion_signals: Array
 
     def with_delay(self, delay: float) -> Spectra:
-        """Return the spectra with `signals` at another delay [s]; other fields are unchanged."""
+        """Return the spectra with `signals` at another delay [s]."""
         window, shift, signals = self.window, delay - self.delay, self.signals
         if window.is_taper_fixed:
             before = window.filtered_taper(np.exp(-2j * np.pi * window.grid.frequency * shift))
             signals = window.signal_spectrum(self.motion_signals, before)
         late = signals * np.exp(2j * np.pi * window.bands.frequency * shift)[:, None]
         late[:, 0] = self.signals[:, 0]
-        return replace(self, signals=late)
+        return replace(self, signals=late, delay=delay)
 
     def second_moments(self) -> Array:
         """Return second moments (bands, 22, 22) of signals and wrench."""
