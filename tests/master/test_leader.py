@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.master.device import AddHapticDevice
+from drake_teleop.station.master.device import AddDeviceAndForceDisplay
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -43,7 +43,7 @@ class ConnectedLeader:
 
     def __init__(self, device):
         builder = DiagramBuilder()
-        self.block, self.display = AddHapticDevice(builder, PERIOD, device, device.home)
+        self.block, self.display = AddDeviceAndForceDisplay(builder, PERIOD, device, device.home)
         builder.ExportInput(self.block.GetInputPort("hand_wrench_E"), "hand")
         builder.ExportInput(self.display.GetInputPort("wrench_command"), "command")
         self.diagram = builder.Build()

@@ -25,7 +25,7 @@ def encoder_pose_into(q, q_start, steps, packed_device, pose):
 
 
 class Encoders(LeafSystem):
-    """Encoders of a haptic device, with whole `steps` (6,) [m, rad] of its axes; 0: no rounding.
+    """Encoders that round a device's joint positions to `steps` (6,) [m, rad]; 0: no rounding.
 
     Steps count from the joint positions `q_start` (6,).
 
