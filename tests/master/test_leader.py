@@ -213,7 +213,7 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
 @pytest.mark.parametrize(
     ("leader", "said"),
     [
-        (None, "master.leader: `model: leader` without the settings `leader` is invalid"),
+        (None, "master.leader: model: leader without a block leader is invalid"),
         (Leader(hand_frame="hand"), "master.leader.file: a leader arm requires a file"),
         (
             dataclasses.replace(LEADER, home=[0.0]),

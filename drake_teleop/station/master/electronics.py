@@ -13,7 +13,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 @njit(cache=True)
 def encoder_pose_into(q, q_start, steps, packed_device, pose):
-    """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
+    """Write the pose X_BE (7,) of q (6,) rounded to whole encoder steps from `q_start` (6,).
 
     `steps` (6,) are in m or rad; 0 disables rounding.
     """
