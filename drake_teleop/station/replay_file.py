@@ -149,7 +149,7 @@ class ReplayFile:
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
     """Return times (F,) of a replay's frames [s], and its slow-motion factor.
 
-    By default the factor is the smallest up to 100 with a replay of at least 6 s.
+    By default the factor is the smallest for a replay of at least 6 s, and at most 100.
     """
     span = stop - start
     if slow_motion is None:

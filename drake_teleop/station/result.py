@@ -317,7 +317,7 @@ class SimulationResult:
 
 
 class _SignalsOnDisk(dict[str, Any]):
-    """Mapping of signal names to arrays (N, k), each read from the disk at every access."""
+    """Column names by signal, but `[name]` reads the signal's array (N, k) from the disk."""
 
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
         super().__init__((spec.name, spec.columns) for spec in specs)
