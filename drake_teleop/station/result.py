@@ -317,7 +317,7 @@ class SimulationResult:
 
 
 class _SignalsOnDisk(dict[str, Any]):
-    """Column names by signal, but `[name]` reads the signal's array (N, k) from the disk."""
+    """Signals on disk: `[name]` reads an array (N, k), other methods give column names."""
 
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
         super().__init__((spec.name, spec.columns) for spec in specs)

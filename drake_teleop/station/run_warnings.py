@@ -60,7 +60,7 @@ _REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
     """Return a warning, with times, for each condition in docs/running.md that occurred.
 
-    Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm, with limits.
+    Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm.
     """
     found = chain(
         _check_faults(result),
