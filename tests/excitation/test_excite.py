@@ -378,7 +378,7 @@ def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     assert noise == pytest.approx(sensor.wrench_std()[[0, 3]])
     assert robot.arm.joint_names == ("j1", "j2", "j3", "j4", "j5", "j6")
     words = "; ".join(robot.assumptions)
-    assert "turns without end for j4" in words
+    assert "unlimited rotation for j4" in words
     assert "a speed limit of 3.142 rad/s for j5" in words
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
     assert "shapes are missing of l3, l4, l5: meshes were not found (--package-path" in words
@@ -605,7 +605,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
     urdf.write_text(nothing)
     robot = RobotFromModel(urdf, "l6", WristSensorConfig())
     assert "no inertia of l6" in robot.assumptions
-    assert any("turns without end for j3" in words for words in robot.assumptions)
+    assert any("unlimited rotation for j3" in words for words in robot.assumptions)
 
 
 @pytest.mark.parametrize(
@@ -619,7 +619,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "model contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
-        (["--sensor-frame", "l0"], "no moving joint"),
+        (["--sensor-frame", "l0"], "no joint moves l0"),
         ([], "--sensor-frame"),
     ],
 )

@@ -143,7 +143,9 @@ def test_deviations_double_for_a_quarter_of_the_samples():
     """The record has no rejected samples."""
     whole = SampleRecord(*record(2000, noise=1.0))
     fit = METHODS["whitened"].fit(whole, EstimatorOptions(NoiseStd(WRENCH_NOISE)))
-    assert _std_growth_by_rejection(fit, whole.decimate(4).moments) == pytest.approx(2.0, rel=0.02)
+    assert _std_growth_by_rejection(fit, whole.with_row_step(4).moments) == pytest.approx(
+        2.0, rel=0.02
+    )
     assert _std_growth_by_rejection(fit, whole.moments) == pytest.approx(1.0)
 
 
