@@ -100,7 +100,7 @@ def doubled_quaternions(pose: Array, reference: Array) -> Array:
     Their signs are those nearer to the quaternion of the pose `reference[0]`.
     """
     q: Array = pose[:, :4]
-    return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
+    return 2 * q * np.where(q @ reference[0, :4] < 0.0, -1.0, 1.0)[:, np.newaxis]
 
 
 def remove_times_near_causes(times: Array, causes: Array, window: float) -> Array:

@@ -228,7 +228,7 @@ class ReplayScene:
             instance, to_plant_positions, *_ = self._device
             state = signals["master_state"][sample]
             plant.SetPositions(context, instance, to_plant_positions(state[: len(state) // 2]))
-        if self._sheet is not None:
+        if self._sheet is not None and "sheet_state" in signals:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
         for name, body in self._moving_bodies.items():
             if name in signals:

@@ -284,6 +284,8 @@ class SimulationResult:
         if name in self._columns:
             signal, index = self._columns[name]
             return [(signal, self._specs[signal].units[index], [index])]
+        if name == "t":
+            raise KeyError("'t' is the abscissa of every plot; give the names of signals")
         if name not in self._specs:
             self[name]  # a KeyError with a suggestion
         units = self._specs[name].units
