@@ -66,7 +66,7 @@ def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0,
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return both ports' reference impedances [N s/m]: the hand's damping, at each side's scale."""
+    """Return both ports' reference impedances [N s/m]: the hand's damping, in each port's scale."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         name = "force_scale" if axis.force_scale == 0 else "position_scale"
@@ -98,7 +98,7 @@ def power_scaled_matrices(H: Complex, axis: OneAxis) -> tuple[Complex, Complex]:
 
 
 def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
-    """Return H of the station together with impedances [N s/m] of the hand and the environment."""
+    """Return H with impedances [N s/m] of hand and environment included."""
     h11, h12, h21, h22 = matrix_entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)
@@ -107,12 +107,12 @@ def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike 
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
-    """Return the impedance [N s/m] displayed to the hand for an impedance of the environment."""
+    """Return the impedance [N s/m] displayed to the hand for this impedance of the environment."""
     return absorb_impedances(H, environment=environment)[..., 0, 0]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the displayed impedance [N s/m] of an ideal station with these scales (T52)."""
+    """Return the displayed impedance [N s/m] of an ideal station with the scales of `axis` (T52)."""
     rendered = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * rendered
 
@@ -126,7 +126,7 @@ class ApparentImpedance(NamedTuple):
 
 
 def fit_apparent_impedance(impedance: Complex, omega: Array) -> ApparentImpedance:
-    """Return the best-fitting mass, damping and stiffness of an impedance (n, ...)."""
+    """Return the best-fitting mass, damping, stiffness of an impedance (n, ...) at `omega` (n,)."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = impedance.imag.reshape(len(omega), -1)
     # Normalised columns: from 0.1 to 1000 rad/s they differ by eight orders of magnitude.

@@ -60,7 +60,7 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compare the given methods, or all; write summary, runs, report and pictures into `out`.
+    """Compare passivity methods (None: all); write summary, runs, report and pictures into `out`.
 
     Rates, integrator and environment of the scenario are not used. Return the content of
     summary.json (docs/delay-figures.md).

@@ -120,9 +120,9 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
-        """Return the minimum over time of start energy, `accounts` at AT_HAND and at `place` [J].
+        """Return the minimum over time [J] of start energy plus `accounts` at AT_HAND and `place`.
 
-        A negative minimum means that the station is active.
+        Negative: the station is active.
         """
         other = 0.0 if place == AT_HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, AT_HAND] + other))
@@ -301,7 +301,7 @@ def measures_of_traces(
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """Return the smallest device damping [N s/m] with a passive displayed impedance (T43)."""
+    """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
     return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
 
 

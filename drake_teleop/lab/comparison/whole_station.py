@@ -185,7 +185,7 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the cumulative work (N, 2) [J] of the load's wrench that the hand is displayed.
+    """Return the work (N, 2) [J] so far of the load's displayed wrench, at the master's scale.
 
     Columns: translation, rotation.
     """
@@ -214,9 +214,9 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the passivity method's stored energy (2,) [J] at the start, both ends together.
+    """Return the energy (2,) [J] that the passivity method stores at both ends at the start.
 
-    Translation, rotation.
+    Columns: translation, rotation.
     """
     scales = _kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales

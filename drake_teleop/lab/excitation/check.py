@@ -63,7 +63,7 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit by joint motion (T, n) at times t (T,) [s], largest first."""
+    """Return, largest first, the use of every limit by joint motion q, qd, qdd (T, n) at t (T,)."""
     names, limits = robot.arm.joint_names, robot.limits
     quantities = _evaluate_limited_quantities(robot, q, qd, qdd, progress)
     torque, sensor, workspace, clearance, nearest = quantities

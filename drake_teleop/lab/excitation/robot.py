@@ -166,7 +166,7 @@ def _make_robot(
     candidates, touching = scene.find_collision_candidates_and_touching(postures, start)
     if touching:
         names = ", ".join(touching)
-        assumptions.append(f"no clearance required of bodies that touch in the start posture: {names}")
+        assumptions.append(f"no clearance required, as these bodies touch at the start: {names}")
     phi, std = arm.phi_load, sensor.wrench_std()
     wrench_noise = float(std[0]), float(std[3])
     force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)

@@ -318,7 +318,7 @@ def _tuning_result_sentences(
         f"{chosen.low_pass_hz:g} Hz.",
         f"The station is stable for a {hands} grip at walls of {low:g} to {high:g} kN/m over "
         f"{about['network']}, also with gamma {figures['margin']:g} times as large.",
-        f"The device renders {figures['share']:.2f} to {figures['largest_share']:.2f} of the scaled "
+        f"It renders {figures['share']:.2f} to {figures['largest_share']:.2f} of the scaled "
         f"contact force; above 5 Hz the force at rest has {figures['rest_force_N']:.3f} N rms.",
         f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
         f"at the tool; {instead}.",
