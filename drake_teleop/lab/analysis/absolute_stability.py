@@ -53,7 +53,7 @@ def _is_criterion_met(H: Complex, criterion: Array, criterion_size: Array) -> Bo
 def required_damping(H: Complex) -> Array:
     """Return the device damping [N s/m] to add for absolute stability, for each frequency of H.
 
-    Negative: more than necessary is present. inf: no damping is sufficient.
+    Negative: surplus damping. inf: no damping is sufficient.
     """
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21

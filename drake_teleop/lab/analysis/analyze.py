@@ -163,7 +163,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 
 def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in its base B, for a tip 5 mm inside the leaf."""
+    """Return the master's displacement [m], in its base B, for a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -234,7 +234,7 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     """Return the largest deviation of each entry of H from the one-axis models up to 30 Hz.
 
-    They are relative to the entry's largest magnitude. H includes the hand's mass.
+    The deviations are relative to the entry's largest magnitude. H includes the hand's mass.
     """
     compared = OMEGA <= MAX_COMPARED_OMEGA_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
@@ -360,7 +360,7 @@ def measure_free_impedance(
 ) -> dict[str, Any]:
     """Return the displayed impedance in free motion, simulated without Coulomb friction.
 
-    Its errors are relative to the linear model `system`.
+    The returned errors are relative to the linear model `system`.
     """
     frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
     smooth = replace(scenario.without_environment(), master=frictionless, slave__friction=[])

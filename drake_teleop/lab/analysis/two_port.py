@@ -112,7 +112,7 @@ def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the displayed impedance [N s/m] of an ideal station with the scales of `axis` (T52)."""
+    """Return the displayed impedance [N s/m] of an ideal station with the axis' scales (T52)."""
     rendered = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * rendered
 
@@ -149,7 +149,6 @@ class ZWidth(NamedTuple):
 
 
 def transmitted_z_width(H: Complex) -> ZWidth:
-    """Return the Z-width of H: impedances displayed in free motion and at a rigid wall."""
     h11, h12, h21, h22 = matrix_entries(H)
     with np.errstate(divide="ignore", invalid="ignore"):
         rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)

@@ -63,7 +63,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class OneDof(AxisParameters):
-    """Model parameters with Coulomb friction, motor lag, encoders, noise; no device damping.
+    """One-axis parameters with Coulomb friction, motor lag, encoders, noise; no device damping.
 
     The equations of motion, with intended motion x_i, displayed force f, command x_cmd::
 

@@ -120,9 +120,9 @@ def measures_of_press(
 
 
 def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
-    """Return "t" [s], vertical forces at the master's scale [N] and "energy" [J] of a run.
+    """Return "t" [s], vertical forces at the master's scale [N] and injected "energy" [J].
 
-    "hand_force" is displayed, "pressed" the scaled true contact force; see `injected_energy`.
+    "hand_force" is the displayed force, "pressed" the scaled true contact force.
     """
     scaling = scenario.force_scaling
     return {

@@ -92,7 +92,7 @@ class Criterion:
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the logarithm of the smooth criterion and its gradient by V (T, 6, 10).
+        """Return the logarithm of the smooth criterion and its gradient by the regressor V.
 
         The constant factor of the duration is omitted.
         """
@@ -124,7 +124,7 @@ class Criterion:
 
 @njit(cache=True)
 def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
-    """Write a scalar's gradients (3,) by s, omega, alpha, from its gradient g_V by V (6, 10)."""
+    """Write a scalar's gradients (3,) by s, omega, alpha, given g_V, that by the regressor V."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]

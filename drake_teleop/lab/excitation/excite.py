@@ -119,7 +119,7 @@ def find_best_within_limits(
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
     """Return the best trajectory that passes the check, and its uses of the limits.
 
-    If no trajectory of `iterates` passes, `fallback_trajectories` are checked in their order.
+    If no iterate of the optimiser passes, `fallback_trajectories` are checked in their order.
     """
     worst: LimitUse | None = None
     candidates = islice(_feasible_candidates(iterates, robot), _MAX_CHECKED_CANDIDATES)

@@ -94,7 +94,7 @@ def sensor_motion_series(motions):
 
 @njit(cache=True)
 def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
-    """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), given g_V, that by V."""
+    """Add a scalar's gradient by q, qd, qdd to `gradient`, given g_V, that by the regressor V."""
     work, g = _allocate_seeds(motions), np.empty((3, 3))
     seed = work[0][-1]
     for t in range(len(motions)):

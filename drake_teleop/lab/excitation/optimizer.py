@@ -164,7 +164,7 @@ def minimise_criterion(
 ) -> list[FeasibleIterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `starts` counts descents. `seconds` of thread CPU time replace it; results then vary.
+    `starts` is the number of descents. `seconds` of CPU time replace it; results then vary.
     """
     search = _DescentSearch(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):

@@ -61,7 +61,7 @@ def predicted_deviations(
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of identified offsets and phi after a sensor motion (T, 3).
+    """Return the covariance (16, 16) of identified offsets and phi after s, omega, alpha (T, 3).
 
     `step` is the sample period [s], `phi` the true load (10,).
     """

@@ -234,7 +234,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
 
 def white_noise_densities_over_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
-    """Return the density matrix (6, 6) of wrench and motion noise over that of wrench noise."""
+    """Return the density matrix (6, 6) of wrench and motion noise over wrench noise alone."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)

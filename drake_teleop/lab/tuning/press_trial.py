@@ -237,7 +237,7 @@ class StationPressTrial:
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Function that a study runs: find the largest gamma that meets all corners in one axis."""
+    """Function that a study runs: find the largest gamma for all extremes, in one axis."""
 
     base_scenario: Scenario
     operating_range: OperatingRange
