@@ -188,11 +188,15 @@ def singular_value_in_ranges(
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     reduction = 1 / (1 + h22 * e)
-    felt = z + h11 - h12 * h21 * e * reduction
-    through = h12 * h21 * reduction**2 / felt
+    displayed = z + h11 - h12 * h21 * e * reduction
+    through = h12 * h21 * reduction**2 / displayed
     # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
     # with this diagonal and this product of the other two.
-    first, second, product = r1 / felt, r2 * (h22 * reduction - through), -r1 * r2 * through / felt
+    first, second, product = (
+        r1 / displayed,
+        r2 * (h22 * reduction - through),
+        -r1 * r2 * through / displayed,
+    )
     mu = structured_singular_value(two_port_matrix(first, product, 1.0, second))
     return np.min(mu, axis=(-2, -1))
 

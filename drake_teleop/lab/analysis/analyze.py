@@ -313,13 +313,13 @@ def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str
     figures: dict[str, Any] = {}
     for name, one in (("free", axis), ("wall", contact)):
         environment = environment_impedance(one, S_AT_OMEGA)
-        felt = two_port.transmitted_impedance(H, environment)
+        displayed = two_port.transmitted_impedance(H, environment)
         ideal = two_port.ideal_impedance(axis, S_AT_OMEGA, environment)
-        noticed = two_port.is_difference_noticed(felt, ideal)
+        noticed = two_port.is_difference_noticed(displayed, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
             which: two_port.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
-            for which, impedance in (("felt", felt), ("ideal", ideal))
+            for which, impedance in (("felt", displayed), ("ideal", ideal))
         }
         figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
     tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
@@ -372,12 +372,12 @@ def measure_free_impedance(
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
     # The hand's mass moves with the stylus and belongs to the hand.
-    felt = held - 1j * found.omega * along.axis.hand_mass
+    displayed = held - 1j * found.omega * along.axis.hand_mass
     ratio = held / two_port_along(system, found.omega, along.hand, along.tool)[:, 0, 0]
     return {
         "frequency_Hz": found.omega / (2 * np.pi),
-        "felt_re": felt.real,
-        "felt_im": felt.imag,
+        "felt_re": displayed.real,
+        "felt_im": displayed.imag,
         "coherence": found.coherence("hand_velocity", "hand_force"),
         "greatest_error": np.abs(np.abs(ratio) - 1).max(),
         "greatest_error_deg": np.abs(np.angle(ratio, deg=True)).max(),

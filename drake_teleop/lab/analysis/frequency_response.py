@@ -102,10 +102,10 @@ class StationResponse:
             remedy = "lower `lowest` or lengthen `period` of the MultiSine"
             raise DrakeTeleopError(what, where="MultiSine", remedy=remedy)
         omega = self.omega[low]
-        felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
+        displayed = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
         # The force noise is about equal at all lines, so that the weights are the accelerations.
         acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
-        mass = (felt / (1j * omega)).real
+        mass = (displayed / (1j * omega)).real
         return float(np.polyfit((omega / omega[-1]) ** 2, mass, 1, w=acceleration)[1])
 
 

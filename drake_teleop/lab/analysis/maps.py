@@ -51,11 +51,11 @@ def stability_map(
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
     def evaluate(x: Array, y: Array) -> tuple[OneAxis, CutLoop, NDArray[np.int64]]:
-        moved, loop = _axis_and_loop_with_values(axis, sampling, {x_name: x, y_name: y})
-        return moved, loop, cut_loop.count_unstable_multipliers(loop, moved.delay)
+        changed_axis, loop = _axis_and_loop_with_values(axis, sampling, {x_name: x, y_name: y})
+        return changed_axis, loop, cut_loop.count_unstable_multipliers(loop, changed_axis.delay)
 
     points = np.stack(np.meshgrid(xs, ys), axis=-1)
-    moved, loop, unstable = evaluate(xs, ys[:, None])
+    changed_axis, loop, unstable = evaluate(xs, ys[:, None])
     unstable = np.broadcast_to(unstable, points.shape[:2])
     stable = unstable == 0
     # Neighbours in a row, then neighbours in a column.
@@ -67,8 +67,8 @@ def stability_map(
         middle = 0.5 * (low + high)
         as_low = ((evaluate(*middle.T)[2] == 0) == stable_at_low)[:, None]
         low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)
-    felt = np.broadcast_to(force_distortion(moved, loop), stable.shape)
-    return StabilityMap(x_name, y_name, xs, ys, unstable, felt, 0.5 * (low + high))
+    distortion = np.broadcast_to(force_distortion(changed_axis, loop), stable.shape)
+    return StabilityMap(x_name, y_name, xs, ys, unstable, distortion, 0.5 * (low + high))
 
 
 def force_distortion(

@@ -117,13 +117,13 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     delay_factor = np.exp(-1j * w * model.dt * one_way_delay_in_hand_periods(axis, sampling))
     # Responses without delay to a force on the device, and to one of the environment.
     response = model.frequency_response(w)[:, :, :2]
-    (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
+    (v_m, _), (v_s, yielding), (displayed, displayed_e) = np.moveaxis(response, 0, 2)
     hold = -np.expm1(-1j * w * model.dt) / (1j * w * model.dt)
     return two_port_matrix(
-        hold * (1 + delay_factor**2 * felt) / v_m,
-        delay_factor * felt_e,
+        hold * (1 + delay_factor**2 * displayed) / v_m,
+        delay_factor * displayed_e,
         -delay_factor * v_s / v_m,
-        -give / hold,
+        -yielding / hold,
     )
 
 
@@ -172,13 +172,13 @@ def _servo_row(zeros: Array, axis: OneAxis) -> Array:
 
 
 def _sensor_rows(zeros: Array, axis: OneAxis, sections: Array) -> Array:
-    rows, felt_mass = zeros.copy(), axis.displayed_tool_mass
-    scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
+    rows, displayed_mass = zeros.copy(), axis.displayed_tool_mass
+    scale = axis.force_scale * (axis.gamma - displayed_mass / axis.slave_mass)
     value = rows[..., 0, :]
     value[..., SLAVE_X] = scale * axis.wall_stiffness
     value[..., SLAVE_V] = scale * axis.wall_damping
     value[..., _HELD_ENVIRONMENT_FORCE] = scale
-    value[..., SERVO_A] = axis.force_scale * felt_mass
+    value[..., SERVO_A] = axis.force_scale * displayed_mass
     for k in range(sections.shape[-2]):
         b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
         first, raw = 1 + 2 * k, value.copy()

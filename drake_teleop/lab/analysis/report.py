@@ -95,9 +95,9 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
         figure = Picture(figsize=(9.0, 5.4))
         grid = figure.subplots(2, 2, sharex=True, sharey="row")
 
-        def draw(column: int, hertz: Array, felt: Complex, label: str, **style: Any) -> None:
-            grid[0, column].loglog(hertz, np.abs(felt), label=label, **style)
-            phase = np.degrees(np.unwrap(np.angle(felt)))
+        def draw(column: int, hertz: Array, displayed: Complex, label: str, **style: Any) -> None:
+            grid[0, column].loglog(hertz, np.abs(displayed), label=label, **style)
+            phase = np.degrees(np.unwrap(np.angle(displayed)))
             grid[1, column].semilogx(hertz, phase, **style)
 
         for column, (name, environment) in enumerate(environments.items()):
@@ -110,9 +110,9 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
             grid[0, column].set_title(name)
             grid[1, column].set_xlabel("frequency [Hz]")
         if measured is not None:
-            felt = np.array(measured["felt_re"]) + 1j * np.array(measured["felt_im"])
+            displayed = np.array(measured["felt_re"]) + 1j * np.array(measured["felt_im"])
             dots: dict[str, Any] = {"color": VERMILION, "linestyle": "", "marker": "o", "ms": 3.5}
-            draw(0, measured["frequency_Hz"], felt, "Diagram, simulated", **dots)
+            draw(0, measured["frequency_Hz"], displayed, "Diagram, simulated", **dots)
         grid[0, 0].set_ylabel("|Z| displayed [N s/m]")
         grid[1, 0].set_ylabel("phase [deg]")
         grid[0, 0].legend()
@@ -299,12 +299,12 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
 
 def _transparency_sentences(figures: dict[str, Any]) -> list[str]:
     free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
-    felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
+    displayed, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
     sigma = f"σ = {figures['axis']['sigma']:g}"
     return [
         f"In free motion the displayed mass is {1e3 * free['felt']['mass']:.3g} g.",
         f"The ideal mass for this device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
-        f"At the wall the displayed stiffness is {felt:.3g} N/m; the ideal is {ideal:.3g} N/m.",
+        f"At the wall the displayed stiffness is {displayed:.3g} N/m; the ideal is {ideal:.3g} N/m.",
         f"A human cannot distinguish it from the ideal up to {wall['unnoticed_to_Hz']:.2g} Hz.",
         f"The slave tracks up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
     ]

@@ -99,7 +99,7 @@ def compare_command(
             "method": method,
             "network": network,
             "verdict": cell.verdict,
-            "felt_N": [felt for felt, _ in cell.force_pairs],
+            "felt_N": [displayed for displayed, _ in cell.force_pairs],
             "pressed_N": [pressed for _, pressed in cell.force_pairs],
             "leaked_J": cell.leaked_J,
         }
@@ -250,8 +250,8 @@ def _tap_impulse_share(
     first = int(np.argmax(run.wall_force < 0.0))
     second = first + round(0.75 / rate / PERIOD_S)  # between first and second contact
     pressed = scale * run.wall_force[second:].sum()
-    felt = run.hand_force[second + round(one_way_delay_s / PERIOD_S) :].sum()
-    return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0
+    displayed = run.hand_force[second + round(one_way_delay_s / PERIOD_S) :].sum()
+    return float(max(displayed / pressed, 0.0)) if pressed < 0.0 else 0.0
 
 
 def _run_one_dof_study(

@@ -138,10 +138,10 @@ class RunMeasures:
     turning: float  #: largest peak-to-peak rotation in hold and end [rad]
     felt_force: float  #: mean force on the hand in the hold [N]
     chatter: float  #: standard deviation of the force on the hand in the hold [N]
-    force_error: float  #: relative error of felt_force to the scaled contact force
+    force_error: float  #: relative error of felt_force, compared with the scaled contact force
     drift: float  #: position of slave minus master, 2 s after contact [m]
     free_force: float  #: rms force on the hand in free motion [N]
-    rise_delay: float  #: from contact force to felt force at half the steady felt force [s], or NaN
+    rise_delay: float  #: from contact to displayed force, at half its steady value [s], or NaN
     least_energy: float  #: minimum of the energy put in so far [J]; negative: active
 
     @property
@@ -215,9 +215,9 @@ def run_one_dof(
         *states, ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD_S
-    master, slave, command, felt, pushed = rows.T[:5]
+    master, slave, command, displayed, pushed = rows.T[:5]
     rest = rows[:, 5:7], rows[:, 7:9], rows[:, 9:], stored
-    return OneDofRun(t, master, slave, command, felt, pushed, *rest)
+    return OneDofRun(t, master, slave, command, displayed, pushed, *rest)
 
 
 def operator_intent(task: Task = Task()) -> Array:
@@ -346,8 +346,8 @@ def _simulate_steps(
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
-    felt, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
-    # Columns: master, slave, command, felt, wall, energy (2), silent (2), accounts (4).
+    displayed, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
+    # Columns: master, slave, command, displayed, wall, energy (2), silent (2), accounts (4).
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
@@ -364,15 +364,16 @@ def _simulate_steps(
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
         hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
         pose_m[4], pose_s[4] = _quantise(x, master_resolution), _quantise(x_s, slave_resolution)
-        accounts[AT_HAND] -= felt[0] * (x - x_before)
+        accounts[AT_HAND] -= displayed[0] * (x - x_before)
         before, x_before = received[4], x
         # A literal False would compile the whole channel once more.
         step_channel(
             steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S, timeout,
-            frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
+            frame, p, forward_line, backward_line, forward, backward, ends, received, ports,
+            displayed,
         )  # fmt: skip
         command, accounts[AT_COMMAND] = received[4], ports[6]
-        copy_into(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
+        copy_into(rows[k], 0, (x, x_s, command, displayed[0], wall, ports[0], ports[2]), 0, 7)
         copy_into(rows[k], 7, ports, 4, 2)
         copy_into(rows[k], 9, accounts, 0, 4)
         servo_force = K * (command - x_s) - D * v_s
@@ -380,7 +381,7 @@ def _simulate_steps(
             share = (i + 0.5) / _SUBSTEPS_PER_CHANNEL_PERIOD
             x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
             v_i = course[k, 1] + share * (course[following, 1] - course[k, 1])
-            force = stiffness * (x_i - x) + damping * (v_i - v) + felt[0]
+            force = stiffness * (x_i - x) + damping * (v_i - v) + displayed[0]
             v += dt / mass * (force - friction * np.tanh(v / _DEVICE_FRICTION_SPEED_M_S))
             x += dt * v
             x_then, v_then = x_s, v_s

@@ -96,7 +96,7 @@ class MethodResult:
     @property
     def least_displayed_share_text(self) -> str:
         """Smallest displayed share [%] of the scaled contact force, all springs; "" if unstable."""
-        shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
+        shares = [displayed / pressed for displayed, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
@@ -149,7 +149,7 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             x, y = networks.index(network), methods.index(method)
             mark, colour, text_colour = VERDICT_STYLES[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
-            lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
+            lines = [f"displays {force:.1f} of {true:.1f} N" for force, true in cell.force_pairs]
             lines += cell.motion_texts
             style: dict[str, Any] = {"color": text_colour, "ha": "center", "va": "center"}
             y -= 0.12 * len(lines)

@@ -145,7 +145,7 @@ def _force_and_motion_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: 
 def _nearest_shapes(scene: CollisionScene, query: QueryObject, reach: float) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
-        return reach, "all shapes are farther"
+        return reach, "all shapes are farther apart"
     pair = min(found, key=lambda pair: pair.distance)
     inspector = scene.scene_graph.model_inspector()
     frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
