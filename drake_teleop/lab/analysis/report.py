@@ -299,12 +299,12 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
 
 def _transparency_sentences(figures: dict[str, Any]) -> list[str]:
     free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
-    displayed, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
+    rendered, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
     sigma = f"σ = {figures['axis']['sigma']:g}"
     return [
         f"In free motion the displayed mass is {1e3 * free['felt']['mass']:.3g} g.",
         f"The ideal mass for this device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
-        f"At the wall the displayed stiffness is {displayed:.3g} N/m; the ideal is {ideal:.3g} N/m.",
+        f"At the wall the displayed stiffness is {rendered:.3g} N/m; the ideal is {ideal:.3g} N/m.",
         f"A human cannot distinguish it from the ideal up to {wall['unnoticed_to_Hz']:.2g} Hz.",
         f"The slave tracks up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
     ]
