@@ -256,7 +256,7 @@ def _stability_sentence(point: dict[str, Any], grip: str) -> str:
     if decay is None:
         stable = "stable" if point["stable"] else "unstable"
         return f"In the state '{point['point']}' the one-axis model of the station is {stable}."
-    state = f"In the state '{point['point']}' with {grip} grip the station is"
+    state = f"In '{point['point']}', {grip} grip, the station is"
     motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
     if point["stable"]:
         return f"{state} stable: motion halves every {1e3 * np.log(2) / decay:.3g} ms, {motion}."
@@ -264,14 +264,14 @@ def _stability_sentence(point: dict[str, Any], grip: str) -> str:
 
 
 def _margin_sentences(row: dict[str, Any], one_way_delay_s: float) -> list[str]:
-    wall = f"a wall of {_stiffness_text(row['wall_N_per_m'])}"
+    wall = f"wall of {_stiffness_text(row['wall_N_per_m'])}"
     if not row["stable"]:
-        return [f"At {wall} the station is unstable with this grip."]
+        return [f"At a {wall} the station is unstable with this grip."]
     trip, longest = row["round_trip_s"], "any round trip"
     if trip is not None:
         longest = f"{1e3 * (trip - 2 * one_way_delay_s):.3g} ms more round trip"
     more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times the loop gain"
-    return [f"At {wall} the station remains stable up to {longest}, or up to {more}."]
+    return [f"A {wall} is stable up to {longest}, or up to {more}."]
 
 
 def _wall_sentences(figures: dict[str, Any]) -> list[str]:
