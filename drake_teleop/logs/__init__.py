@@ -1,1 +1,1 @@
-"""Recorded logs: identification and removal of the load, contact detection; no Drake needed."""
+"""Load identification, load removal and contact detection for recorded logs, without Drake."""

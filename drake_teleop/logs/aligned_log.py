@@ -1,4 +1,4 @@
-"""Motion and wrench of a log at the same instants, and the load fitted to a log with poses."""
+"""Alignment of motion and wrench in time, and the load identified from a log with poses."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _fit_with_fallback_delay(
 
 
 def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log without delay with motion of splines, and flags (N,) near ends and gaps."""
+    """Return the log without delay, with spline motion; and flags (N,): True near ends and gaps."""
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
@@ -102,12 +102,12 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: its specific force is the acceleration if the robot had removed the weight.
+        log: aligned log; if the robot has removed the weight, `specific_force` is the acceleration.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
-        log_with_differentiated_motion: log with motion by numerical differentiation, if required.
+        log_with_differentiated_motion: the same with differentiated motion, if requested.
         edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
-        clock_notes: note on the clock rate of the poses, if it is corrected.
+        clock_notes: note on the clock rate of the poses, if it was corrected.
     """
 
     log: Log
@@ -127,11 +127,11 @@ def read_aligned_log(
     differentiate: bool,
     weight_removed: bool,
 ) -> AlignedLog:
-    """Read a log and remove the delay between motion and wrench.
+    """Return the log in a file, without the delay between motion and wrench.
 
     The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
-    `delay` [s] or "auto" is removed, or `fallback_delay_s` if the record does not determine it.
-    `differentiate` also returns numerically differentiated motion.
+    The removed delay is `delay` [s], or its estimate for "auto", or `fallback_delay_s` if the
+    record does not determine it. `differentiate` adds numerically differentiated motion.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated
@@ -182,7 +182,7 @@ def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:
 
 
 def replace_specific_force_by_acceleration(log: Log) -> Log:
-    """Return the log with specific force + gravity, the acceleration, as `specific_force`."""
+    """Return the log with the acceleration, specific force + gravity, as its `specific_force`."""
     if log.gravity is None:
         raise removed_weight_needs_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
@@ -190,10 +190,10 @@ def replace_specific_force_by_acceleration(log: Log) -> Log:
 
 @dataclass(frozen=True)
 class LoadFitOfLog:
-    """Load identified from a log; `log` are the used samples, without the delay.
+    """Load identified from a log; `log` contains the used samples without delay.
 
-    `delay_source` is "static", "given", "estimated", or "undetermined" (0 was used). `motion` is
-    from splines, or None.
+    `delay_source` is "static", "given", "estimated", or "undetermined" (delay 0). `motion` is the
+    spline motion, if used.
     """
 
     log: Log
@@ -206,9 +206,9 @@ class LoadFitOfLog:
 def fit_load_to_posed_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[LoadFitOfLog | None, tuple[Finding, ...]]:
-    """Return the load identified from wrench and poses, and findings about the pose frame.
+    """Return the load identified from wrench and poses, and any finding on unit or frame of poses.
 
-    The load is None for a method without splines, a log without usable poses, or an IMU that
+    The load is None for a method without splines, a log without poses over 4 s, or an IMU that
     contradicts the poses.
     """
     is_long = log.t[-1] - log.t[0] >= _MIN_POSES_DURATION_S

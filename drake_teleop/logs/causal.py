@@ -17,11 +17,11 @@ CAUSAL_MODES = ("delayed", "predicted")
 
 @dataclass(frozen=True)
 class CausalContactAndScaledWrench:
-    """Contact and scaled wrenches of N samples, each computed from past samples only.
+    """Contact and scaled wrench of N samples, each computed from past samples only.
 
     Attributes:
-        mode: "delayed", or "predicted" (extrapolated over the lag).
-        lag_s: delay of slow changes of the contact force, before prediction [s].
+        mode: "delayed", or "predicted" (extrapolated over `lag_s`).
+        lag_s: sum of the motion's delay and the delay of the low-pass [s].
         contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma (load's wrench).
         offsets: (6,) subtracted sensor offsets [N, N m].
     """
@@ -36,7 +36,7 @@ class CausalContactAndScaledWrench:
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
     """Filter samples x (N, ...) by a causal second-order Butterworth low-pass, Eq. (T11).
 
-    Extrapolate the output over `ahead_s` [s] by its slope. Do not filter for a cut-off of None.
+    Extrapolate the output over `ahead_s` [s] by its slope. A cut-off of None returns x.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -63,7 +63,7 @@ def low_pass_and_settled_state(dt: float, cutoff_hz: float, ahead_s: float = 0.0
 def design_low_pass(dt, tangent, ahead_s, low_pass):
     """Write filter coefficients b (3), a (2) and settled state (2) to `low_pass` (7,), Eq. (T11).
 
-    `tangent` is tan(pi cutoff dt), `ahead_s` [s] how far the output is extrapolated by its slope.
+    `tangent` is tan(pi cutoff dt). The output is extrapolated by its slope over `ahead_s` [s].
     """
     k = 2.0 / dt
     w = k * tangent / _FOURTH_ROOT_OF_3
@@ -79,7 +79,7 @@ def design_low_pass(dt, tangent, ahead_s, low_pass):
 
 
 def filter_lag(dt: float, cutoff_hz: float | None) -> float:
-    """Return the delay of `causal_low_pass` for slow signals [s]."""
+    """Return the delay [s] of `causal_low_pass` at low frequencies, without extrapolation."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
     return _ROOT_OF_2 / (2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _FOURTH_ROOT_OF_3)
@@ -88,10 +88,10 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
 def compute_causal_wrench(
     contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
 ) -> CausalContactAndScaledWrench:
-    """Return the filtered wrenches that a control loop has at each instant.
+    """Return contact and scaled wrench (N, 6), low-passed as in a control loop.
 
-    The delay of the motion behind the wrench, `delay_s`, is rounded up to full samples. The mode
-    "delayed" keeps the lag of the wrenches (N, 6), "predicted" extrapolates over it.
+    `delay_s`, the motion's delay behind the wrench, is rounded up to full samples. Mode "delayed"
+    keeps the lag; "predicted" extrapolates over it.
     """
     if mode not in CAUSAL_MODES:
         what = f"{mode!r} is not a causal mode"

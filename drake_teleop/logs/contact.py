@@ -46,9 +46,9 @@ class Detection:
     Attributes:
         noise_floor: noise of the contact wrench in free motion.
         statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
+        statistics: (N, 3) values of all statistics; 0 in samples that are not judged.
         touched: (N,) True for contact, with hysteresis.
-        free_duration_s: duration of the free motion that determined the floor [s].
+        free_duration_s: duration of the free motion that determined the noise floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
     """
 
@@ -91,7 +91,7 @@ def detect_contact(
 
     Samples with `edge` True, or within a period of the low-pass from the ends, are not judged.
     `covariance` (16, 16) is that of [offsets; phi], `residual_rms` (6,) that of the identification
-    [N, N m]. `free` is a log of free motion, and its sample time [s].
+    [N, N m]. `free` contains samples of another log in free motion, and their sample time [s].
     """
     period = 1.0 / (cutoff_hz or _CUTOFF_WITHOUT_LOW_PASS_HZ)
     inner = _rows_far_from_ends_and_edges(rows, dt, period, edge)
@@ -179,7 +179,7 @@ def _fit_floor_and_threshold_to_log(
 
 
 def _expected_maximum_in_free_motion(values: Array, block: int, samples: int) -> float:
-    """Return the expected maximum of `values` in free motion over `samples` samples, Eq. (T13)."""
+    """Return the expected maximum of a statistic in `samples` samples of free motion, Eq. (T13)."""
     block = min(block, len(values) // 4)
     count = len(values) // block
     largest = values[: count * block].reshape(count, block).max(axis=1)
@@ -224,7 +224,7 @@ def _notes_if_mostly_contact(
 
 
 def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if the offsets differ by `shift` (6,) from those of free motion, else ()."""
+    """Return a note if contact is frequent and offsets differ by a large `shift` (6,), else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_OFFSET_NOTE:
         return ()
@@ -251,7 +251,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the RMS noise (6,) of a wrench (N, 6) that is half free of contact, Eq. (T12)."""
+    """Return the RMS noise (6,) of a contact wrench (N, 6) that is mostly noise, Eq. (T12)."""
     floor = width_and_centre_of_narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):

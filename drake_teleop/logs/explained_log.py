@@ -51,10 +51,10 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 def add_description_lines(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
-    """Add the corrected lines of the log description to the messages of causes."""
-    fields, touched = _corrected_and_touched_fields(causes, log, by_pose)
+    """Return the causes with corrected lines of the log description in messages and fields."""
+    fields, changed_names = _corrected_fields_and_names_by_cause(causes, log, by_pose)
     note, out = note_that_table_needs_description(log.source), []
-    for cause, names in zip(causes, touched, strict=True):
+    for cause, names in zip(causes, changed_names, strict=True):
         lines = {name: _yaml_value(name, fields[name]) for name in names}
         text = f"set {' and '.join(f'{k}: {x}' for k, x in lines.items())}{note}"
         text = text if lines else _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
@@ -67,11 +67,11 @@ def add_description_lines(
 def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
     """Return a message on wrong units for a mass of at least 1000 kg.
 
-    None for a smaller one, or for a log without a description of its wrench.
+    Return None for a smaller one, or for a log without a description of its wrench.
     """
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected_and_touched_fields(causes, log, by_pose=True)[0]
+    fields = _corrected_fields_and_names_by_cause(causes, log, by_pose=True)[0]
     ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
     text = _yaml_value("wrench.torque.scale", ratio)
     return (
@@ -84,18 +84,18 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     )
 
 
-def _corrected_and_touched_fields(
+def _corrected_fields_and_names_by_cause(
     causes: Sequence[Finding], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
     column = _column_of_each_axis(fields["wrench.frame"])
-    touched: list[list[str]] = []
+    changed_names: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         _correct_fields_by_cause(fields, cause.name, cause.values, column)
-        touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
-    return fields, touched
+        changed_names.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
+    return fields, changed_names
 
 
 def _correctable_fields(description: Description, by_pose: bool) -> DescriptionFields:
@@ -200,40 +200,40 @@ _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
-    """Search for causes why a rigid load does not explain the wrench; None for a short log.
+    """Return causes why a rigid load does not explain the wrench of a log; None for a short log.
 
-    `delay_s` [s] is that of the motion, which is from splines of `found` or, for None, the log.
+    `delay_s` [s] is that of the motion. The motion is from the splines of `found`, or from the log
+    if None.
     """
 
-    def instants_at_delay(more: float) -> BlockMeans:
-        late = delay_s + more
+    def means_at_additional_delay(more_s: float) -> BlockMeans:
         if found is not None:
-            return _block_means_of_splines(log, found, late)
-        return block_means_of_log(remove_delay(log, late))
+            return _block_means_of_splines(log, found, delay_s + more_s)
+        return block_means_of_log(remove_delay(log, delay_s + more_s))
 
-    data = instants_at_delay(0.0)
+    data = means_at_additional_delay(0.0)
     if data.used.sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
         return None
-    why = explain_misfit(data, instants_at_delay, log.estimated)
+    why = explain_misfit(data, means_at_additional_delay, log.estimated)
     why = fit_with_missing_acceleration(why) if why.is_acceleration_missing else why
     if log.described is None:
         return why
     return replace(why, causes=add_description_lines(why.causes, log, by_pose=found is not None))
 
 
-def _block_means_of_splines(log: Log, found: PoseEstimate, late: float) -> BlockMeans:
+def _block_means_of_splines(log: Log, found: PoseEstimate, delay_s: float) -> BlockMeans:
     assert log.posed is not None
     splines, gravity = found.splines, log.posed.gravity_W
     middle = np.mean(log.posed.poses.position, axis=0)
 
     def motion_at(t: Array) -> tuple[Array, ...]:
-        q = splines.quaternion(t + late)
+        q = splines.quaternion(t + delay_s)
         q /= np.linalg.norm(q, axis=1, keepdims=True)
-        p = splines.position(t + late) - middle
-        return *splines.motion(t + late, gravity)[:3], rotation_matrices(q, "quaternion_wxyz"), p
+        p = splines.position(t + delay_s) - middle
+        return *splines.motion(t + delay_s, gravity)[:3], rotation_matrices(q, "quaternion_wxyz"), p
 
     stamps, margin = splines.poses.t, _SPLINE_END_MARGIN_OVER_KNOT_SPACING * splines.spacing
-    at = log.t + late
+    at = log.t + delay_s
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
@@ -252,7 +252,7 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 
 
 def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> Identification:
-    """Return the load fitted with the causes; without any, `load`, less certain after a misfit."""
+    """Return the load fitted with the causes, else `load` with intervals widened by a misfit."""
     if why.causes or why.always_fitted or why.is_acceleration_missing:
         load = _load_fitted_with_causes(load, why)
     elif not why.explained and load.identifiable.any():
@@ -300,7 +300,7 @@ def _load_fitted_with_causes(load: Identification, why: MisfitExplanation) -> Id
 
 
 def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
-    """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
+    """Return the causes; `finding` replaces those about frames if no other extension is fitted."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (finding, *kept)
@@ -308,19 +308,19 @@ def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Find
 
 
 def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Finding:
-    """Return the finding of a misfit that none of the fitted corrections explains."""
+    """Return the finding of a misfit that none of the fitted `corrections` explains."""
     ratio = why.state.residual_ratio
     text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"
     if corrections:
-        return Finding("misfit", f"{text}, and {ask_about_correction(corrections[0])} Or {remedy}")
+        return Finding("misfit", f"{text}, and {ask_about_correction(corrections[0])}; or {remedy}")
     return Finding("misfit", f"{text}, and no known cause explains it; {remedy}")
 
 
 def ask_about_correction(correction: Finding) -> str:
-    """Return a question about a correction that does not explain the record."""
+    """Return a text that asks to check the likeliest correction of an unexplained record."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
-    return f"no single correction explains the record; check the best candidate: is it that {text}?"
+    return f"no single correction explains the record; check whether {text}"
 
 
 def missing_acceleration_finding(why: MisfitExplanation) -> Finding:

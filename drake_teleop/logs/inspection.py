@@ -133,7 +133,7 @@ def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) 
     write_text(path, _with_checksum(draft.text()))
     summary["draft"] = str(path)
     places = ", ".join(_places_to_fill_in(draft.streams))
-    lacking = [f"places that were not recognized: FILL IN {places}"] if places else []
+    lacking = [f"fields that were not recognized: FILL IN {places}"] if places else []
     try:
         load_description(path)
     except DrakeTeleopError as error:
@@ -233,22 +233,22 @@ def _inspect_stream(
     if not good.all():
         first = table.line_in_file(int(np.argmin(good)))
         text = (
-            f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
-            f" the longest block {figures['nan_longest']} rows; cut or repair them"
+            f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}), the"
+            f" longest block has {figures['nan_longest']} rows; delete or repair them"
         )
         findings.append(Finding("nan", text))
-    same = np.zeros(len(values), bool)
-    same[1:] = (values[1:] == values[:-1]).all(axis=1)
-    figures["repeated_rows"] = int(same.sum())
-    moving = name in ("wrench", "imu") and not same[1:].all()
+    repeats = np.zeros(len(values), bool)
+    repeats[1:] = (values[1:] == values[:-1]).all(axis=1)
+    figures["repeated_rows"] = int(repeats.sum())
+    moving = name in ("wrench", "imu") and not repeats[1:].all()
     if moving:
-        findings += _repeated_rows_findings(at, values, same, figures.get("rate_hz"), time)
+        findings += _repeated_rows_findings(at, values, repeats, figures.get("rate_hz"), time)
     figures["columns"] = {}
     for column, x in zip(_channel_labels(columns, table), values.T, strict=True):
         finite = x[np.isfinite(x)]
         if not len(finite):
             continue
-        saturated = 0 if time is None or not moving else _count_saturated_samples(x, same)
+        saturated = 0 if time is None or not moving else _count_saturated_samples(x, repeats)
         ends = {"min": float(finite.min()), "max": float(finite.max())}
         noise = float(white_noise_deviations(finite[:, None])[0])
         mean = {"mean": float(finite.mean()), "noise": noise, "saturated": saturated}
@@ -256,7 +256,7 @@ def _inspect_stream(
         if saturated:
             text = (
                 f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
-                f" {finite.max():.4g}) for {saturated} samples; cut them or move slower"
+                f" {finite.max():.4g}) for {saturated} samples; delete them or move slower"
             )
             findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
@@ -264,19 +264,21 @@ def _inspect_stream(
 
 
 def _repeated_rows_findings(
-    at: str, values: Array, same: NDArray[np.bool_], rate: float | None, time: Any
+    at: str, values: Array, repeats: NDArray[np.bool_], rate: float | None, time: Any
 ) -> list[Finding]:
-    held = int(same.sum())
-    news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
+    held = int(repeats.sum())
+    news_after = np.flatnonzero(repeats[:-1] & ~repeats[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > MIN_REPEATED_ROW_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK_ROWS
+    enough = (
+        repeats.mean() > MIN_REPEATED_ROW_SHARE or _longest_run(repeats) >= MIN_REPEATED_BLOCK_ROWS
+    )
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
-    longest = _longest_run(same)
-    fresh = np.flatnonzero(~same)
+    longest = _longest_run(repeats)
+    fresh = np.flatnonzero(~repeats)
     period = int(np.median(np.diff(fresh)))
-    news = "" if rate is None else f": new values come at {rate * len(fresh) / len(same):.4g} Hz"
+    news = "" if rate is None else f": new values come at {rate * len(fresh) / len(repeats):.4g} Hz"
     if period > 1 and rate is not None:
         what = f"every value is held for {period} rows{news}, not {rate:.4g} Hz"
     else:
@@ -315,19 +317,17 @@ def _inspect_clock_and_flag_usable_rows(
     if gaps:
         where = float(t[int(np.argmax(steps))] - t[0])
         text = (
-            f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s: rows are missing or"
-            " the clock jumped; the motion there is not used: record again"
-            " if it matters"
+            f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s (missing rows, or a"
+            " jump of the clock), are not used; record again if these parts are required"
         )
         findings.append(Finding("gap", text))
     if back:
         finite = np.flatnonzero(np.isfinite(stamps))
         row = table.line_in_file(finite[int(np.argmax(steps <= 0)) + 1])
         text = (
-            f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
-            " rows with equal stamps are omitted if their values repeat, and are spread evenly"
-            " otherwise; a log with decreasing stamps is refused: cut it where they decrease, or"
-            " give time.rate"
+            f"{at}: {back} time stamps repeat or decrease, the first in row {row}; rows with"
+            " repeated stamps are omitted if their values repeat, else spread evenly; a log with"
+            " decreasing stamps is refused: split it where they decrease, or give time.rate"
         )
         findings.append(Finding("clock jump", text))
     return findings, usable
@@ -345,9 +345,9 @@ def _longest_run(flags: NDArray[np.bool_]) -> int:
     return int(np.diff(find_runs_of_true(flags)).max(initial=0))
 
 
-def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
+def _count_saturated_samples(x: Array, repeats: NDArray[np.bool_]) -> int:
     held = np.zeros(len(x), bool)
-    held[1:] = (x[1:] == x[:-1]) & ~same[1:]
+    held[1:] = (x[1:] == x[:-1]) & ~repeats[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0

@@ -39,7 +39,7 @@ _PARAMETER_SYMBOLS = (
     *(f"$I_{{{axes}}}$" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
 VERDICT_COLOURS = dict(zip(VERDICT_NAMES, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
-_VERDICT_TEXTS = ("identified", "weakly identified", "not identified", "mostly the prior's")
+_VERDICT_TEXTS = ("identified", "weakly identified", "not identified", "mostly from the prior")
 VERDICT_WORDS = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
 _MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
@@ -95,7 +95,7 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
 
 
 def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
-    """Write two PNG files of equal width, one above the other, to `page`."""
+    """Write two PNG files of equal width, one above the other, to the PNG file `page`."""
     from matplotlib.image import imread, imsave
 
     with replace_file_on_success(page) as unfinished:
@@ -129,7 +129,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     for row, (value, colour) in enumerate(zip(theta, colours, strict=True)):
         marker = "o" if abs(value) < limit else ">" if value > 0 else "<"
         left.plot(np.clip(value, -0.97 * limit, 0.97 * limit), row, marker, color=colour, ms=4.5)
-    left.set(xlim=(-limit, limit), title="95 % intervals, over the natural scale")
+    left.set(xlim=(-limit, limit), title="95 % intervals, relative to a typical value")
     left.axvline(0, color=GREY, linewidth=0.8)
     floor = 1e-5
     widths = np.clip(np.where(np.isfinite(deviations), deviations, 10.0), floor, 10.0)
@@ -139,7 +139,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     for share, words in ((0.05, "5 %"), (0.5, "50 %")):
         right.axvline(share, color=BLACK, linewidth=0.8, linestyle="--")
         right.text(share, -0.9, words, fontsize=8, ha="center", va="bottom")
-    right.set_title("Standard deviation over the natural scale", pad=16)
+    right.set_title("Standard deviation relative to a typical value", pad=16)
     handles = [
         Patch(color=VERDICT_COLOURS[verdict], label=VERDICT_WORDS[verdict])
         for verdict in VERDICT_NAMES
@@ -200,7 +200,7 @@ def draw_detection(found: DetectedLog) -> Any:
         top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
         top.set_yscale("symlog", linthresh=1.0)
         top.set_ylim(bottom=0.0)
-        top.set(ylabel="$|F|$ [N]", title="dotted: the same threshold for all motions")
+        top.set(ylabel="$|F|$ [N]", title="dotted: 1.25 times the largest |F| in free motion")
         below.plot(t, found.statistics[inner, STATISTIC_NAMES.index(found.statistic)], color=BLUE)
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set(xlabel="time [s]", ylabel=f"{found.statistic} [standard deviations]")

@@ -36,7 +36,7 @@ from drake_teleop.logs.causes.cause import (
     RecordPartWithLoad,
 )
 from drake_teleop.logs.check import edits
-from drake_teleop.logs.check.against_load import lag_finding
+from drake_teleop.logs.check.against_load import lag_findings
 from drake_teleop.logs.check.conventions import (
     ConventionCheckResult,
     check_conventions_of_file,
@@ -161,8 +161,8 @@ def identify_log(
 ) -> IdentifiedLog:
     """Identify the load and the sensor offsets from a log.
 
-    With positions, the motion is from splines. Otherwise wrench and motion pass one zero-phase
-    low-pass, and the motion counts as exact. Static poses are unfiltered.
+    With positions, "robust" and "consistent" use motion from splines. Otherwise wrench and motion
+    pass one zero-phase low-pass, and the motion counts as exact. Static poses are unfiltered.
 
     Args:
         path: canonical table or log description.
@@ -292,7 +292,7 @@ def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
-    """Check a log and its description, including causes that identification finds."""
+    """Return the checks of a log and its description, with causes that identification finds."""
     checks = check_conventions_of_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
@@ -322,7 +322,7 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
         if not findings:
             delay = own_delay
             if abs(delay) > _MIN_REPORTED_DELAY_OVER_STD * deviation:
-                findings = tuple(lag_finding(description, delay))
+                findings = tuple(lag_findings(description, delay))
     return replace(checks, findings=findings, delay_s=delay)
 
 
@@ -393,8 +393,8 @@ def eliminate_log(
         phi_gripper = phi_with_inertia_replaced(alone)[0]
     common = identification, phi_gripper, scales, cutoff_hz, delay, tare
     if untouched_s is not None and not tare:
-        what = "a contact-free span excludes the load's offsets (--offsets load, tare=False)"
-        raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
+        what = "a contact-free span cannot be combined with --offsets load (tare=False)"
+        raise DrakeTeleopError(what, where="untouched", remedy="remove one of the two")
     found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
     reference = None
     if free is not None:
@@ -438,16 +438,16 @@ def _read_and_eliminate_log(
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
-        what = "a contact-free start requires `causal`, the mode of wrenches as in a control loop"
-        remedy = "give causal as well, or remove it"
+        what = "a contact-free start requires `causal`, wrenches as in a control loop"
+        remedy = "give causal as well, or remove causal_tare_s"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     phi = phi_with_inertia_replaced(identification)[0]
     removed, late_s = identification.weight_removed, identification.delay_s
     aligned = read_aligned_log(path, phi, late_s, cutoff_hz, delay, causal is not None, removed)
     log = aligned.log
     if log.static and causal is not None:
-        what = "poses at rest have no times for a causal filter"
-        raise DrakeTeleopError(what, where="causal", remedy="leave it out")
+        what = "poses at rest have no times, which a causal filter requires"
+        raise DrakeTeleopError(what, where="causal", remedy="remove it")
     known = is_far_from_gaps(log, cutoff_hz)
     shown, edge = log.select_rows(known), aligned.edge[known]
     parts = phi_gripper, phi - phi_gripper
@@ -540,13 +540,13 @@ def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         what = f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples"
         what += f" ({_MIN_TARE_SAMPLES} or more are required, but not all)"
-        remedy = "give another contact-free start"
+        remedy = "give another duration of the contact-free start [s]"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     return rows
 
 
 def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias set to those of a point mass, and their names."""
+    """Return phi (10,) with undetermined inertias as of a point mass, and the names of these."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
@@ -555,7 +555,7 @@ def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tu
 
 
 def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
-    """Return notes on parameters of a load that are not identified: moments, and inertias."""
+    """Return notes on unidentified parameters: mass and moments, and inertias."""
     named = zip(PARAMETER_NAMES[6:10], load.verdicts[6:10], strict=True)
     moments = [name for name, verdict in named if verdict == "not"]
     return tuple(
@@ -608,7 +608,7 @@ def _checked_scales(
 
 @dataclass(frozen=True)
 class DetectedLog(Detection):
-    """Contacts of a log, and the log after removal of the load's wrench (`eliminated`)."""
+    """Contacts of a log, and `eliminated`, the log after removal of the load's wrench."""
 
     eliminated: EliminatedLog = field(kw_only=True)
 

@@ -67,7 +67,7 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, with fit.png and knowledge.png of its folder.
+    """Write the HTML report of an identification, with fit.png and knowledge.png from its folder.
 
     `alone` is the load of the object alone, if the gripper is known.
     """

@@ -108,10 +108,10 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     records = {"free": ((), "in free motion"), "touched": (FINGERTIP_PUSHES, "touched three times")}
     files = []
     with output_folder(out):
-        for row, (name, (touches, what)) in enumerate(records.items()):
+        for row, (name, (pushes, what)) in enumerate(records.items()):
             text = _DESCRIPTION_TEMPLATE.format(name=name, what=what, offset=-CLOCK_START_S)
             write_text(out / f"{name}.yaml", text)
-            _write_record(out, name, row, touches, random)
+            _write_record(out, name, row, pushes, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
         offsets = {"offsets": TRUE_OFFSETS[0], "offsets_touched": TRUE_OFFSETS[1]}
@@ -162,7 +162,7 @@ def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
 def _random_motion(
     random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
 ) -> Callable[[Array], _Motion]:
-    """Return `sensor_motion` between two rests over times [s]; `scale` is that of joint angles."""
+    """Return a function of times [s]: `sensor_motion` of a random path between two rests."""
     sine, cosine = (
         random.normal(size=(2, 6, harmonics - 1)) * scale * _FOURIER_AMPLITUDES_RAD[:, np.newaxis]
     )
@@ -196,14 +196,14 @@ def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
 
 
 def _write_record(
-    out: Path, name: str, row: int, touches: tuple[FingertipPush, ...], random: np.random.Generator
+    out: Path, name: str, row: int, pushes: tuple[FingertipPush, ...], random: np.random.Generator
 ) -> None:
     from scipy.spatial.transform import Rotation
 
     t, motion_at = _jittered_clock(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
     wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_OFFSETS[row]
-    for touch in touches:
+    for touch in pushes:
         wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)

@@ -73,13 +73,13 @@ def summarize_grasped_object(alone: Identification) -> dict[str, Any]:
 
 def notes_on_grasped_object(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
+    if alone.mass < identification.MIN_SIGNIFICANT_STDS * deviation:
         excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
         return [f"no object: the total mass exceeds the gripper's by {excess}"]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = identification.consistency_margin(alone)
-    if margin < -identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
+    if margin < -identification.MIN_SIGNIFICANT_STDS * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"
@@ -88,7 +88,7 @@ def notes_on_grasped_object(alone: Identification) -> list[str]:
 
 
 def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:
-    """Return RMS and peak of |force|, |torque| and each channel, away from ends and gaps."""
+    """Return RMS and peak of |force|, |torque| and each channel; ends and gaps are excluded."""
     figures: dict[str, Any] = {}
     for name, suffix, wrench in (
         ("raw", "rms", found.measured),
@@ -138,7 +138,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
 
 
 def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return the shares of samples with |F| > `threshold` [N], of raw and corrected wrenches."""
+    """Return shares of samples with |F| > `threshold` [N] in tared, weightless, contact wrench."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

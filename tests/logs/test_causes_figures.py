@@ -45,7 +45,7 @@ def state_of(model: LoadModel, values: list[float], spans: tuple = ()) -> Simple
         (LoadModel(("frame",)), [0.01, -0.02, 0.03], "pose frame",
          {"position_in_sensor": [-0.01, 0.02, -0.03]}, "[-10, 20, -30] mm in S (+- 8.8 mm)"),
         (LoadModel(("rotation",)), [0.0, 0.3, -0.4], "sensor rotation",
-         {"rotation_vector": [0.0, 0.3, -0.4]}, "rotated by 28.65 deg (+- 0.5) against"),
+         {"rotation_vector": [0.0, 0.3, -0.4]}, "rotated by 28.65 deg (+- 0.5) relative to"),
         (LoadModel(gain_channels=(4,)), [0.2], "gain",
          {"gain": 1.2}, "tau_y reads 20.00 % (+- 0.83) more"),
         (LoadModel(("linear drift",)), [1.0, -2.0, 0.5, 0.1, 0.3, -0.2], "drift",

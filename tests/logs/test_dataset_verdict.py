@@ -38,18 +38,18 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"kind": "weight removed"}, ["already removed the load's weight"]),
         ({"axes": (-I3, -I3)}, ["the wrench is negated"]),
         ({"axes": (FLIP, FLIP)}, ["axis y of the wrench is reversed"]),
-        ({"axes": (I3, SKEW)}, ["the torque is turned by 30 deg about [0, 1, 0]"]),
-        ({"axes": (-SKEW, I3)}, ["the force is negated", "the force is turned by 30 deg"]),
+        ({"axes": (I3, SKEW)}, ["the torque is rotated by 30 deg about [0, 1, 0]"]),
+        ({"axes": (-SKEW, I3)}, ["the force is negated", "the force is rotated by 30 deg"]),
         ({"gains": np.array([1.05, 0.95])}, []),
         (
             {"gains": np.array([0.1, 1.0])},
-            ["the force is 0.1 times that in N: its unit is daN"],
+            ["the force is 0.1 times the value in N: its unit is daN"],
         ),
         (
             {"gains": np.array([1.0, 8.85])},
-            ["torque is 8.85 times that in N m: its unit is lbf in"],
+            ["torque is 8.85 times the value in N m: its unit is lbf in"],
         ),
-        ({"gains": np.array([1.3, 1.0])}, ["the force is 1.3 times that in N"]),
+        ({"gains": np.array([1.3, 1.0])}, ["the force is 1.3 times the value in N"]),
         ({"phi": 2.0 * TRUE_PHI}, ["another one: "]),
     ],
 )  # fmt: skip

@@ -582,5 +582,5 @@ def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
     for span, words in (((5.0, 9.0), "has 0 samples"), ((1.0, 1.001), "samples")):
         with pytest.raises(DrakeTeleopError, match=words):
             eliminate_log(path, load, untouched_s=span)
-    with pytest.raises(DrakeTeleopError, match="leave one of the two out"):
+    with pytest.raises(DrakeTeleopError, match="remove one of the two"):
         eliminate_log(path, load, untouched_s=(0.2, 0.9), tare=False)

@@ -1,4 +1,4 @@
-"""Candidate causes of a misfit: extensions of a model with a sufficiently large effect."""
+"""Candidate causes of a misfit: extensions of the wrench model with a sufficient effect."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERRO
 _MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
 _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD = 0.2
 _MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
-_SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
+_MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fit with one more extension; `score` is twice its gain in log likelihood, minus a cost."""
+    """Fit with one more extension; `score` is twice its gain in log likelihood minus a BIC cost."""
 
     name: str
     state: FittedModel
@@ -60,7 +60,7 @@ class Candidate:
 
 
 def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candidate]:
-    """Fit a model with each further extension, and yield those with sufficient effect."""
+    """Yield fits of a model with one further extension each, if its effect is sufficient."""
     model, data = state.model, state.data
     if is_first_round:
         yield from _axis_permutation_candidates(state)
@@ -144,7 +144,7 @@ def has_negative_mass(state: FittedModel) -> bool:
 
 
 def has_negative_inertia(state: FittedModel) -> bool:
-    """Return whether the inertia about So, or the mass if it is uncertain, is clearly negative."""
+    """Return True if mass, or inertia about So of a well determined mass, is clearly negative."""
     if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
@@ -179,7 +179,7 @@ def max_cable_stiffness_n_m(state: FittedModel) -> float:
 
 
 def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array, float, float]:
-    """Return the estimated gravity_W (3,), its angle [deg] and ratio to the description's."""
+    """Return estimated gravity_W (3,), its angle [deg] and size ratio to the described gravity."""
     given = state.data.gravity_W
     assert given is not None
     true = given - state.parameters_of_extension("gravity")[0]
@@ -189,7 +189,7 @@ def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array
 
 
 def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
-    """Return start parameters for fitting a very wrong direction of gravity; None if unknown."""
+    """Return start parameters with a linear estimate of the gravity direction; None if zero."""
     y = state.data.with_other_rows_zeroed(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -215,7 +215,7 @@ def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
 
 
 def drift_amplitudes(state: FittedModel) -> Array:
-    """Return bounds (6,) of the drift of the offsets from their means [N, N m]."""
+    """Return upper bounds (6,) of the offsets' drift about their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
     return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
 
@@ -247,12 +247,12 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, num_extra=1)
     if not abs(value[0]) < limit:  # a factor beside the known ratios is not a cause
-        found = replace(found, score=min(found.score, _SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR))
+        found = replace(found, score=min(found.score, _MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR))
     yield found
 
 
 def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
-    """Return fits with other torque units, within a factor of 2, that are nearly as likely."""
+    """Return nearly as likely fits with other unit factors, 0.5 to 2 times the torque factor."""
     factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
@@ -278,14 +278,14 @@ def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
     total = float(np.trace(sums[WRENCH_SIGNALS, WRENCH_SIGNALS][:3, :3]))
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
 
-    def square_with_axes(Q: Array) -> float:
+    def force_misfit(Q: Array) -> float:
         right = np.einsum("dc,cdp->p", Q, cross)
         found = inverse @ right
         return total - float(right @ found) if found[0] > 0.0 else total
 
     identity, *others = signed_permutations()
-    best = min(others, key=square_with_axes)
-    if square_with_axes(best) < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * square_with_axes(identity):
+    best = min(others, key=force_misfit)
+    if force_misfit(best) < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * force_misfit(identity):
         larger = state.refit(replace(state.model, axes=best), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
             found = _scored_candidate("axes", state, larger, num_extra=3)

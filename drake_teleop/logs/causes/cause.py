@@ -1,4 +1,4 @@
-"""Findings about a log, and causes of a misfit in words."""
+"""Findings about a log, and texts of the causes of a misfit."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
 
 def _wrong_axes_cause(Q: Array) -> Finding:
     rows = axis_names_of_rows(Q)
-    what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
+    what = f"the axes x, y, z of the wrench are {', '.join(rows)} of the motion"
     if (-np.eye(3) == Q).all():
         what = "the wrench has the opposite sign"
     return Finding("axes", what, values={"axes": rows, "matrix": Q.tolist()})
@@ -127,7 +127,7 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
             angle = float(np.linalg.norm(x))
             text = (
                 f"the sensor is rotated by {np.degrees(angle):.2f} deg"
-                f" (+- {np.degrees(wide.max()):.2g}) against the motion, about"
+                f" (+- {np.degrees(wide.max()):.2g}) relative to the motion's frame, about"
                 f" {_format_vector(x / (angle + 1e-12), 'in S', '.2f')}"
             )
         case "cable":
@@ -148,7 +148,7 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
 
 
 def direction_std_deg(x: Array, covariance: Array) -> float:
-    """Return the largest standard deviation of the direction of a vector x (3,) [deg]."""
+    """Return the standard deviation of x's direction about the least certain axis [deg]."""
     size = float(np.linalg.norm(x))
     across = np.eye(3) - np.outer(x, x) / size**2
     spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
@@ -192,8 +192,8 @@ def _gain_error_cause(state: FittedModel, c: int) -> Finding:
     value, covariance = state.parameters_of_extension(f"gain {c}")
     channel, wide = CHANNEL_NAMES[c], 1.96 * float(np.sqrt(covariance[0, 0]))
     text = (
-        f"{channel} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other channels"
-        " allow; calibrate the sensor"
+        f"{channel} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than expected from the"
+        " other channels; calibrate the sensor"
     )
     return Finding("gain", text, values={"channel": channel, "gain": 1.0 + float(value[0])})
 

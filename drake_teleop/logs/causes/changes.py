@@ -29,7 +29,7 @@ _MIN_MASS_STEP_OVER_MASS, _MIN_MOMENT_STEP_OVER_MASS_M = 0.01, 0.002
 
 
 def add_step_change(state: FittedModel, kind: str) -> FittedModel | None:
-    """Return the model with one more change of "offsets" or "load" (`kind`), at its likeliest time.
+    """Return a fit with one more change of "offsets" or "load" (`kind`), at the likeliest time.
 
     Return None if no change is significant.
     """
@@ -92,10 +92,6 @@ class _StepTimeScan:
 
 
 def _weighted_normal_equations(J: Array, residual: Array, sums: Array) -> tuple[Array, Array]:
-    """Return the normal equations of p parameters for sums (..., W, W) of products of W signals.
-
-    J (p, 6, W) are derivatives of the wrench and `residual` (6, W) coefficients, over the weights.
-    """
     gram = [J[:, c] @ sums @ J[:, c].T for c in range(6)]
     right = [sums @ residual[c] @ J[:, c].T for c in range(6)]
     return np.sum(gram, axis=0), np.sum(right, axis=0)
@@ -108,9 +104,10 @@ def fit_steps_at_middle_of_ramps(
     spans: TimeSpans,
     widths: Sequence[float] | None = None,
 ) -> FittedModel:
-    """Add changes of "offsets" or "load" (`kinds`) at the estimated middles of ramps.
+    """Return a fit with more changes of "offsets" or "load", in the middle of gradual transitions.
 
-    The ramps are near `times` [s] and `widths` [s] long; their rows are not used.
+    `kinds` lists the changes at each of `times` [s]. Rows within the transitions, which take
+    `widths` [s], are not used.
     """
     least = MIN_OMITTED_RAMP_SPAN_S
     widths = [max(least, w + least) for w in (widths or [0.0] * len(times))]
@@ -122,8 +119,8 @@ def fit_steps_at_middle_of_ramps(
     found = FittedModel.fit_record(state.data, model, start, (*spans, *around))
     steps = []
     for both, span in zip(kinds, around, strict=True):
-        own = range(first + len(steps), first + len(steps) + len(both))
-        middle = _estimate_ramp_middle(found, own, span)
+        added = range(first + len(steps), first + len(steps) + len(both))
+        middle = _estimate_ramp_middle(found, added, span)
         steps += [StepChange(kind, middle) for kind in both]
     model = replace(model, steps=(*state.model.steps, *steps))
     return FittedModel.fit_record(state.data, model, found.x, found.contact_spans)
@@ -152,14 +149,14 @@ def _squared_step_over_variance(state: FittedModel, i: int) -> float:
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _estimate_ramp_middle(state: FittedModel, own: range, span: tuple[float, float]) -> float:
+def _estimate_ramp_middle(state: FittedModel, added: range, span: tuple[float, float]) -> float:
     data = state.data
     rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
     def residual_with_steps_at(time: float) -> Array:
-        times = tuple(time if i in own else x.time for i, x in enumerate(state.model.steps))
+        times = tuple(time if i in added else x.time for i, x in enumerate(state.model.steps))
         y = data.append_step_signals(times)[rows][:, state.model.columns]
         return np.asarray(y @ state.residual.T)
 
@@ -212,7 +209,7 @@ _MAX_STEP_OVER_CONTACT_RESIDUAL, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
 
 
 def find_contact_spans(state: FittedModel) -> TimeSpans:
-    """Return time spans (start, stop) [s] of contact, whose residual far exceeds the usual one."""
+    """Return time spans (start, stop) [s] of contact, whose residual far exceeds that elsewhere."""
     blocks = _NormalEquationsOfBlocks(state)
     contact_blocks = blocks.find_contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
@@ -227,7 +224,7 @@ def find_contact_spans(state: FittedModel) -> TimeSpans:
 
 
 def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
-    """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
+    """Return a fit with changes of load and offsets instead of contacts; None if it fits badly."""
     blocks = _NormalEquationsOfBlocks(state)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_NUM_LOADS):
@@ -277,7 +274,7 @@ class _NormalEquationsOfBlocks:
         self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return flags of blocks `among` with a residual far above the usual; None for few."""
+        """Return flags of blocks `among` with a residual as in contact; None for too few blocks."""
         found = self._residual_levels_by_calm_fit(np.flatnonzero(among))
         if found is None:
             return None
@@ -360,7 +357,7 @@ def _residuals_by_motion_errors(
 
 
 def replace_steps_by_contact(state: FittedModel) -> FittedModel:
-    """Replace changes of the offsets by a contact if that explains the residual better."""
+    """Replace step changes by a contact if they cancel, or if the residual after one is large."""
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
     borders = [(-1, first), *((i, step.time) for i, step in steps), (-1, last)]
@@ -381,7 +378,7 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
 
 
 def shrink_contacts(state: FittedModel) -> FittedModel:
-    """Return a fit whose time spans of contact are shortened to rows with a large residual."""
+    """Return a fit whose contact spans are shortened to their rows with a large residual."""
     data, spans = state.data, []
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
     usual = np.maximum(data.wrench_noise, state.rows.residual_rms(state.residual)).clip(1e-12)

@@ -35,7 +35,7 @@ _MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S, _MAX_DELAY_ITERATIONS = 0.004, 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
-_MAX_RESIDUAL_OVER_OTHER_AXES = 2.0
+_MAX_RESIDUAL_RATIO_OF_SIMPLE_AXES = 2.0
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL, _MAX_CONTACT_RESIDUAL_SHARE = 0.2, 1.1, 0.5
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO, _MAX_EFFECTIVE_MISFIT_SHARE = 15.0, 0.9
@@ -67,7 +67,7 @@ SearchResult = tuple[FittedModel, float, list[Candidate]]
 def search_causes(
     data: BlockMeans, means_at: MeansAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
-    """Return the fitted model that explains a record, additional delay [s], and rejected causes."""
+    """Return the fit with the found causes, added motion delay [s], and rejected candidates."""
     plain = LoadModel(extensions=always_fitted)
     found = _search_causes_from(_initial_state(data, plain), 0.0, means_at)
     if has_negative_mass(found[0]):
@@ -96,7 +96,7 @@ def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
 
 
 def may_be_coloured_noise(state: FittedModel) -> bool:
-    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
+    """Return True for a moderate residual that smooth signals do not explain."""
     small = state.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
     return small and state.smooth_misfit < GOOD_SMOOTH_MISFIT
 
@@ -214,12 +214,12 @@ class MisfitExplanation:
     """Causes why a rigid load does not explain a wrench, and the load fitted with these causes.
 
     Attributes:
-        explained: whether the residual is sensor noise.
-        theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
-        misfit_deviations: (16,) standard deviations of theta due to the misfit.
+        explained: True if the residual is sensor noise.
+        theta, covariance: [offsets; phi] (16,) of the first part of the record [SI]; (16, 16).
+        misfit_deviations: (16,) standard deviations of theta if the misfit is unexplained.
         delay_s: additional delay of the motion behind the wrench [s].
-        loads: parts of the record with different loads, if the load changes.
-        always_fitted: quantities such as "gravity", which are no causes.
+        loads: parts of the record with their loads; empty for one load.
+        always_fitted: names of extensions, such as "gravity", that are fitted but are no causes.
     """
 
     causes: tuple[Finding, ...]
@@ -234,23 +234,23 @@ class MisfitExplanation:
 
     @property
     def is_misfit(self) -> bool:
-        """Whether the residual is clearly not noise: large, or explained by smooth signals."""
+        """True if the residual is clearly not noise: large, or explained by smooth signals."""
         smooth = self.state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
         return not self.explained and (self.is_residual_large or smooth)
 
     @property
     def is_residual_large(self) -> bool:
-        """Whether the residual is too large for coloured noise of the sensor."""
+        """True if the residual is too large for coloured sensor noise."""
         return self.state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
 
     @property
     def is_acceleration_missing(self) -> bool:
-        """Whether the misfit may be the force of an acceleration that the record lacks."""
+        """True if the record lacks an acceleration whose force may cause the misfit."""
         return not self.explained and bool(np.isinf(self.state.data.acceleration_noise))
 
     @property
     def has_several_gains(self) -> bool:
-        """Whether several gain errors were found, which only approximate a full gain matrix."""
+        """True if the found gain errors only approximate a full gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.extensions)
         return len(model.gain_channels) > 1 or bool(model.gain_channels and others)
@@ -262,7 +262,7 @@ def explain_misfit(
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
     The model contains the extensions `always_fitted`, such as "weight", from the start.
-    `means_at` returns the record with an additional delay [s].
+    `means_at(x)` returns the block means with an additional motion delay x [s].
     """
     with one_blas_thread():
         state, delay_s, rejected = search_causes(data, means_at, always_fitted)
@@ -287,10 +287,10 @@ def explain_misfit(
 
 
 def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
-    """Return the unweighted fit, as uncertain as if all residuals were one error.
+    """Return the unweighted fit of a record without acceleration, with a pessimistic covariance.
 
-    A missing acceleration depends on the orientation, so that it does not average out. It may be
-    that of a rotation about any point, so that the inertia remains undetermined.
+    The missing acceleration depends on the orientation, so that all residuals count as one common
+    error. The inertia is undetermined, because S may rotate about any point.
     """
     data, axes = why.state.data, why.state.model.axes
     fits = []
@@ -302,7 +302,7 @@ def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
             state = fit_model(model, state.rows, state.x, iterations=2)
         fits.append(state)
     # A rotation that is not right-angled resembles several permutations of axes.
-    limit = _MAX_RESIDUAL_OVER_OTHER_AXES * fits[0].residual_ratio
+    limit = _MAX_RESIDUAL_RATIO_OF_SIMPLE_AXES * fits[0].residual_ratio
     simple = (x for x in fits[1:] if x.x[6] > 0.0 and x.residual_ratio < limit)
     state = next(simple, fits[0])
     covariance = float(data.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]
@@ -318,5 +318,5 @@ def _no_load_cause(state: FittedModel, covariance: Array) -> list[Finding]:
     if not (mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1):
         return []
     most = mass + 1.96 * deviation
-    text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
+    text = f"the load on the sensor is below {1e3 * most:.2g} g; only the offsets are identified"
     return [Finding("no load", text, values={"mass_limit": most})]

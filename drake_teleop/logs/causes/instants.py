@@ -51,8 +51,8 @@ class BlockMeans:
         used: (M,) True for rows without gaps and edges.
         wrench_noise: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        acceleration_noise: standard deviation of its noise in a block mean [m/s^2];
-            inf if the acceleration is unknown and taken as zero.
+        acceleration_noise: standard deviation of acceleration noise in a block mean [m/s^2]; inf if
+            the acceleration is unknown and taken as zero.
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 
@@ -67,7 +67,7 @@ class BlockMeans:
 
     @cached_property
     def has_enough_acceleration(self) -> bool:
-        """Whether the accelerations are large enough to separate inertia from weight."""
+        """True if accelerations exceed their noise enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_ALPHA_NOISE_SHARE
         a = (self.y[:, SPECIFIC_FORCE_SIGNALS] + self.y[:, GRAVITY_SIGNALS])[self.used]
@@ -88,10 +88,10 @@ class BlockMeans:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
-        """Return y (M, 67) with 25 columns appended for each time [s].
+        """Return y (M, 67) with 25 columns appended for each step time [s].
 
-        They repeat those columns of y that model the load's wrench (a constant and the motion),
-        and are 0 before that time.
+        These are the columns of y in the load's wrench and offsets, times 0 before and 1 after the
+        step.
         """
         parts = [self.y]
         for time in times:
@@ -100,7 +100,7 @@ class BlockMeans:
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
-        """Return sums over blocks of products of y (M, W) with earlier y, (blocks, lags, W, W)."""
+        """Return block sums of products of y (M, W) with earlier rows: (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -123,10 +123,10 @@ def block_means_of_record(
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
 ) -> BlockMeans:
-    """Return block means of a record with N samples at even times `t` [s].
+    """Return block means of a record with N samples at equally spaced times `t` [s].
 
     The wrench (N, 6) is [f; tau] on the load, in S about So, Eq. (1). `gravity_W` is in the world
-    [m/s^2], None without orientation. Samples with `lost` True are ignored.
+    [m/s^2], None without orientation. Blocks with a `lost` sample are not used.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_INSTANT_RATE_HZ * dt)), -(-len(t) // _MAX_INSTANTS))
@@ -212,10 +212,10 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
 
 
 def delay_of_linear_fit(data: BlockMeans) -> float:
-    """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
+    """Return the motion delay behind the wrench [s], within +-0.25 s, with the best linear fit.
 
-    The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.
-    Return 0 if the smallest residual is at an end of the range.
+    The fit combines 16 motion signals freely, without a rigid load. Return 0 if the best delay is
+    at an end of the range.
     """
     reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

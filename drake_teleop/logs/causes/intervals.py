@@ -44,7 +44,7 @@ def load_covariance(
 def load_deviations_if_unexplained(
     state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
-    """Return jackknife deviations (16,) of [offsets; phi], widened for an unexplained misfit."""
+    """Return jackknife standard deviations (16,) of [offsets; phi] with an unexplained misfit."""
     large = state.residual_ratio > _LARGE_RESIDUAL_RATIO
     limits = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL, _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
     if state.smooth_misfit > limits[large]:
@@ -68,7 +68,7 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
 
 
 def load_covariance_by_gain_errors(state: FittedModel) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] due to gain errors; 0 if implausible."""
+    """Return the covariance (16, 16) of [offsets; phi] due to gain errors; 0 if unlikely."""
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
     unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
@@ -124,7 +124,7 @@ def load_bias_by_alpha_noise(state: FittedModel) -> Array:
 
 
 def widening_factor_by_misfit(state: FittedModel, jackknife_std: Array) -> float:
-    """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
+    """Return the factor by which misfit widens all standard deviations; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.covariance)[OFFSETS_AND_LOAD])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0

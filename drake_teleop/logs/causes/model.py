@@ -38,7 +38,7 @@ SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class StepChange:
-    """Change of the offsets (6 parameters) or of the load (10 parameters) at `time` [s]."""
+    """Change of offsets (`kind` "offsets", 6 parameters) or load ("load", 10) at `time` [s]."""
 
     kind: str
     time: float
@@ -46,14 +46,14 @@ class StepChange:
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """Rigid load with a selection of extensions, such as drift or a rotated sensor.
+    """Model of the wrench: rigid load with selected extensions, such as drift or a rotated sensor.
 
     Attributes:
         extensions: names of extensions, such as "gravity" or "drift".
-        gain_channels: numbers of the wrench channels whose gain is estimated.
+        gain_channels: indices 0 to 5 of the wrench channels whose gain is estimated.
         steps: changes of offsets or load.
         axes: (3, 3) signed permutation, from the motion's axes to the wrench's.
-        torque_factor: given factor on the torque; the extension "torque factor" corrects it.
+        torque_factor: fixed factor on the torque; the extension "torque factor" corrects it.
     """
 
     extensions: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ class LoadModel:
 
     @cached_property
     def parameter_slices(self) -> dict[str, slice]:
-        """Positions of the parameters of extensions, "gain c" (channel c) and "step i"."""
+        """Slices of the parameter vector for each extension, "gain c" (channel c) and "step i"."""
         out, at = {}, DELAY_INDEX + 1
         sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
         sizes += [(f"gain {c}", 1) for c in self.gain_channels]
@@ -85,7 +85,7 @@ class LoadModel:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
+        """Indices (k,) of the used signals among the columns of `append_step_signals`."""
         kept = np.ones(_columns_of_step(len(self.steps)).start, bool)
         if not {"gravity", "cable"} & set(self.extensions):
             kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
@@ -95,7 +95,7 @@ class LoadModel:
 
     @cached_property
     def max_parameter_changes(self) -> Array:
-        """Largest change (size,) of each parameter in one iteration."""
+        """Largest allowed change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
         out[DELAY_INDEX] = _MAX_DELAY_CHANGE_PER_ITERATION_S
         for name, where in self.parameter_slices.items():
@@ -108,7 +108,7 @@ class LoadModel:
         return tuple(step.time for step in self.steps)
 
     def start_parameters(self, x: Array, other_model: LoadModel) -> Array:
-        """Return parameters (size,) from those of `other_model`, x; new ones are 0."""
+        """Return parameters (size,): values x of `other_model` where it has them, else 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
         for name, where in self.parameter_slices.items():
@@ -117,7 +117,7 @@ class LoadModel:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
+        """Return the model's wrench for x (B, size), as coefficients (B, 6, W) of W signals."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, _columns_of_step(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
@@ -169,7 +169,7 @@ class LoadModel:
         return M
 
     def wrench_derivative(self, x: Array) -> Array:
-        """Return d coefficients / dx (size, 6, k), of k signals in the wrench by parameters x."""
+        """Return derivatives (size, 6, k) by x of the wrench's coefficients of k used signals."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
             steps[self.parameter_slices["rotation"]] = _ROTATION_DIFFERENCE_STEP_RAD
@@ -179,7 +179,7 @@ class LoadModel:
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual_coefficients(self, x: Array) -> Array:
-        """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
+        """Return measured minus model wrench for x (size,): coefficients (6, k) of used signals."""
         out = -self.wrench_coefficients(x[None])[0]
         out[np.arange(6), instants.WRENCH_SIGNALS.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])

@@ -20,7 +20,7 @@ TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
 
 @dataclass(frozen=True, eq=False)
 class UsedRows:
-    """Rows of a record with `used` (M,) True, and the columns of its signals that a model needs."""
+    """Rows of a record (`used` (M,) True) and signal columns to which a model is fitted."""
 
     data: BlockMeans
     used: NDArray[np.bool_]
@@ -34,12 +34,12 @@ class UsedRows:
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of products of W signals at lags of 0 to 4 rows."""
+        """Sums (5, W, W) of products of W used signals at lags of 0 to 4 rows."""
         return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
     def rows_with_four_predecessors(self) -> NDArray[np.intp]:
-        """Indices of rows whose four predecessors are used, too."""
+        """Indices of used rows whose four predecessors are used, too."""
         padded = np.pad(self.used, (instants.MAX_NOISE_LAG, 0))
         return np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).all(axis=1))
 
@@ -53,7 +53,7 @@ class UsedRows:
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
-        """Return sums of products (6, n, n) of n signals, whitened by 5-tap filters (6, 5)."""
+        """Return sums of products (6, n, n) of n signals after whitening by the filters (6, 5)."""
         width = self.y.shape[1]
         taps = [(filters[:, : 5 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(5, -1)
@@ -64,7 +64,7 @@ class UsedRows:
     def noise_filters_and_power(
         self, residual_coefficients: Array, floor: Array, is_white: bool = False
     ) -> tuple[Array, Array]:
-        """Return whitening filters (6, 5) and noise power (6,) >= `floor` (6,) of the residual."""
+        """Return the residual's whitening filters (6, 5) and noise power (6,), at least `floor`."""
         e = self.y @ residual_coefficients.T
         filters = np.eye(1, instants.MAX_NOISE_LAG + 1).repeat(6, axis=0)
         now = self.rows_with_four_predecessors
@@ -93,8 +93,8 @@ _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS 
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 _NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
 # (18, 27) from rotation-position products to the signals of a symmetric stiffness.
-_STIFFNESS_ENTRIES = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
-_STIFFNESS_SIGNALS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRIES])
+_STIFFNESS_ENTRY_MASKS = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
+_STIFFNESS_SIGNAL_ROWS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRY_MASKS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class FittedModel:
 
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
-        residual: (6, W) coefficients of the residual in the signals y.
+        residual: (6, k) residual wrench as coefficients of the signals `rows.y`.
         noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
         noise_power: (6,) variance of the whitened residual.
         contact_spans: (start, stop) of contacts, whose rows are not used [s].
@@ -146,7 +146,7 @@ class FittedModel:
         return self.x[where], self.covariance[where, where]
 
     def normal_equations(self, model: LoadModel, x: Array) -> tuple[Array, Array]:
-        """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
+        """Return gram (size, size) and right side (size,) of the normal equations at x (size,)."""
         whitened = self.rows.whitened_products(self.noise_filters) / self.noise_power[:, None, None]
         J = model.wrench_derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
@@ -156,7 +156,7 @@ class FittedModel:
 
     @cached_property
     def likelihood(self) -> float:
-        """Logarithm of the likelihood of all rows; contacts have separate noise."""
+        """Log likelihood of all rows; rows in contact have a separate noise power."""
         count = len(self.rows.rows_with_four_predecessors)
         own = -0.5 * count * float(np.log(self.noise_power).sum())
         if not self.contact_spans:
@@ -176,13 +176,13 @@ class FittedModel:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """`gain_by_smooth_signals` per degree of freedom; about 1 or less for noise."""
+        """`gain_by_smooth_signals` per degree of freedom; about 1 or less for noise alone."""
         gain, freedom = self.gain_by_smooth_signals
         return gain / max(1, freedom - self.model.size)
 
     @cached_property
     def gain_by_smooth_signals(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
+        """Gain in twice the log likelihood by adding generic smooth signals, and their number."""
         y = self.data.y
         segments = _NUM_TIME_SEGMENTS_OF_MISFIT_TEST
         part = np.linspace(0.0, segments, len(y), endpoint=False).astype(int)
@@ -190,7 +190,7 @@ class FittedModel:
         if self.data.gravity_W is not None:
             parts.append(y[:, instants.ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNALS.T)
+            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNAL_ROWS.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_four_predecessors, self.noise_filters
@@ -204,7 +204,7 @@ class FittedModel:
         return gain, freedom
 
     def score_of_larger_model(self, model: LoadModel) -> float:
-        """Return the first-order gain of twice the log likelihood by fitting a larger model."""
+        """Return the first-order gain in twice the log likelihood with a larger model."""
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
         residual = self.residual if rows is self.rows else model.residual_coefficients(x)
@@ -255,7 +255,7 @@ def regularized_inverse(gram: Array) -> Array:
 
 
 def score_statistic(gram: Array, right: Array, min_diagonal: ArrayLike = 0.0) -> tuple[float, int]:
-    """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
+    """Return right^T gram^-1 right, the gain in twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(min_diagonal, 1e-12 * diagonal.max())
     if not used.any():

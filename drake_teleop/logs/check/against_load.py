@@ -1,4 +1,4 @@
-"""Corrections of signs, axes, units and clocks of log descriptions that let a load fit, Eq. (5)."""
+"""Corrections of signs, axes, units and clocks in log descriptions so that a load fits, Eq. (5)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
 
 @dataclass(frozen=True)
 class LoadFitQuality:
-    """Fit of a load to a log, Eq. (5): shares of residual and white noise in the variance."""
+    """Quality of a fit; residual (`unexplained`) and noise are shares of the wrench's variance."""
 
     unexplained: float
     mass: float
@@ -60,17 +60,17 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        """Whether the fitted load has a positive mass and explains the wrench."""
+        """True if the fitted load has a positive mass and explains the wrench."""
         limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
         return self.mass > 0 and self.unexplained < limit
 
     def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
-        """Return the largest accepted `unexplained`: that of the noise plus the given share."""
+        """Return the largest accepted `unexplained`: the noise share plus `share_beside_noise`."""
         return min(share_beside_noise + self.noise_share, MIN_UNDETERMINED_UNEXPLAINED)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
-    """Fit load and offsets to the best fitting share of a log, below 15 Hz unless it is static."""
+    """Return the quality of a load's fit to the best fitting `kept_share` of a low-passed log."""
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
@@ -109,7 +109,7 @@ def _fit_load_parameters(V: Array, w: Array) -> Array:
 
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
-    """Return the variance of a residual (N, 6) over the wrench's; force and torque count alike."""
+    """Return the residual's variance over the wrench's; force and torque have equal weights."""
     scale = _wrench_channel_scales(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
@@ -132,7 +132,7 @@ _MAX_UNEXPLAINED_RATIO_BY_CLOCK_DRIFT = 0.5
 def check_wrench_and_estimate_delay(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], float | None]:
-    """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
+    """Return findings on wrench, orientation and clocks; motion delay behind the wrench [s]."""
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
@@ -158,7 +158,7 @@ def check_wrench_and_estimate_delay(
         without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
         found = _edits_with_far_better_fit(without_contact, without_contact(description), tried)
     if not found and given.is_good:
-        return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
+        return lag_findings(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
         return _findings_without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
@@ -170,10 +170,10 @@ def check_wrench_and_estimate_delay(
         if shift:  # of the clock of the wrench, to the nearest 20 ms
             delay = shift + (delay or 0.0)
     if finding is None:
-        return lag_finding(description, delay), delay
+        return lag_findings(description, delay), delay
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
-    return [replace(finding, message=message), *lag_finding(description, delay)], delay
+    return [replace(finding, message=message), *lag_findings(description, delay)], delay
 
 
 def _edits_with_far_better_fit(
@@ -181,7 +181,7 @@ def _edits_with_far_better_fit(
     given: LoadFitQuality,
     tried: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
-    """Return edits with which a load of positive mass fits far better, else with opposite sign."""
+    """Return (fit, finding, description) of edits with a far better fit and a positive mass."""
     positive, negative = [], []
     for finding, edited in tried:
         fit = edits.call_or_none_if_unreadable(fit_description, edited)
@@ -252,11 +252,11 @@ def _findings_without_remedy(
         # Contacts bias the delay.
         lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
         delay = estimate_delay(replace(log, bridged=lost), 30.0)
-    return lag_finding(description, delay), delay
+    return lag_findings(description, delay), delay
 
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """Return a finding if a record does not determine the mass of a load."""
+    """Return a finding if the record does not determine the mass of the load, else None."""
     if load.verdicts[6] != "not" and unexplained < MIN_UNDETERMINED_UNEXPLAINED:
         return None
     deviation = float(load.standard_deviations[6])
@@ -288,7 +288,7 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
         yield None, edits.edit_field(description, "wrench.time.offset", offset)
 
 
-def lag_finding(description: Description, delay: float | None) -> list[Finding]:
+def lag_findings(description: Description, delay: float | None) -> list[Finding]:
     if delay is None or abs(delay) <= MIN_REPORTED_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
@@ -309,7 +309,7 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
 def clock_drift_finding_and_correction(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], Description]:
-    """Return a finding for a steadily growing delay, and the corrected description."""
+    """Return a finding, if the delay grows steadily, and the corrected description."""
     name = "imu" if description.pose is None else "pose"
     stream = getattr(description, name)
     if stream is None or description.wrench is None or (description.imu and description.pose):

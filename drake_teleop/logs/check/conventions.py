@@ -1,4 +1,4 @@
-"""Wrong units, signs, axes and clocks in a log description, found by the laws of motion."""
+"""Wrong units, signs, axes and clocks in a log description, found in the data by laws of motion."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest rea
 
 @dataclass(frozen=True)
 class ConventionCheckResult:
-    """Findings of the checks, fit of a load after IMU corrections, and delay of the motion [s]."""
+    """Findings on a description, load fit, IMU mounting, motion delay behind the wrench [s]."""
 
     findings: tuple[Finding, ...]
     fit: LoadFitQuality
@@ -62,10 +62,10 @@ def findings_if_load_is_suspicious(
     delay: float | None,
     check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
-    """Return findings, except "lag", of a log whose identified load is suspicious.
+    """Return findings, except "lag", on the description of a log whose load is suspicious.
 
-    The load predicts the wrench `predicted` (N, 6). `check` checks the log's description against
-    its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
+    `predicted` (N, 6) is the wrench by the load. `check` compares the description with the data.
+    Raise DrakeTeleopError if the load is useless and a remedy is known.
     """
     if _is_wrench_constant(log):
         what = "the wrench is the same in all samples: no load can be identified"
@@ -195,7 +195,7 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     if not log.static:
         return []
     if len(log) < _MIN_CHECKED_POSES:
-        remedy = "record 12, turned about two horizontal axes"
+        remedy = "record 12 poses, rotated about two horizontal axes"
         text = f"{len(log)} poses at rest are too few to check the fit; {remedy}"
         return [Finding("static poses", text)]
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
@@ -205,7 +205,7 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     text = (
         "the poses are too alike: along one direction gravity in S varies by only"
         f" {np.degrees(np.arcsin(least)):.2g} deg, which does not separate offsets from the load;"
-        " add poses that are turned by 45 deg or more about two horizontal axes"
+        " add poses that are rotated by 45 deg or more about two horizontal axes"
     )
     return [Finding("static poses", text)]
 
@@ -218,7 +218,6 @@ _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 def _dead_or_repeated_channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
-    """Return findings about dead and repeated channels of the stream "wrench" or "imu"."""
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}
@@ -236,7 +235,7 @@ def _dead_or_repeated_channel_findings(
             parts = [f"{column}[{i}]" for i in range(len(x))] if len(x) > 1 else [str(column)]
             numbers |= zip(parts, x, strict=True)
         remedy = f"name another column in {where}.columns, or record again"
-        text = "in all rows, and its neighbours are not: the channel is dead or not connected"
+        text = "in all rows, but other channels vary: the channel is dead or not connected"
         for name in _dead_channels(numbers):
             value = f"{name!r} is {numbers[name][0]:.4g}"
             found.append(Finding("dead channel", f"{value} {text}; {remedy}"))
@@ -255,7 +254,7 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
         if before is not None:
             both = "twice" if before == where else f"in {before}.columns too"
             text = f"{where}.columns names {column!r} {both}: one number cannot be two channels"
-            remedy = f"set {where}.columns to three columns of their own"
+            remedy = f"set {where}.columns to three different columns"
             found.append(Finding("repeated channel", f"{text}; {remedy}"))
     return found
 

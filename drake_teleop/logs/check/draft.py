@@ -91,7 +91,7 @@ _RAW_ACCELERATION_NOTE = (
     " m/s^2, or one for each axis; the gyroscope is probably in counts too."
 )
 _NO_TORQUE_NOTE = "A force alone is not enough: the commands need force and torque."
-_NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
+_NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate: 500}, in Hz."
 
 
 class Draft(NamedTuple):
@@ -115,7 +115,7 @@ class Draft(NamedTuple):
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
-    """Join drafts of a log description; the first draft with a stream provides it."""
+    """Join drafts of a log description: each stream is from the first draft that contains it."""
     streams: dict[str, Any] = {}
     for draft in drafts:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
@@ -137,8 +137,8 @@ _Columns = dict[str, list[str]]  # names of the columns of each recognized vecto
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
-    """Guess a log description from the names and magnitudes of a table's columns."""
-    plain = {name: _split_name_and_unit(name) for name in table.columns}
+    """Return a log description guessed from names and magnitudes of columns."""
+    plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
     found |= _find_vectors_in_array_columns(table, plain)
@@ -148,8 +148,8 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
-        beside = next(iter(groups.values()))["columns"][0]
-        return {**file, "time": _draft_time(table, plain, beside), **groups}
+        vector_column = next(iter(groups.values()))["columns"][0]
+        return {**file, "time": _draft_time(table, plain, vector_column), **groups}
 
     pair = {x: found.get(x, [_FILL_IN_TEXT] * 3) for x in ("force", "torque")}
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
@@ -198,7 +198,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     return Draft(draft, head)
 
 
-def _split_name_and_unit(name: str) -> tuple[str, str]:
+def _normalized_name_and_unit(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
     if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
@@ -231,7 +231,7 @@ def _find_vectors(plain: _NamesAndUnits) -> _Columns:
 
 
 def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
-    """Return the columns of each vector of this kind, whole ones if there are any, by its name."""
+    """Return the columns of each vector of a `kind`, by its name; only complete vectors, if any."""
     axes = "wxyz" if kind == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
     groups: dict[str, dict[str, str]] = {}
@@ -379,15 +379,15 @@ def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[st
     return pose
 
 
-def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, Any]:
+def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict[str, Any]:
     named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
     named = named or _clock_columns(table, plain)
     if not named:
         return {"column": _FILL_IN_TEXT}
-    if beside in table.columns:
-        structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
+    if vector_column in table.columns:
+        structure, rows = vector_column.rpartition(".")[0], len(table.columns[vector_column])
         named.sort(key=lambda name: len(table.columns[name]) != rows)
         named.sort(key=lambda name: name.rpartition(".")[0] != structure)
     unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")

@@ -1,4 +1,4 @@
-"""Edits of a log description, each for one suspected error, and the log that they give."""
+"""Edits of a log description, each for one suspected error, and logs read with these edits."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _lists_to_tuples(value: Any) -> Any:
 def correct_accelerometer_unit(
     description: Description, log: Log
 ) -> tuple[list[Finding], Description]:
-    """Return a finding for an accelerometer in a wrong unit, and the corrected description.
+    """Return a finding if the accelerometer is in a wrong unit, and the corrected description.
 
     If no unit fits, the finding has no fields, and the description is unchanged.
     """
@@ -92,7 +92,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
         text = "the accelerometer reads g - a: gravity is reversed"
-        note = " (or turn the vector `gravity` if z points down)"
+        note = " (or reverse the vector `gravity` if z points down)"
         yield _make_edit(description, "reversed gravity", text, {"imu.sign": -imu.sign}, note)
     where = "static.orientation" if description.static else "pose.orientation"
     orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
@@ -112,7 +112,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
         yield _make_edit(description, "quaternion order", text, fields)
     for axes in EULER_AXES if orientation.form == "euler" else ():
         if axes != orientation.axes:
-            text = f"the Euler angles do not turn about {orientation.axes}"
+            text = f"the Euler angles are not about the axes {orientation.axes}"
             yield _make_edit(description, "Euler axes", text, {f"{where}.axes": axes})
     if orientation.form in ("rotation_vector", "euler"):
         text = f"the angles are not in {orientation.unit}"
@@ -121,7 +121,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
 
 
 def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -> Edit:
-    """Return finding and description of an edit, with the sign of the wrench inverted, too."""
+    """Return finding and description of an edit, with the sign of the wrench also inverted."""
     stream = "static" if description.static else "wrench"
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
@@ -170,15 +170,15 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         fields = {f"{stream}.frame": (R @ old).tolist()}
-        yield _make_edit(description, "swapped axes", "the wrench is in other axes", fields)
+        yield _make_edit(description, "swapped axes", "the axes of the wrench are rotated", fields)
 
 
 _THINNED_RATE_HZ = 100.0
-_THIN_TIME_PREFIX = "thinned time stamps of"
+_THINNED_TIME_COLUMN_PREFIX = "thinned time stamps of"
 
 
 class LogTables:
-    """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
+    """Tables of a log in memory, complete and thinned to about 100 Hz."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source, self.tables = source, tables
@@ -198,11 +198,11 @@ class LogTables:
         return read_described_log(description, self._source, tables=self.tables)
 
     def read_thinned_log(self, description: Description) -> Log:
-        """Return the log at about 100 Hz, as a description defines it."""
+        """Return the thinned log (about 100 Hz), read as `description` defines it."""
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
-                column = {"column": f"{_THIN_TIME_PREFIX} {name}", "unit": "s"}
+                column = {"column": f"{_THINNED_TIME_COLUMN_PREFIX} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
                 stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
@@ -211,10 +211,10 @@ class LogTables:
     def start_lag_and_clock_drift_correction(
         self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
     ) -> tuple[float, str, Description]:
-        """Return a stream's lag at its first row [s], lines to set, and the edited description.
+        """Return a stream's lag at its first row [s], corrected lines, and the edited description.
 
-        The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row, and by
-        `drift` [s/s] more each second.
+        The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row. The
+        lag grows by `drift` [s/s].
         """
         time = getattr(description, name).time
         start = self._start_time_of_stream(getattr(description, name))
@@ -256,7 +256,7 @@ class LogTables:
         if getattr(stream, "time", None) is not None:
             t, rows = self._times_and_rows(stream)
             means = _means_of_consecutive_rows(t[:, None], block_rows)
-            thinned.columns[f"{_THIN_TIME_PREFIX} {name}"] = means
+            thinned.columns[f"{_THINNED_TIME_COLUMN_PREFIX} {name}"] = means
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):

@@ -1,4 +1,4 @@
-"""Checks of the described motion: IMU against itself and the pose, unit and frame of poses."""
+"""Checks of the described motion: IMU signals, IMU against pose, unit and frame of poses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0
 
 
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Return a contradiction among an IMU's signals, if any, and the corrected description."""
+    """Return up to one finding on contradictory IMU signals, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
@@ -130,9 +130,10 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
 
 
 def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
-    """Return mean specific forces (2, n, 3) in n Hann windows, and half a window later.
+    """Return mean specific forces (2, n, 3) in n Hann windows, and in windows half a length later.
 
-    The gyroscope, its axes permuted by `gyro_axes`, rotates them to the axes at the window's start.
+    Integrated angular velocity, its axes permuted by `gyro_axes`, rotates them to the axes at the
+    start of the window.
     """
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_GRAVITY_WINDOW_RANGE_S))
     half = max(1, int(0.5 * length / log.dt))
@@ -189,7 +190,7 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
 def check_imu_against_pose(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], Mounting | None, Description]:
-    """Return contradictions of IMU and pose, the IMU's mounting, and the corrected description."""
+    """Return findings on IMU against pose, the IMU's mounting, and the corrected description."""
 
     def fit_mounting(edited: Description) -> Mounting | None:
         pose_alone = edited.model_copy(update={"imu": None})
@@ -240,7 +241,7 @@ def check_imu_against_pose(
         frame = R @ (np.array(old) if isinstance(old, tuple) else np.eye(3))
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        text = f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S;"
+        text = f"the IMU is rotated by {given.rotation_angle_deg:.0f} deg relative to S;"
         oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
         findings.append(Finding(kind, f"{text} set imu.frame: {shown}{oblique}"))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
@@ -280,9 +281,9 @@ _COM_TOLERANCE_OF_WRONG_TORQUE_UNIT = 0.03
 def position_unit_or_origin_findings(
     description: Description, data: LogTables, lag: float
 ) -> list[Finding]:
-    """Return findings for positions in a wrong unit, or of a point other than So.
+    """Return a finding if positions have a wrong unit, or are not of the described point.
 
-    They are compared with the accelerometer, whose clock lags the pose's by `lag` [s].
+    The reference is the accelerometer, whose clock lags that of the pose by `lag` [s].
     """
     imu, pose = description.imu, description.pose
     if imu is None or pose is None or imu.specific_force is None or pose.position is None:
@@ -302,8 +303,8 @@ def position_unit_or_origin_findings(
     columns = np.concatenate([(s + g)[:, :, None], lever_matrix(omega, alpha)], axis=2)
     columns, by_pose = (low_pass(x, sensed.dt, _ACCELERATION_CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
-    independent = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
-    fit = _fit_centred_signals(columns[inner], by_pose[inner], independent)
+    num_samples = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
+    fit = _fit_centred_signals(columns[inner], by_pose[inner], num_samples)
     if fit is None or abs(fit[0][0]) <= _MIN_ERROR_OVER_DEVIATION * fit[1][0]:
         return []
     x, deviations = fit
@@ -330,7 +331,7 @@ def position_unit_or_origin_findings(
 def _position_unit_finding(described: str, scale: float, deviation: float) -> Finding | None:
     if not abs(scale) > _MIN_ERROR_OVER_DEVIATION * deviation:
         return None
-    text = f"the acceleration of the positions is {1.0 / scale:.3g} times the measured one:"
+    text = f"the acceleration by the positions is {1.0 / scale:.3g} times the measured one:"
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[described]
         if unit != described and _UNIT_MATCH_RANGE[0] < scale / ratio < _UNIT_MATCH_RANGE[1]:
@@ -339,11 +340,11 @@ def _position_unit_finding(described: str, scale: float, deviation: float) -> Fi
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(scale) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
     remedy = f"multiply pose.position.scale (1 by default) by {scale:.4g}"
-    return Finding("units", f"{text} their unit is not known; {remedy}")
+    return Finding("units", f"{text} their unit is unknown; {remedy}")
 
 
 def _fit_centred_signals(
-    columns: Array, target: Array, independent: float
+    columns: Array, target: Array, num_samples: float
 ) -> tuple[Array, Array] | None:
     if len(columns) == 0:
         return None
@@ -357,12 +358,12 @@ def _fit_centred_signals(
         return None
     inverse = np.linalg.inv(gram)
     x = inverse @ ((A / size).T @ b)
-    variance = float(np.sum((b - (A / size) @ x) ** 2)) / (target.shape[1] * max(1.0, independent))
+    variance = float(np.sum((b - (A / size) @ x) ** 2)) / (target.shape[1] * max(1.0, num_samples))
     return x / size, np.sqrt(variance * np.diag(inverse)) / size
 
 
 def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
-    """Return a finding for positions in a wrong unit, or for a pose frame that is not S."""
+    """Return a finding if positions have a wrong unit or the pose frame is not S, else None."""
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
     seen = found.units_and_axes
@@ -375,7 +376,7 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
 
 
 def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
-    """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
+    """Return a finding if the pose frame is not S; None if another error is as likely."""
     frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.parameters.theta[6:]
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None

@@ -1,4 +1,4 @@
-"""Size of the recorded motion beyond the noise of poses and IMU."""
+"""Size of the recorded motion, without the noise of poses and IMU."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from drake_teleop.logs.read.canonical import Log
 
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.17, 0.06
 """Least rms of specific force [m/s^2] (gravity turned by 1 deg) and angular velocity [rad/s]."""
-MORE_MOTION_REMEDY = "record 10 s of brisk turns about all axes, as `drake-teleop excite` designs"
+MORE_MOTION_REMEDY = "record 10 s of fast rotations about all axes (see `drake-teleop excite`)"
 _BLOCK_S, _MIN_BLOCKS, _CUTOFF_HZ = 0.1, 8, 5.0
 _MAX_NOISE_OVER_MOTION, _MIN_CUTOFF_HZ = 0.1, 2.0
 
 
 def motion_rms(log: Log) -> tuple[float, float]:
-    """Return the rms of specific force [m/s^2] and angular velocity [rad/s] without noise."""
+    """Return rms changes of specific force [m/s^2] and angular velocity [rad/s], without noise."""
     smooth = low_pass_log(log, min(_CUTOFF_HZ, 0.2 / log.dt))
     s, omega = (float(np.linalg.norm(x.std(axis=0))) for x in smooth.motion[:2])
     if log.posed is None:
@@ -33,7 +33,7 @@ def motion_rms(log: Log) -> tuple[float, float]:
 
 
 def max_cutoff_by_pose_noise(log: Log) -> float:
-    """Return the cut-off [Hz] below which noise of positions is small in the specific force."""
+    """Return the cut-off [Hz] below which position noise is small in specific force, or inf."""
     by_pose = None if log.posed is None else _motion_rms_of_poses(log.posed)
     if log.posed is None or by_pose is None:
         return np.inf
@@ -46,7 +46,7 @@ def max_cutoff_by_pose_noise(log: Log) -> float:
 
 
 def too_little_motion(log: Log) -> str | None:
-    """Return why motion beyond the noise cannot separate load and offsets, or None if it can."""
+    """Return a text if the motion is too small to separate load and offsets, else None."""
     if log.static:
         return None
     s, omega = motion_rms(log)
@@ -59,7 +59,7 @@ def too_little_motion(log: Log) -> str | None:
 
 
 def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
-    """Return `motion_rms` of poses, from covariances of two halves with independent noise."""
+    """Return `motion_rms` by covariance of even and odd poses, in which noise cancels, or None."""
     poses = posed.poses.with_continuous_quaternions()
     count = max(1, int(0.5 * _BLOCK_S * poses.rate))
     rows = len(poses.t) // (2 * count) * 2 * count

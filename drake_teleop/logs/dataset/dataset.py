@@ -51,7 +51,7 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class DatasetAndLoad(NamedTuple):
-    """Dataset, its described streams and the load shared by its episodes."""
+    """Dataset, its described streams and shared load."""
 
     dataset: Dataset
     streams: dict[str, Any]
@@ -76,7 +76,7 @@ def dataset_command(
         load: identification.json of the load.
         identify: identify the load from the episodes instead.
         description: log description whose `file` is omitted or one of the episodes.
-        jobs: number of processes as in joblib.
+        jobs: number of parallel processes.
     """
     if (load is None) != identify:
         what = "exactly one of --load and --identify is required"
@@ -180,7 +180,7 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
     streams = _streams_of_draft_for_all_episodes(draft, dataset.fps)
     if "FILL IN" in str(streams) or "wrench" not in streams or not {"pose", "imu"} & set(streams):
         raise DrakeTeleopError(
-            "wrench, time and motion are not all recognized by the names of its columns"
+            "wrench, time and motion are not all recognized by the names of the columns"
             f" ({', '.join(list(table.columns)[:12])} ...)",
             where=f"{episode.file.name}: {episode.name}",
             remedy="give a --description, see docs/robot-learning.md",
@@ -314,8 +314,8 @@ def _verdict_on_episode(
     spread -= np.log(found.gains).repeat(3)
     if not faults and spread.mean() > _MAX_LN_SPREAD_OVER_USUAL:
         text = (
-            "no single fault explains the wrench: it is in contact most of the time, or the load"
-            " changes"
+            "no single fault explains the wrench (possible causes: contact most of the time, or a"
+            " change of the load)"
         )
         faults.append(EpisodeFault("unexplained", text, None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)

@@ -1,6 +1,6 @@
 """Files of robot-learning datasets: episodes of LeRobot, robomimic, Zarr and folders of tables.
 
-The copy has two more columns; its other tables have the same values, and other files are links.
+The copy has two more columns; other values are unchanged, and other files are hard links.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Dataset(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
-    """Return the columns of a Parquet file without text and images; the last file is kept."""
+    """Return the numeric and array columns of a Parquet file, from a cache of the last file."""
     import polars as pl
 
     frame = pl.scan_parquet(file)
@@ -145,7 +145,7 @@ def _open_zarr(path: Path) -> Dataset:
 
 
 def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
-    """Write the dataset with the columns of each episode to `out`; the dataset stays unchanged."""
+    """Write a copy of the dataset with the new columns of each episode to `out`."""
     if dataset.kind == "hdf5":
         _write_hdf5(dataset, out, columns)
         return
@@ -154,8 +154,8 @@ def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactCol
         written |= {dataset.path / "meta" / name for name in ("info.json", "stats.json")}
     for file in sorted(p for p in dataset.path.glob("**/*") if p.is_file()):
         if file not in written:
-            copied = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
-            _hard_link_or_copy(file, out / file.relative_to(dataset.path), copied=copied)
+            must_copy = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
+            _hard_link_or_copy(file, out / file.relative_to(dataset.path), must_copy=must_copy)
     if dataset.kind == "zarr":
         _write_zarr(out, columns)
         return
@@ -176,12 +176,12 @@ def _join_columns(columns: Sequence[ContactColumns]) -> ContactColumns:
     return ContactColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
-def _hard_link_or_copy(file: Path, target: Path, *, copied: bool) -> None:
+def _hard_link_or_copy(file: Path, target: Path, *, must_copy: bool) -> None:
     make_folder(target.parent)
     with replace_file_on_success(target) as temporary:
         temporary.unlink(missing_ok=True)
         with suppress(OSError):  # on another file system
-            if not copied:
+            if not must_copy:
                 os.link(file.resolve(), temporary)
                 return
         shutil.copyfile(file, temporary)

@@ -30,7 +30,7 @@ class EpisodeFault(NamedTuple):
 def list_faults(
     x: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
-    """Return the faults of an episode that a hypothesis contains.
+    """Return the faults of an episode, in words, from the hypothesis x about its wrench.
 
     `usual_lag` [frames] is that of other episodes, `usual_phi` (10,) the usual load.
     """
@@ -71,7 +71,7 @@ def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
     angle = float(np.linalg.norm(turn))
     if angle > _MIN_WRENCH_ROTATION_DEG:
         axis = ", ".join(f"{a:.2g}" for a in turn / angle)
-        text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
+        text = f"{what} is rotated by {angle:.3g} deg about [{axis}] of S"
         found.append(EpisodeFault("frame", text, M.tolist()))
     return found
 
@@ -83,13 +83,13 @@ def _unit_faults(gain: Array) -> list[EpisodeFault]:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
         near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_FACTOR_TOLERANCE
-        text = f"the {what} is {factor:.4g} times that in {si}"
+        text = f"the {what} is {factor:.4g} times the value in {si}"
         found.append(EpisodeFault("unit", text + (f": its unit is {unit}" if near else ""), factor))
     return found
 
 
 def saturation_faults(wrench: Array) -> list[EpisodeFault]:
-    """Return the fault of channels of a wrench (N, 6) that are constant or stay at a range end."""
+    """Return a fault for wrench channels (N, 6) that are constant or stay at a range end, or []."""
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():

@@ -1,9 +1,9 @@
 """Faults of an episode's wrench, found by comparison with the wrench of a known load.
 
-A hypothesis is a reading G M p(t + lag) + offsets, with the load's wrench p, a rotation or
-mirroring M and a factor G of forces and of torques. The simplest hypothesis is chosen unless
-another one reduces the spread of the residual decisively. The spread is that of the calmer half of
-the frames, so that contact has no influence.
+A hypothesis predicts the reading G M p(t + lag) + offsets, with the load's wrench p, a rotation or
+mirroring M and factors G of force and torque. The simplest hypothesis is chosen unless another one
+reduces the spread of the residual decisively. The spread is that of the calmer half of the frames,
+so that contact has no influence.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _MAX_STEP_DEVIATION_OVER_FRAME_NOISE = 1.5
 
 @dataclass(frozen=True)
 class WrenchHypothesis:
-    """Explanation of an episode's wrench.
+    """Hypothetical relation of an episode's reading to the wrench of a load.
 
     Attributes:
         kind: one of `HYPOTHESIS_KINDS`.
@@ -53,7 +53,7 @@ class WrenchHypothesis:
         phi: (10,) of another load; None for the known one.
         spread: (6,) logarithms of the half widths of the residual.
         offsets: (6,) sensor offsets [N, N m].
-        cost: sum of `spread` and of the costs of all deviations.
+        cost: sum of `spread` and of the costs of all faults.
     """
 
     kind: str
@@ -81,7 +81,7 @@ def hypothesis_without_fault(lag: float) -> WrenchHypothesis:
 
 
 def ln_half_width_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
-    """Return log half widths (6,), at least log `floor`, and centres of half of the residuals."""
+    """Return log half widths (6,), at least log `floor`, and centres of a residual's calm half."""
     widths, centres = width_and_centre_of_narrowest_half(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
@@ -112,7 +112,7 @@ def find_simplest_hypothesis_and_residual(
 
 
 class HypothesisSearch:
-    """Search for the best hypothesis of an episode; `floor` (6,) is the least half width."""
+    """Search for the best hypothesis of an episode; half widths count as at least `floor` (6,)."""
 
     def __init__(self, signals: EpisodeSignals, phi: Array, usual_lag: float, floor: Array) -> None:
         self.predict = lru_cache(maxsize=None)(partial(signals.measured_and_load_wrench, phi))
@@ -121,7 +121,7 @@ class HypothesisSearch:
         self.price = _SPREAD_COST_PER_FAULT + _SPREAD_COST_TIMES_FRAMES / self.frames
 
     def unexplained_reading(self, x: WrenchHypothesis) -> Array:
-        """Return the reading (N, 6) without the load's part by a hypothesis; offsets remain."""
+        """Return the reading (N, 6) minus the load's reading by hypothesis x; offsets remain."""
         wrench, load_wrench = self.predict(x.kind, x.lag)
         if x.phi is not None:
             return np.asarray(wrench - self.regress(x.lag) @ x.phi)
@@ -152,7 +152,7 @@ class HypothesisSearch:
                 yield self.refit_best_rows(replace(start, axes=(M, M)), det=0.0, scale=True)
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
-        """Return the signed permutation (3, 3) with which p fits three channels of w best."""
+        """Return the signed permutation M (3, 3) for which M p fits w best, in three channels."""
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         pairs = pairs.reshape(len(w), -1)
@@ -165,19 +165,20 @@ class HypothesisSearch:
         return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
 
     def _best_fit(self, fit: Callable[[NDArray[np.bool_]], WrenchHypothesis]) -> WrenchHypothesis:
-        """Return the best fit that starts from all frames or one quarter, given by flags (N,)."""
+        """Return the best result of `fit`, started from all frames and each quarter of them."""
         at = np.arange(self.frames) * _NUM_START_FIT_PARTS // self.frames
         quarters = (at == part for part in range(_NUM_START_FIT_PARTS))
         return min(map(fit, [at >= 0, *quarters]), key=lambda x: x.cost)
 
     def refit_best_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
-        """Return the hypothesis with rotation and factors fitted to the frames that fit best.
+        """Return x with rotation and factors fitted to the frames with the least residual.
 
-        The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
+        `det` is the determinant of the fitted rotation; 0 keeps that of x. `scale` fits the
+        factors.
         """
         both = self.predict(x.kind, x.lag)
 
-        def fit(rows: NDArray[np.bool_]) -> WrenchHypothesis:
+        def fit_from_rows(rows: NDArray[np.bool_]) -> WrenchHypothesis:
             found = x
             for _ in range(_NUM_REFITS):
                 w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
@@ -196,13 +197,13 @@ class HypothesisSearch:
                 rows = self._best_rows_of(found)
             return found
 
-        return self._best_fit(fit)
+        return self._best_fit(fit_from_rows)
 
     def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
         first_weights = np.exp(-ln_half_width_and_centre_of_calm_half(wrench, self.floor)[0])
 
-        def fit(rows: NDArray[np.bool_]) -> WrenchHypothesis:
+        def fit_from_rows(rows: NDArray[np.bool_]) -> WrenchHypothesis:
             x, weights = hypothesis_without_fault(lag), first_weights
             for _ in range(_NUM_REFITS):
                 w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
@@ -213,10 +214,10 @@ class HypothesisSearch:
                 rows, weights = self._best_rows_of(x), np.exp(-x.spread)
             return x
 
-        return self._best_fit(fit)
+        return self._best_fit(fit_from_rows)
 
     def best_lag(self, x: WrenchHypothesis) -> float:
-        """Return the lag [frames] with the least spread of a hypothesis."""
+        """Return the lag [frames] at which hypothesis x has the least spread."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
@@ -225,7 +226,7 @@ class HypothesisSearch:
         return lag
 
     def lag_of_linear_fit(self, kind: str) -> float:
-        """Return the lag [frames] with which a linear map of the load's wrench fits best."""
+        """Return the lag [frames] at which a linear map of the load's wrench fits best."""
 
         def residual_and_cost(lag: float) -> tuple[Array, float]:
             w, p = self.predict(kind, lag)
@@ -249,7 +250,7 @@ def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
 
 
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
-    """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
+    """Return the orthogonal M (3, 3) with determinant `det` and least |w - gain M p|."""
     H = np.zeros((3, 3))
     for channels, factor in zip(_FORCE_AND_TORQUE_CHANNELS, gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
@@ -283,7 +284,7 @@ def _rotation_cost(M: Array) -> float:
 def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
     """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
 
-    Frames fit to one of two constant offsets, without a transition; contact begins gradually.
+    Frames beside the jump fit to one of two constant offsets; contact begins gradually.
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
@@ -352,7 +353,7 @@ class EpisodeSignals:
         return Motion(*self._splines.motion(t, log.posed.gravity_W), R)
 
     def motion_at_lag(self, lag: float) -> Motion:
-        """Return the motion (N, ...) `lag` frames after each frame."""
+        """Return the motion (N, ...) at `lag` frames after each frame."""
         first = (lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME
         step = round(first)
         if abs(step - first) < 1e-6 and abs(lag) < _MOTION_MARGIN_FRAMES:
@@ -364,7 +365,7 @@ class EpisodeSignals:
         return regressor(*self.motion_at_lag(lag)[:3])
 
     def measured_and_load_wrench(self, phi: Array, kind: str, lag: float) -> tuple[Array, Array]:
-        """Return the wrench (N, 6) in the axes of S, and that of load phi at a lag [frames]."""
+        """Return the measured wrench (N, 6) in axes of S, and the wrench of load phi at `lag`."""
         at, wrench = self.motion_at_lag(lag), self.log.wrench
         s = at.s + at.gravity if kind == "weight removed" else at.s
         if kind == "base":

@@ -28,7 +28,7 @@ from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
-_MAX_COUNTED_EXCESS_SPREAD, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
+_EXCESS_SPREAD_LIMIT, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
 _LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0
 _MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
 _THRESHOLD_OVER_LARGEST_FREE_LEVEL = 1.1
@@ -54,7 +54,7 @@ class SharedLoad:
 
 
 def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
-    """Return the load that most episodes of a dataset share, or the given load."""
+    """Return the load that most episodes of a dataset share, or `load` if given."""
     signals = map(EpisodeSignals, logs)
     episodes = [_FittedEpisode(x, fit_own_load_of_episode(x)) for x in signals]
     if load is None:
@@ -64,10 +64,10 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
             remedy = "write wrench.sign: -1 into a --description file, or remove it if it is there"
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
-        def counted_excess(phi: Array) -> float:
-            return sum(min(x.excess_spread(phi), _MAX_COUNTED_EXCESS_SPREAD) for x in episodes)
+        def sum_of_limited_excess_spreads(phi: Array) -> float:
+            return sum(min(x.excess_spread(phi), _EXCESS_SPREAD_LIMIT) for x in episodes)
 
-        phi = min(candidates, key=counted_excess)
+        phi = min(candidates, key=sum_of_limited_excess_spreads)
         for _ in range(2):
             load = _fit_shared_load(_episodes_sharing_load(episodes, phi), phi)
             phi = load.phi
@@ -97,7 +97,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
 
 def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
-    """Return the hypothesis of the load and lag that explain an episode best."""
+    """Return the hypothesis with the load and lag that explain one episode best."""
     search = episode_verdict.HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
@@ -109,7 +109,7 @@ class _FittedEpisode(NamedTuple):
     own: WrenchHypothesis
 
     def faultless_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
-        """Return the hypothesis of load phi (10,), at the best lag near that of the own load."""
+        """Return the faultless hypothesis of load phi (10,) at the best lag, and its residual."""
         search = episode_verdict.HypothesisSearch(
             self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
         )
@@ -123,7 +123,7 @@ class _FittedEpisode(NamedTuple):
         return best, search.unexplained_reading(best)
 
     def excess_spread(self, phi: Array) -> float:
-        """Return the log spread with load phi (10,) beyond that with the own load."""
+        """Return how much load phi (10,) increases the log spread, compared with the own load."""
         usual = self.faultless_hypothesis_and_residual(phi)[0]
         return float(usual.spread.sum() - self.own.spread.sum())
 
