@@ -130,7 +130,7 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (
         0.3,
         3,
-        study._RATES_OF_EVERY_RUN,
+        study._COMPARISON_RATES,
     )
     assert base.surroundings is None and base.contact_detection is None
     # Steps longer than the events' period avoid extra steps by rounding.
