@@ -106,6 +106,8 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     [
         ({"networks": ["mars"]}, r"networks.*no network 'mars'.*lunar"),
         ({"methods": ["magic"]}, r"methods.*no passivity method 'magic'.*tdpa"),
+        ({"methods": []}, "methods: is empty; give"),
+        ({"networks": []}, "networks: is empty; give"),
     ],
 )
 def test_unknown_names_raise(tmp_path, arguments, message):

@@ -94,8 +94,9 @@ def _check_parameter_values(name: str, values: ArrayLike) -> Array:
         remedy = f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}"
         raise DrakeTeleopError(what, where="stability_map", remedy=remedy)
     array = np.asarray(values, dtype=float)
-    if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
-        what = f"the values (shape {array.shape}) are no list of numbers, or do not increase"
+    finite = array.ndim == 1 and array.size > 0 and np.isfinite(array).all()
+    if not finite or (np.diff(array) <= 0).any():
+        what = f"the values (shape {array.shape}) are no list of finite numbers, or do not increase"
         remedy = "give at least one number, each above the one before"
         raise DrakeTeleopError(what, where=f"stability_map:{name}", remedy=remedy)
     return array

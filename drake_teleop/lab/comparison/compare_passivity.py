@@ -70,6 +70,9 @@ def compare_command(
         what = f"there is no network '{unknown[0]}'"
         raise DrakeTeleopError(what, where="networks", remedy=remedy)
     methods = tuple(METHODS) if methods is None else methods
+    for where, chosen in (("networks", networks), ("methods", methods)):
+        if not chosen:
+            raise DrakeTeleopError("is empty", where=where, remedy="give one name or more")
     for name in methods:
         METHODS.check(name, "methods")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
