@@ -13,7 +13,7 @@ from typing import Any
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, replace_file_on_success, write_picture
 from drake_teleop.common.texts import to_yaml_text
-from drake_teleop.lab.new_station.picture import draw_start
+from drake_teleop.lab.new_station.picture import draw_start_posture
 from drake_teleop.lab.new_station.plan import (
     SWING_HZ,
     StationPlan,
@@ -91,7 +91,7 @@ def new_command(
                 each.rmdir()
         raise
     picture = folder / "start.png"
-    write_picture(picture, draw_start(plan, f"{arm.stem}, sensor frame {sensor_frame}"))
+    write_picture(picture, draw_start_posture(plan, f"{arm.stem}, sensor frame {sensor_frame}"))
     if not quiet:
         _print_plan(plan, scenario, picture)
     return run_command(scenario, folder / "first_run", quiet=quiet)

@@ -32,7 +32,7 @@ _HULL_SAMPLE_DIRECTIONS = np.column_stack(
 )
 
 
-def draw_start(plan: StationPlan, title: str) -> Figure:
+def draw_start_posture(plan: StationPlan, title: str) -> Figure:
     """Draw the station in its start posture, meshes as convex hulls."""
     shapes, wall = plan.posture_shapes, plan.wall
     triangles, colours = _arm_triangles(shapes)

@@ -35,7 +35,7 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Larger overlaps are reported [m]; smaller ones are rounding of models.
 MIN_OVERLAP_M = 1e-3
-_MAX_COLLISION_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
+_MAX_CHECKED_SHAPE_HALF_WIDTH_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
 _MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
@@ -235,7 +235,7 @@ def _complete_and_bound_collision_shapes(
         for k, identifier in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
             shape, box = inspector.GetShape(identifier), inspector.GetObbInGeometryFrame(identifier)
             is_curved = isinstance(shape, (geometry.Capsule, geometry.Cylinder, geometry.Ellipsoid))
-            is_limited = box is not None and max(box.half_width()) < _MAX_COLLISION_SHAPE_SIZE_M
+            is_limited = box is not None and max(box.half_width()) < _MAX_CHECKED_SHAPE_HALF_WIDTH_M
             here, name = RigidTransform(inspector.GetPoseInFrame(identifier)), f"solid_{k}"
             if is_curved:
                 shape = geometry.Convex(
