@@ -16,7 +16,6 @@ _STATE_FORMAT, _FORCE_FORMAT = struct.Struct("<4sIQd8d"), struct.Struct("<4sIQd6
 _STATE_TAG, _FORCE_TAG = b"DTD1", b"DTF1"
 MAX_PACKET_BYTES = _STATE_FORMAT.size  #: of both packets [bytes]
 _MAX_POSITION_M, _MAX_WRENCH_VALUE = 10.0, 1e3  # m; N, N m
-
 CLUTCH_OPEN_FLAG = 1  #: motion of the device is not transmitted to the slave
 
 

@@ -90,10 +90,9 @@ def find_spans(t: Array, flags: Flags, min_duration: float = 0.0) -> Spans:
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """Return (N,) distances of the actual motion from the range of the commands before it.
+    """Return distances (N,) of `actual` (N, k) from the range of `command` (N, k) before it.
 
-    The range covers the last `window` [s], so a pure delay gives 0. `t` (N,) are evenly spaced
-    times [s], `command` and `actual` are (N, k).
+    The range covers the last `window` [s]: a pure delay gives 0. Times `t` [s] are evenly spaced.
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _trailing_maximum(command, rows)
