@@ -124,7 +124,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         output_ports:
         - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
-        - angular_velocity_S: (3,) [rad/s], of an ideal gyroscope with the encoders' delay
+        - angular_velocity_S: (3,) [rad/s], with delay, low-pass and rounding of the encoders
         - angular_acceleration_S: (3,) [rad/s^2]
         - status: 0 valid; 1 a channel is saturated; 2 and above: no sample yet, or implausible
         - joint_position: (n,) positions q in `state`
