@@ -47,11 +47,11 @@ class Registry(dict[str, _Part]):
         if name in self.shipped:
             what = f"'{name}' is the name of a shipped part"
             raise DrakeTeleopError(what, where=self.kind, remedy="use another name")
-        self._check_type(name, part)
+        self._check_part_type(name, part)
         self[name] = part
         return part
 
-    def _check_type(self, name: str, part: Any) -> None:
+    def _check_part_type(self, name: str, part: Any) -> None:
         if self._part_type is None:
             return
         if self._parts_are_classes:

@@ -35,7 +35,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study,
-        "_SIGMA_ROUND_TRIP_WALL_CASES",
+        "_INJECTED_ENERGY_STUDY_CASES",
         tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))),
     )
     # Use the load of the shipped scenario, which other tests have identified.
