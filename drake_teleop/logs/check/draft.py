@@ -15,7 +15,7 @@ import numpy as np
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
-from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
+from drake_teleop.logs.read.description_fields import known_unit
 from drake_teleop.logs.read.tables import Table
 
 _TIME_NAME_PATTERN = (
@@ -61,11 +61,6 @@ _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
-_UNIT_OF_SPELLING = {
-    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
-    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
-    "n*m": "N m", "n.m": "N m",
-}  # fmt: skip
 _ALLOWED_UNITS = {
     "force": description_fields.FORCE_UNITS, "torque": description_fields.TORQUE_UNITS,
     "specific_force": ("m/s^2", "mm/s^2", "g", "mg"),
@@ -201,7 +196,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
-    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
+    if unit is None and suffix is not None and known_unit(suffix[1]):
         unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[\W_]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
@@ -242,14 +237,10 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
             groups.setdefault("", {}).setdefault(words, name)
     for name, (words, unit) in plain.items() if not groups else ():  # in another language
         match = re.match(r"^(.*?)_?([xyz])$", words)
-        if match and _known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
+        if match and known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
     whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
     return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
-
-
-def _known_unit(text: str) -> str:
-    return _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", text).lower(), "")
 
 
 def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
@@ -341,7 +332,7 @@ def _draft_quantity(
         if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT:
             group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
-        unit = _known_unit(spelling)
+        unit = known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
     if kind in ("force", "torque"):
@@ -390,7 +381,7 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
         structure, rows = vector_column.rpartition(".")[0], len(table.columns[vector_column])
         named.sort(key=lambda name: len(table.columns[name]) != rows)
         named.sort(key=lambda name: name.rpartition(".")[0] != structure)
-    unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
+    unit = known_unit(plain[named[0]][1])
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
     for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
