@@ -185,6 +185,8 @@ def _inspect_described_log(
     for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
+            if note := tables[stream.source].note:
+                findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, source)
         summary["streams"][name] = figures

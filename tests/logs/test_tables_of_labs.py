@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from known_motion import quaternions
 from planted import PHI, good
+from xlsxwriter import Workbook
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.inspection import inspect_command
@@ -113,3 +114,55 @@ def test_row_of_units_gives_the_units_of_the_draft(tmp_path: Path) -> None:
     assert summary["findings"] == []
     load = identify_log(tmp_path / "out" / "draft.yaml").identification
     assert load.mass == pytest.approx(PHI[0], rel=0.01)
+
+
+def write_sheets(path: Path, sheets: dict[str, pl.DataFrame]) -> Path:
+    with Workbook(path) as book:
+        for name, frame in sheets.items():
+            frame.write_excel(book, name)
+        book.add_worksheet("empty")
+    return path
+
+
+def numbers_as_frame(rows: int, names: list[str]) -> pl.DataFrame:
+    numbers = np.random.default_rng(1).normal(size=(rows, len(names)))
+    return pl.DataFrame(numbers, schema=names)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize("rows", [30, 400])
+def test_sheet_with_the_log_is_read_and_named(tmp_path: Path, place: int, rows: int) -> None:
+    log = numbers_as_frame(rows, NAMES)
+    others = {
+        "Info": pl.DataFrame({"field": ["sensor", "date"], "value": ["FT-300", "2024-05-12"]}),
+        "Mean values": numbers_as_frame(4, NAMES),
+    }
+    named = list(others.items())
+    named.insert(place, ("Measurement", log))
+    table = read_table(write_sheets(tmp_path / "x.xlsx", dict(named)))
+    np.testing.assert_allclose(table.finite_numbers(NAMES, 7, ""), log.to_numpy(), rtol=1e-14)
+    assert "the sheet 'Measurement' was read" in table.note
+    assert "'Info'" in table.note and "'Mean values'" in table.note
+
+
+@pytest.mark.parametrize("share", [0.6, 1.0, 1.5])
+def test_two_similar_sheets_raise_one_error(tmp_path: Path, share: float) -> None:
+    sheets = {"Run 1": numbers_as_frame(100, NAMES), "Notes": pl.DataFrame({"a": ["b"]})}
+    sheets["Run 2"] = numbers_as_frame(round(100 * share), NAMES)
+    path = write_sheets(tmp_path / "x.xlsx", sheets)
+    with pytest.raises(DrakeTeleopError, match=r"x\.xlsx.*'Run .'.*'Run .'.*as a CSV file"):
+        read_table(path)
+
+
+@pytest.mark.slow
+def test_commands_print_the_name_of_the_sheet(tmp_path: Path) -> None:
+    c = good()
+    columns = [c["t"][:, None], c["force"], c["torque"], c["p"], quaternions(c["R"])]
+    names = [*NAMES, "x", "y", "z", "qw", "qx", "qy", "qz"]
+    sheets = {"Info": pl.DataFrame({"a": ["b"]}), "Log": pl.DataFrame(np.hstack(columns), names)}
+    path = write_sheets(tmp_path / "x.xlsx", sheets)
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    assert [(x["name"], "'Log'" in x["message"]) for x in summary["findings"]] == [("sheet", True)]
+    found = identify_log(tmp_path / "out" / "draft.yaml")
+    assert any("the sheet 'Log' was read" in note for note in found.log.notes)
+    assert found.identification.mass == pytest.approx(PHI[0], rel=0.01)

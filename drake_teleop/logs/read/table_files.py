@@ -47,6 +47,7 @@ _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"
 _THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
 _DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_MIN_SIMILAR_SHEET = 0.5  # rows of a second log in an Excel file, over those of the first
 _TIME_CELL_PATTERN = re.compile(r"\d[\dT:./ +-]*Z?")  # of dates and times of day
 _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
 
@@ -265,8 +266,6 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
     if kind == ".parquet":
         check_parquet_sizes(path)
         frame = pl.scan_parquet(path)
-    elif kind == ".xlsx":
-        frame = pl.read_excel(path).lazy()
     else:
         read = pl.read_ipc if kind in (".arrow", ".feather") else pl.read_ndjson
         frame = read(path.read_bytes()).lazy()
@@ -279,6 +278,30 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
 
         return ColumnsOnAccess(columns, read_column)  # to limit memory
     return _collect_columns(frame, columns)
+
+
+def _read_excel(path: Path) -> Table:
+    """Return the sheet with the log; raise an error if another one has a similar table."""
+    import polars as pl
+
+    sheets = pl.read_excel(path, sheet_id=0, raise_if_empty=False)
+    number = pl.all().cast(pl.Float64, strict=False)
+    rows, wide = dict.fromkeys(sheets, 0), []
+    for name, sheet in sheets.items():
+        if sheet.width:
+            cells = sheet.select(number.is_not_null())
+            rows[name] = int(cells.select((pl.sum_horizontal(pl.all()) > 1).sum()).item())
+            full = cells.select(pl.all().sum() > 0.5 * rows[name]).row(0)
+            wide += [name] if rows[name] and sum(full) >= len(_WRENCH_COLUMN_NAMES) else []
+    best = max(wide or rows, key=lambda name: rows[name])
+    if similar := [x for x in wide if x != best and rows[x] >= _MIN_SIMILAR_SHEET * rows[best]]:
+        what = (
+            f"the sheets {best!r} and {', '.join(map(repr, similar))} have tables of similar size"
+        )
+        raise DrakeTeleopError(what, where=str(path), remedy="save each sheet as a CSV file")
+    others = ", ".join(repr(name) for name in sheets if name != best)
+    note = f"{path.name}: the sheet {best!r} was read; other sheets: {others}" if others else ""
+    return Table(path, columns_of_frame(sheets[best].lazy()), note=note)
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
@@ -396,9 +419,8 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
     "log format",
     {
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
-        **dict.fromkeys(
-            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_with_polars
-        ),
+        **dict.fromkeys((".parquet", ".arrow", ".feather", ".jsonl", ".ndjson"), _read_with_polars),
+        ".xlsx": _read_excel,
         **{suffix: _reader_of_columns(read) for suffix, read in _ARRAY_READERS.items()},
     },
 )

@@ -32,6 +32,7 @@ class Table:
         absent_groups: names of column groups that the file marks as not provided.
         whole_table: table of all rows, if this one has only some of them.
         kept_rows: row numbers in `whole_table`, counted from 0; None: all rows.
+        note: which part of the file was read, if it has several.
     """
 
     path: Path
@@ -40,6 +41,7 @@ class Table:
     absent_groups: tuple[str, ...] = ()
     whole_table: Table | None = None
     kept_rows: NDArray[np.intp] | None = None
+    note: str = ""
 
     def line_in_file(self, row: int) -> int:
         """Return the number that a row of this table has in its file, for messages."""
