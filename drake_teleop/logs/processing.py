@@ -45,6 +45,7 @@ from drake_teleop.logs.check.conventions import (
     findings_if_load_is_suspicious,
     motion_findings,
 )
+from drake_teleop.logs.check.handedness import left_handed_pose_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
@@ -181,11 +182,12 @@ def identify_log(
     why, too_still = _explain_residual(raw, fitted, frame_findings)
     if why is not None:
         fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
-    errors = _errors_beside_the_load(raw, fitted.log, frame_findings, why, too_still, check)
+    errors = _errors_beside_the_load(raw, fitted, frame_findings, why, too_still, check)
     result, causes, note = fitted.fit.identification, (), fitted.fit.note
     accepted = None if errors else why
     if errors:
-        result = result.with_nothing_identified() if too_still else result.with_unidentified_load()
+        useless = too_still or errors[0].name == "left-handed"
+        result = result.with_nothing_identified() if useless else result.with_unidentified_load()
     if accepted is not None:
         result, causes, note = _apply_explanation(result, raw, accepted, frame_findings, note)
     log = replace(fitted.log, notes=(*fitted.log.notes, *([note] if note else [])))
@@ -280,7 +282,7 @@ def _correct_delay(
 
 def _errors_beside_the_load(
     raw: Log,
-    log: Log,
+    fitted: LoadFitOfLog,
     frame_findings: tuple[Finding, ...],
     why: MisfitExplanation | None,
     too_still: str | None,
@@ -291,10 +293,15 @@ def _errors_beside_the_load(
     if too_still is not None:
         text = f"payload not identifiable: {too_still}; {MORE_MOTION_REMEDY}"
         errors = (Finding("payload", text),)
-    elif not errors and why is not None and why.is_misfit and why.causes:
-        errors = motion_findings(check)
-    if log.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
-        errors += tuple(edits.correct_accelerometer_unit(log.described, log)[0])
+    elif not errors and why is not None and (why.is_misfit or why.causes):
+        if raw.posed is not None and raw.posed.imu is None:
+            splines = None if fitted.motion is None else fitted.motion.splines
+            mirrored = left_handed_pose_finding(fitted.log, splines, fitted.delay_s)
+            errors = () if mirrored is None else (mirrored,)
+        if not errors and why.is_misfit and why.causes:
+            errors = motion_findings(check)
+    if raw.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
+        errors += tuple(edits.correct_accelerometer_unit(raw.described, fitted.log)[0])
     return errors
 
 
@@ -376,6 +383,8 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
                 read_log(path)
                 return replace(checks, findings=(Finding("payload", str(error)),))
         return checks
+    if any(finding.name == "left-handed" for finding in identified.findings):
+        return replace(checks, findings=identified.findings)
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     no_load = any(cause.name == "no load" for cause in identified.causes)  # explains the record
