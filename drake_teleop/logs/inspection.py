@@ -66,7 +66,10 @@ def inspect_command(
     else:
         drafts = [_draft_of_recording(path, out, summary) for path in (log, *others)]
         with output_folder(out):
-            _correct_and_write_draft(join_drafts(drafts), _free_draft_path(out), summary)
+            draft = join_drafts(drafts)
+            _correct_and_write_draft(draft, _free_draft_path(out), summary)
+        more = [{"name": x.name, "message": x.message} for x in draft.findings]
+        summary["findings"] = [*summary["findings"], *more]
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:

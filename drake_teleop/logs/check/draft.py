@@ -6,7 +6,8 @@ import copy
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
 from drake_teleop.logs.read.description_fields import known_unit
-from drake_teleop.logs.read.tables import Table
+from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 _TIME_NAME_PATTERN = (
     r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?|zeit|temps|tiempo|tempo)(_?(s|ms|us|ns))?$"
@@ -90,10 +91,11 @@ _NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate:
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, and its comment lines."""
+    """Draft of a log description: its streams as in YAML, comment lines, and findings."""
 
     streams: dict[str, Any]
     comment_lines: list[str]
+    findings: tuple[Finding, ...] = ()
 
     def text(self) -> str:
         return to_yaml_text(self.streams, head=self.comment_lines)
@@ -106,7 +108,8 @@ class Draft(NamedTuple):
             for name in outer:
                 place = place.setdefault(name, {})
             place[last] = value
-        return Draft(streams, [*self.comment_lines, f"Corrected by the data: {finding.message}."])
+        lines = [*self.comment_lines, f"Corrected by the data: {finding.message}."]
+        return Draft(streams, lines, self.findings)
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
@@ -118,7 +121,8 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
     streams = streams or drafts[0].streams
     order = ["wrench", "imu", "pose", "static"]
     ordered = {name: streams[name] for name in order if name in streams}
-    return Draft(ordered, [*dict.fromkeys(x for draft in drafts for x in draft.comment_lines)])
+    lines = dict.fromkeys(x for draft in drafts for x in draft.comment_lines)
+    return Draft(ordered, [*lines], tuple(x for draft in drafts for x in draft.findings))
 
 
 def _is_template(stream: dict[str, Any]) -> bool:
@@ -135,8 +139,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     """Return a log description guessed from names and magnitudes of columns."""
     plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
-    found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
-    found |= _find_vectors_in_array_columns(table, plain)
+    found |= _find_wrench_in_arrays(table, plain) | _find_quaternion(table, plain)
     ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
@@ -190,7 +193,32 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *([_RAW_ACCELERATION_NOTE] if raw in str(draft.get("imu")) else []),
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
-    return Draft(draft, head)
+    return Draft(draft, head, tuple(_other_wrench_findings(table, plain, found)))
+
+
+def _find_wrench_in_arrays(table: Table, plain: _NamesAndUnits) -> _Columns:
+    numbered = _find_vectors_in_numbered_columns(plain)
+    return numbered | _find_vectors_in_array_columns(table, plain)
+
+
+def _other_wrench_findings(
+    table: Table, plain: _NamesAndUnits, found: _Columns
+) -> Iterator[Finding]:
+    """Yield a finding for each complete wrench of a table beside the one in `found`."""
+    pair = "force", "torque"
+    used = {x for names in found.values() for x in names}
+    taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
+    while taken:
+        arrays = {name.partition("[")[0] for name in used}
+        plain = {x: y for x, y in plain.items() if not {x, x.partition("[")[0]} & (used | arrays)}
+        rest = replace(table, columns=ColumnsOnAccess(plain, table.columns.__getitem__))
+        other = _find_vectors(plain) | _find_wrench_in_arrays(rest, plain)
+        if any(_width_of_columns(table, other.get(kind, [])) != 3 for kind in pair):
+            return
+        used = {x for kind in pair for x in other[kind]}
+        lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
+        text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
+        yield Finding("other wrench", f"{text}; to use it, set {lines}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
@@ -206,6 +234,12 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
+def _is_not_measured(name: str) -> bool:
+    return (
+        re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name) is not None
+    )
+
+
 def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
@@ -219,6 +253,7 @@ def _find_vectors(plain: _NamesAndUnits) -> _Columns:
     found: _Columns = {}
     for pair in _VECTORS_OF_ONE_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
+        shared.sort(key=_is_not_measured)
         for kind in pair:
             for name in (shared or list(groups[kind]))[:1]:
                 found[kind] = groups[kind][name]
@@ -284,7 +319,7 @@ def _find_vectors_in_numbered_columns(plain: _NamesAndUnits) -> _Columns:
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
-        for base in sorted(fit, key=lambda name: "target" in name)[:1]:
+        for base in sorted(fit, key=_is_not_measured)[:1]:
             for kind, places in kinds.items():
                 found[kind] = [groups[base][k] for k in places]
     by_words = {words: name for name, (words, _) in plain.items()}
