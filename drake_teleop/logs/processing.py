@@ -37,8 +37,8 @@ from drake_teleop.logs.causes.cause import (
     RecordPartWithLoad,
 )
 from drake_teleop.logs.causes.explain import MisfitExplanation
-from drake_teleop.logs.check import edits
-from drake_teleop.logs.check.against_load import lag_findings
+from drake_teleop.logs.check import against_load, edits
+from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, lag_findings
 from drake_teleop.logs.check.conventions import (
     ConventionCheckResult,
     check_conventions_of_file,
@@ -46,6 +46,7 @@ from drake_teleop.logs.check.conventions import (
     motion_findings,
 )
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
+from drake_teleop.logs.check.high_pass import high_pass_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
@@ -68,6 +69,7 @@ from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
+_NOTHING_IDENTIFIED_FINDINGS = ("left-handed", "high-pass")
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
@@ -179,14 +181,18 @@ def identify_log(
     check = partial(check_conventions_of_file, Path(path)) if checks is None else lambda: checks
     options = method, cutoff_hz
     raw, fitted, frame_findings = _read_and_fit_load(path, *options, delay)
-    why, too_still = _explain_residual(raw, fitted, frame_findings)
+    mirrored = _left_handed_pose_finding(raw, fitted)
+    why, too_still = None, None
+    if mirrored is None:
+        why, too_still = _explain_residual(raw, fitted, frame_findings)
     if why is not None:
         fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
     errors = _errors_beside_the_load(raw, fitted, frame_findings, why, too_still, check)
+    errors = errors if mirrored is None else (mirrored,)
     result, causes, note = fitted.fit.identification, (), fitted.fit.note
     accepted = None if errors else why
     if errors:
-        useless = too_still or errors[0].name == "left-handed"
+        useless = too_still or errors[0].name in _NOTHING_IDENTIFIED_FINDINGS
         result = result.with_nothing_identified() if useless else result.with_unidentified_load()
     if accepted is not None:
         result, causes, note = _apply_explanation(result, raw, accepted, frame_findings, note)
@@ -232,6 +238,17 @@ def _read_and_fit_load(
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     return log, fitted or _fit_load_to_motion(log, method, cutoff_hz, delay), frame_findings
+
+
+def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
+    if log.posed is None or log.posed.imu is not None or log.static:
+        return None
+    load, shown = fitted.fit.identification, fitted.log
+    residual = contact_wrench(shown.wrench, load.offsets, *shown.motion, load.phi)
+    if against_load.unexplained_share(shown.wrench, residual) < GOOD_UNEXPLAINED:
+        return None
+    splines = None if fitted.motion is None else fitted.motion.splines
+    return left_handed_pose_finding(shown, splines, fitted.delay_s)
 
 
 def _explain_residual(
@@ -294,10 +311,8 @@ def _errors_beside_the_load(
         text = f"payload not identifiable: {too_still}; {MORE_MOTION_REMEDY}"
         errors = (Finding("payload", text),)
     elif not errors and why is not None and (why.is_misfit or why.causes):
-        if raw.posed is not None and raw.posed.imu is None:
-            splines = None if fitted.motion is None else fitted.motion.splines
-            mirrored = left_handed_pose_finding(fitted.log, splines, fitted.delay_s)
-            errors = () if mirrored is None else (mirrored,)
+        passed = None if raw.static else high_pass_finding(fitted.log, fitted.delay_s)
+        errors = () if passed is None else (passed,)
         if not errors and why.is_misfit and why.causes:
             errors = motion_findings(check)
     if raw.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
@@ -383,7 +398,7 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
                 read_log(path)
                 return replace(checks, findings=(Finding("payload", str(error)),))
         return checks
-    if any(finding.name == "left-handed" for finding in identified.findings):
+    if any(x.name in _NOTHING_IDENTIFIED_FINDINGS for x in identified.findings):
         return replace(checks, findings=identified.findings)
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
