@@ -25,7 +25,7 @@ class ReferenceJoint(NamedTuple):
     """One moving joint of the chain.
 
     Attributes:
-        lower, upper: limits [rad, m]; infinite for a joint that turns without end.
+        lower, upper: limits [rad, m]; infinite for a joint without limits.
         effort: torque or force limit [N m, N]; inf if the file has none.
     """
 

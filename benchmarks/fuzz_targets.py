@@ -609,7 +609,7 @@ def _command_line(path: Path) -> None:
     said = io.StringIO()
     words = [word.replace("\0", "") for word in json.loads(path.read_bytes())]
     with contextlib.redirect_stderr(said):
-        status = cli._run_with_exit_status(words)
+        status = cli._run_and_get_exit_status(words)
     line = said.getvalue().rstrip("\n")
     refused = line.startswith("error: ") and len(line) <= MAX_ERROR_LINE_LENGTH and "\n" not in line
     if refused:

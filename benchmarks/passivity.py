@@ -47,7 +47,7 @@ from drake_teleop.station.passivity.methods import (
     method_parameters,
 )
 from drake_teleop.station.passivity.packet import (
-    METHOD_INTEGRAL,
+    METHOD_VALUES,
     PACKET_SIZE,
     WRENCH,
     dot_of_group,
@@ -197,12 +197,12 @@ def _master(steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory,
         return
     for i in range(6):
         b = p[wave.WAVE_IMPEDANCE][i // 3]  # impedance of the line
-        wrench[i] = math.sqrt(2.0 * b) * received[METHOD_INTEGRAL][i] - b * dx[i] / T
+        wrench[i] = math.sqrt(2.0 * b) * received[METHOD_VALUES][i] - b * dx[i] / T
     for g in range(2):
         limit_group(wrench, g, limits[g])
     for i in range(6):
         b = p[wave.WAVE_IMPEDANCE][i // 3]
-        packet[METHOD_INTEGRAL][i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
+        packet[METHOD_VALUES][i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
 
 
 @njit
@@ -214,9 +214,9 @@ def _slave(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, comman
         return
     step = memory[_STEP]
     for i in range(6):
-        b, u = p[wave.WAVE_IMPEDANCE][i // 3], received[METHOD_INTEGRAL][i]
+        b, u = p[wave.WAVE_IMPEDANCE][i // 3], received[METHOD_VALUES][i]
         step[i] = T * (math.sqrt(2.0 * b) * u + wrench[i]) / b
-        packet[METHOD_INTEGRAL][i] = u + math.sqrt(2.0 / b) * wrench[i]
+        packet[METHOD_VALUES][i] = u + math.sqrt(2.0 / b) * wrench[i]
     move_pose_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])
     command[:] = memory[COMMAND]
 

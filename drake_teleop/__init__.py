@@ -1,6 +1,6 @@
 """Bilateral teleoperation with non-contact force scaling, on Drake.
 
-Its names are imported at their first use: work with a log does not load the simulator.
+Each name is imported at its first use: work with a log does not load the simulator.
 """
 
 from __future__ import annotations

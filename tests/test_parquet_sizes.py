@@ -79,7 +79,7 @@ def test_the_part_of_a_log_that_is_damaged_is_named(tmp_path: Path) -> None:
         SimulationResult(t, {"x": t}, [spec]).write_part(tmp_path / "log", first)
     part = tmp_path / "log" / "row_0000000005.parquet"
     part.write_bytes(part.read_bytes()[:-30] + part.read_bytes()[-20:])
-    with pytest.raises(DrakeTeleopError, match=r"row_0000000005\.parquet: .* it is damaged"):
+    with pytest.raises(DrakeTeleopError, match=r"row_0000000005\.parquet: .* the file is damaged"):
         SimulationResult.scan_parquet(tmp_path / "log")
 
 
@@ -101,7 +101,7 @@ def test_content_that_is_no_parquet_is_refused(content: bytes, reason: str) -> N
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.parquet").touch()
-    with pytest.raises(ValueError, match="it is empty"):
+    with pytest.raises(ValueError, match="the file is empty"):
         check_parquet_sizes(tmp_path / "x.parquet")
 
 

@@ -146,7 +146,7 @@ def test_parameters_of_a_registered_method_are_checked(folder):
         config = Scenario(passivity=PassivityConfig(method="share", registered=values))
         with pytest.raises(DrakeTeleopError, match=says):
             config.check("mine")
-    with pytest.raises(DrakeTeleopError, match="method 'tdpa' takes no parameters here"):
+    with pytest.raises(DrakeTeleopError, match="method 'tdpa' has no registered parameters"):
         PassivityConfig(method="tdpa", registered={"share": 0.5}).check("mine")
 
 

@@ -102,6 +102,8 @@ def test_unknown_name_suggests_the_right_one():
         make_result()["measured_wrench"]
     with pytest.raises(KeyError, match="there are"):
         make_result().plot("nonsense")
+    with pytest.raises(KeyError, match="abscissa"):
+        make_result().plot("sigma", "t")
 
 
 def test_arrays_are_read_only_but_not_those_of_the_caller():

@@ -23,6 +23,7 @@ from drake_teleop.station.master.phantom import (
 )
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.oscillation import (
+    doubled_quaternions,
     find_contact_chatter,
     flag_unexplained_oscillation,
     reversal_indices,
@@ -438,3 +439,12 @@ def test_slave_follows_with_a_late_wrist_sensor():
     sent, received = result["pose_command"][:, 6], result["pose_received"][:, 6]
     assert sent[-1] < 0.42  # the slave moves
     assert abs(received[-1] - np.interp(result.t[-1] - LATE, result.t, sent)) < 2e-3
+
+
+@pytest.mark.parametrize("dot", [-0.5, -0.0, 0.0, 0.5])
+def test_doubled_quaternions_have_norm_2_and_the_nearer_sign(dot):
+    reference = np.array([[1.0, 0.0, 0.0, 0.0, 9.0, 9.0, 9.0]])
+    pose = np.array([[dot, np.sqrt(1.0 - dot**2), 0.0, 0.0, 1.0, 2.0, 3.0]])
+    (doubled,) = doubled_quaternions(pose, reference)
+    assert np.linalg.norm(doubled) == pytest.approx(2.0)
+    assert doubled[0] >= 0.0

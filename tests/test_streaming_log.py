@@ -203,5 +203,5 @@ def test_a_killed_run_leaves_rows_without_gaps(tmp_path, kill):
     if kill == signal.SIGKILL:
         assert (said, status) == ("", -signal.SIGKILL)
     else:
-        expected = f"interrupted: out/log.parquet contains the {len(kept.t)} samples until then"
+        expected = f"interrupted: out/log.parquet contains the first {len(kept.t)} samples"
         assert (said.strip(), status) == (expected, 130)

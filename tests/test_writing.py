@@ -106,7 +106,9 @@ def test_nonfinite_numbers_become_null(tmp_path):
 def test_impossible_folder_raises_one_line(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for folder, reason in (("file", "File exists"), ("file/x", "Not a directory")):
-        with pytest.raises(CannotWrite, match=f"cannot be made a folder .{reason}.; give another"):
+        with pytest.raises(
+            CannotWrite, match=f"cannot be created as a folder .{reason}.; give another"
+        ):
             make_folder(tmp_path / folder)
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root can always read
     with pytest.raises(CannotWrite, match="is a folder without write permission; give another"):
@@ -124,7 +126,7 @@ def test_last_file_marks_a_complete_folder(tmp_path):
         write_text(out / "b", "b")
         (out / "c").mkdir()
         write_text(out / "c", "c")
-    message = f"{out / 'c'}: cannot be written (Is a directory); {out} keeps a, b, earlier"
+    message = f"{out / 'c'}: cannot be written (Is a directory); {out} contains a, b, earlier"
     assert str(error.value) == message
     assert sorted(path.name for path in out.iterdir()) == ["a", "b", "c", "earlier"]
 
@@ -158,9 +160,9 @@ def sample_log(out: Path) -> None:
 
 
 COMMANDS: dict[str, tuple[Callable[[Path], None], int, str]] = {
-    "run": (run, 7, "keeps log.parquet, scenario.yaml"),
-    "study": (study, 6, "keeps 1 of 2 runs; repeat the command"),
-    "sample-log": (sample_log, 8, "keeps free.yaml, free_wrench.csv"),
+    "run": (run, 7, "contains log.parquet, scenario.yaml"),
+    "study": (study, 6, "contains 1 of 2 runs; repeat the command"),
+    "sample-log": (sample_log, 8, "contains free.yaml, free_wrench.csv"),
 }
 """Commands, their files, and their message if the disk is full at the third file."""
 

@@ -166,7 +166,7 @@ def test_values_are_checked_when_they_are_assigned() -> None:
         (scenario.passivity, "method", "legder", "'legder'; did you mean 'ledger'"),
         (scenario.force_scaling, "sigma", -3, "sigma: -3 is outside 0 to 100"),
         (scenario.slave, "position", [1.0], "has 1 numbers; give 3 numbers"),
-        (scenario, "channel", "internet", "make one: Channel(...), with fields delay"),
+        (scenario, "channel", "internet", "pass Channel(...) with fields delay"),
     ):
         before = getattr(block, name)
         with pytest.raises(dt.DrakeTeleopError) as error:

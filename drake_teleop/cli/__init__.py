@@ -7,8 +7,8 @@ from drake_teleop.common.interruption import install_interrupt_handlers
 
 
 def start() -> None:
-    """Run the command line; handle signals first, because imports can lose a KeyboardInterrupt."""
-    install_interrupt_handlers()
+    """Install signal handlers, then import and run the command line; status 130: interrupted."""
+    install_interrupt_handlers()  # first: imports of C code can lose a KeyboardInterrupt
     gc.set_threshold(20_000)  # with 700, collections take a tenth of the compile time
     try:
         from drake_teleop.cli.main import main

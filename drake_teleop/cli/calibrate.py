@@ -36,7 +36,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `until` is the required accuracy of the load, `sensor_range` the range of the sensor: [N, N m].
+    `until` is the required accuracy; `sensor_range` are the sensor's largest force and torque.
     """
     tolerance = tolerances.parse_tolerance(until)
     make_folder(out)
@@ -99,7 +99,7 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
-            _make_progress_bar(half, bool(evaluation.is_known[k])),
+            _make_progress_bar(half, is_known=bool(evaluation.is_known[k])),
             _parameter_verdict(evaluation, k),
         )
     lines = [Text(line, style="red") for line in (*evaluation.doubts, evaluation.failure) if line]
@@ -108,10 +108,11 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
     return Group(table, *lines)
 
 
-def _make_progress_bar(relative_half_width: float, known: bool) -> Text:
+def _make_progress_bar(relative_half_width: float, *, is_known: bool) -> Text:
     share = 1.0 - np.log10(np.clip(relative_half_width, 1.0, None)) / _BAR_DECADES
     cells = int(np.clip(np.nan_to_num(share), 0.0, 1.0) * _BAR_CHARACTERS)
-    return Text("█" * cells + "·" * (_BAR_CHARACTERS - cells), style="green" if known else "yellow")
+    colour = "green" if is_known else "yellow"
+    return Text("█" * cells + "·" * (_BAR_CHARACTERS - cells), style=colour)
 
 
 def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
@@ -120,8 +121,8 @@ def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
     if not np.isfinite(evaluation.relative_half_widths[k]):
         return "not known: no information yet"
     if evaluation.doubts:
-        return "not known: see below"
-    return "almost" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
+        return "not known: see the text below"
+    return "almost known" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
 
 
 def draw_accuracy(evaluations: list[RecordEvaluation], tolerance: tolerances.Tolerance) -> Figure:

@@ -54,10 +54,10 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory; return summary and session in one.
+    """Design, check and write an excitation trajectory; return its results as one dictionary.
 
     Args:
-        model: model file of another arm, with the scenario's sensor.
+        model: model file of another arm; the sensor is the scenario's.
         sensor_frame: name of the sensor's frame, required with `model`.
         until: required accuracy of the load; replaces criterion, period and seconds.
         quiet: True hides progress bars and tables; `progress` False hides only the bars.
@@ -75,7 +75,7 @@ def excite_command(
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             what = "is required with --model, which does not contain the sensor's position"
-            remedy = "name the frame or link at which it measures"
+            remedy = "name the frame or link at which the sensor measures"
             raise DrakeTeleopError(what, where="--sensor-frame", remedy=remedy)
         else:
             robot = RobotFromModel(
@@ -159,7 +159,7 @@ def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
 
 
 def trajectory_table(excitation: Excitation) -> pl.DataFrame:
-    """Return trajectory.csv: joint motion of one period at 1 kHz, both ends included."""
+    """Return the table of trajectory.csv: joint motion of one period at 1 kHz, with both ends."""
     period = excitation.trajectory.period
     t = np.linspace(0, period, round(period * CHECK_RATE_HZ) + 1)
     columns = {"t": t}
@@ -174,7 +174,7 @@ def draw_trajectory(excitation: Excitation) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
-        _draw_joints(joints, excitation)
+        _draw_joint_angles(joints, excitation)
         _draw_heaviest_load_wrench(forces, torques, excitation)
         progress.step(*excitation.criterion_history.T, where="post", color=BLUE)
         # With --until, the criterion is the period.
@@ -184,14 +184,14 @@ def draw_trajectory(excitation: Excitation) -> Figure:
     return figure
 
 
-def _draw_joints(axes: Axes, excitation: Excitation) -> None:
+def _draw_joint_angles(axes: Axes, excitation: Excitation) -> None:
     period = excitation.trajectory.period
     t = np.linspace(0, period, 1000)
     q = np.degrees(excitation.trajectory.evaluate(t)[0])
     for k, name in enumerate(excitation.robot.arm.joint_names):
         colour, style = COLOURS[k % len(COLOURS)], ("-", "--")[k // len(COLOURS) % 2]
         axes.plot(t, q[:, k], style, color=colour, label=name)
-    axes.set(title=f"Joints of {excitation.robot.name} [deg]", xlim=(0, period))
+    axes.set(title=f"Joint angles of {excitation.robot.name} [deg]", xlim=(0, period))
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
@@ -219,7 +219,7 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
 
     console = Console()
     show = partial(console.print, highlight=False, markup=False)
-    values = Table("criterion", "value", "what it is")
+    values = Table("criterion", "value", "meaning")
     for name, meaning in summary["meaning"].items():
         marked = f"[bold]{name}[/]" if name == summary["criterion"] else name
         values.add_row(marked, f"{summary[name]:.4g}", meaning)
@@ -233,8 +233,8 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
         console.print(part)
     if "until" in summary:
         show(
-            f"{summary['period_s']:.3g} s reach {summary['until']}"
-            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone"
+            f"a motion of {summary['period_s']:.3g} s reaches {summary['until']}"
+            f" in {summary['reliable']:.0%} of the records, if only sensor noise disturbs them"
         )
     for words in summary["assumed"]:
         show(f"assumed: {words}")

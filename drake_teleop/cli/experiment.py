@@ -18,9 +18,9 @@ from drake_teleop.station.scenario import Scenario
 def experiment_command(
     study: str | Path, out: Path, *, participant: int | None = None, simulated: int = 0, **page: Any
 ) -> pl.DataFrame:
-    """Continue the experiment in folder `out` and return its result table.
+    """Start or continue the experiment in folder `out`; return its result table.
 
-    `simulated` is the total number of simulated participants, 0 for people.
+    `simulated` is the total number of simulated participants; 0: people take part.
     """
     experiment, scenarios = LoadExperiment(study)
     with open_trial_store(out, experiment) as store:
@@ -41,7 +41,7 @@ def experiment_command(
 def next_participant(
     store: TrialStore, trials_per_participant: int, requested_number: int | None = None
 ) -> int:
-    """Return a participant's number: the requested, the first with trials left, or a new one."""
+    """Return the requested number, or that of the first unfinished participant, or a new one."""
     if requested_number is not None:
         return requested_number
     known = store.participant_numbers()
@@ -56,16 +56,16 @@ def next_participant(
 
 
 def _simulate_participants(
-    experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
+    experiment: Experiment, scenarios: list[Scenario], store: TrialStore, total: int
 ) -> None:
     from drake_teleop.live.experiment.simulated import make_apparatuses, simulate_participant
 
     stations = make_apparatuses(experiment, scenarios)
 
     def print_progress(done: int, trials: int) -> None:
-        print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)
+        print(f"\rparticipant {number} of {total}: trial {done} of {trials}", end="", flush=True)
 
-    for number in range(1, count + 1):
+    for number in range(1, total + 1):
         procedure = Procedure(experiment, number, store)
         simulate_participant(procedure, stations, print_progress)
     print()

@@ -1,4 +1,4 @@
-"""Commands `identify`, `eliminate` and `detect`: write the results, print a table; `parts`."""
+"""Commands `identify`, `eliminate`, `detect` and `parts`, and their printed tables."""
 
 from __future__ import annotations
 
@@ -95,9 +95,9 @@ def eliminate_command(
     scales |= {"sigma_weight": None, "sigma_inertia": None}
     summary = summaries.summarize_log(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
-        "gripper": _text_or_none(options.get("gripper")),
+        "gripper": _path_text_or_none(options.get("gripper")),
         **{name: options.get(name, default) for name, default in scales.items()},
-        "free": _text_or_none(options.get("free")),
+        "free": _path_text_or_none(options.get("free")),
         "offsets_from": offsets,
         "untouched_s": options.get("untouched_s"),
         "tare": found.offsets - load_file.offsets,
@@ -105,8 +105,8 @@ def eliminate_command(
     }
     if found.tare_fraction < 0.5:
         summary["notes"].append(
-            "less than half of the record agrees on the sensor's offsets: if it is in contact most"
-            " of the time, the contact wrench may be off by a constant"
+            "less than half of the record agrees on the sensor's offsets: if the tool is in contact"
+            " most of the time, the contact wrench may have a constant error"
         )
     if found.detection is not None:
         summary["notes"] += found.detection.notes
@@ -128,7 +128,7 @@ def eliminate_command(
     return summary
 
 
-def _text_or_none(path: Path | None) -> str | None:
+def _path_text_or_none(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
@@ -163,8 +163,8 @@ def detect_command(
     )
     eliminated = found.eliminated
     summary = summaries.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
-        "load": _text_or_none(load),
-        "free": _text_or_none(free),
+        "load": _path_text_or_none(load),
+        "free": _path_text_or_none(free),
         "free_s": found.free_duration_s,
         "statistic": statistic,
         "threshold": found.threshold,
@@ -268,7 +268,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
     table = _summary_table("Contact wrench in", summary, headings, left_aligned=("rms of",))
     for label, name in (
         ("measured, without offsets", "raw"),
-        ("less static weight only", "gravity_only"),
+        ("less the static weight only", "gravity_only"),
         ("less the non-contact wrench", "residual"),
     ):
         force, torque = summary[f"{name}_rms"], summary[f"{name}_torque_rms"]
@@ -323,7 +323,7 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_table_and_notes(table: Any, text: str, summary: dict[str, Any], out: Path) -> None:
-    """Print a table, a text, the delay, the notes and the output folder."""
+    """Print a table, `text`, the delay of the motion and the notes in `summary`, and `out`."""
     from rich.console import Console
 
     lines = [text]

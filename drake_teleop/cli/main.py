@@ -33,7 +33,7 @@ def cli(scripts: tuple[Path, ...]) -> None:
     Every command with --out writes its results by name into DIR/summary.json. A command with
     invalid input exits with status 2 and one error line.
 
-    The Tab key completes commands, options, names and files in bash (zsh, fish: likewise) after
+    The Tab key completes commands and names in bash (zsh, fish: zsh_source, fish_source) after
     eval "$(_DRAKE_TELEOP_COMPLETE=bash_source drake-teleop)"
     """
     for script in scripts:
@@ -115,10 +115,10 @@ def drive(
 ) -> None:
     """Drive a station live in the browser.
 
-    SCENARIO is a shipped name or a YAML file; your hand replaces its operator's motion, not the
-    grip. One page on this machine moves the hand by mouse, keys, touch or gamepad (it vibrates in
-    contact), and shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded session.
-    In an experiment (--study: name or YAML file) participants compare two intervals.
+    SCENARIO is a shipped name or a YAML file; you move the hand of its operator, whose grip
+    remains simulated. A page on this machine moves the hand by mouse, keys, touch or gamepad (which
+    vibrates in contact), and shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a
+    recorded session. With --study (name or YAML file) participants compare two intervals per trial.
 
     Options:
         --record: Record the session in DIR.
@@ -127,7 +127,7 @@ def drive(
         --device: Haptic device of the operator: udp://127.0.0.1:PORT or haply://localhost:10001.
         --study: Experiment with participants; SCENARIO is then unused.
         --results: Folder for results of --study; the same folder continues an experiment.
-        --participant: Number that identifies the participant of --study.
+        --participant: Number of the participant of --study.
         --simulated: Number of participants to simulate in --study; 0: people, on the page.
     """
     options["browser"] = not no_browser
@@ -251,12 +251,12 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     Options:
         --sigma-object: With --gripper: scale of the object's non-contact wrench.  [default: value
             of --sigma]
-        --eta: With --gripper: kept share of the object's non-contact wrench; not with other scales.
+        --eta: With --gripper: as --sigma-object, without other scales; eliminates the gripper.
         --offsets: Source of the sensor offsets: LOG (record) or the load file (load).
-        --untouched: Contact-free time of LOG [s], which determines the offsets.  [default: the
-            whole LOG]
-        --causal: Add a causal result: late by the lag of the low-pass, or extrapolated over this
-            lag.
+        --untouched: Start and end of a contact-free part of LOG that determines the offsets [s].
+            [default: the whole LOG]
+        --causal: Add a causal result; delayed: late by the lag of the low-pass; predicted:
+            extrapolated over this lag.
         --causal-tare: With --causal: length of the contact-free start of LOG that determines the
             offsets [s].  [default: offsets of the load file]
         --sigma: Scale of the non-contact wrench; with --gripper, of the gripper's.
@@ -360,8 +360,7 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
         --out: Destination.  [default: stdout]
         --predicted: Extrapolate the results over the low-pass lag.
         --watch: Flag contact, and a change of the load.
-        --free: Log of free motion, whose noise sets the threshold of contact flags, as for
-            `detect`.
+        --free: Log of free motion, whose noise sets the threshold of contact flags.
         --tare: Tare at the start: keep the tool free, at rest.
         --control: UDP port on localhost that accepts the request `tare`.
         --sigma: Scale of the non-contact wrench.
@@ -398,7 +397,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     """
     from drake_teleop.robots.ros2_node import run_ros2_command
 
-    def calibrate_arguments(until: str, seconds: float) -> list[str]:
+    def make_calibrate_arguments(until: str, seconds: float) -> list[str]:
         words = ["calibrate", source, "--until", until, "--seconds", str(seconds), "--quiet"]
         words += ["--out", str(out)]
         given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
@@ -411,7 +410,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
             words += ["--package-path", str(path)]
         return words
 
-    run_ros2_command(source, load, sink, out, calibrate=calibrate_arguments, **options)
+    run_ros2_command(source, load, sink, out, calibrate=make_calibrate_arguments, **options)
 
 
 @cli.command()
@@ -459,14 +458,14 @@ def export(
 ) -> None:
     """Write a load for a robot, model or controller.
 
-    Prints the load of an identification.json in the format, units and frame of a robot, a
-    compensation or a model. c99, fmu and ros2_filter write the compensation itself into --out, as
-    code of a controller with --rate, --cutoff and --range. Values that are dropped or not
+    Prints the load of an identification.json in the format, units and frame of a robot, another
+    load compensation or a model. c99, fmu and ros2_filter write a controller into --out, which
+    compensates the load with --rate, --cutoff and --range. Values that are dropped or not
     identified are listed on stderr.
 
     Options:
         --to: Robot or file format.
-        --sign: As in the log description: -1 if the sensor measures the wrench of the load on it.
+        --sign: -1 if the sensor measures the wrench that the load exerts on it, else 1.
         --sensor-pose: Pose of the sensor in the flange [m, deg].  [default: same frames]
         --rate: Rate of the sensor's readings; required by c99, fmu and ros2_filter.
     """
@@ -539,8 +538,8 @@ def compare_passivity(
     """Compare passivity methods over networks with delay.
 
     The station moves freely and presses on a soft and a stiff sheet spring. In a model with one
-    degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
-    pictures and report.html.
+    degree of freedom the hand lets go or taps, at increasing round-trip times. Writes a
+    decision table, pictures and report.html.
 
     Options:
         --networks: Network presets.  [default: all but ideal]
@@ -555,7 +554,7 @@ def compare_passivity(
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE)
 @click.option("--hands", type=option.NAMES_TYPE)
-@click.option("--walls", type=option.POSITIVES_TYPE)
+@click.option("--walls", type=option.POSITIVE_NUMBERS_TYPE)
 @click.option("--network")
 @option.choice("--task", ["press", "touch", "insert"], "press")
 @option.jobs
@@ -571,7 +570,7 @@ def tune(
     """Choose passivity method and force scales for a station.
 
     SCENARIO is a shipped name or a YAML file. Finds the settings with the smallest detectable
-    contact force that are stable for these grips and walls. Writes tuned.yaml and report.html.
+    contact force that are stable for --hands and --walls. Writes tuned.yaml and report.html.
     After an interruption, repeat the command.
 
     Options:
@@ -636,7 +635,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 @option.path("--model")
 @option.sensor_frame()
 @option.package_paths
-@click.option("--acceleration", type=option.POSITIVES_TYPE, default=())
+@click.option("--acceleration", type=option.POSITIVE_NUMBERS_TYPE, default=())
 @option.number("--payload", limits=(0, 1e4), min_open=True, metavar="KG")
 @option.choice("--criterion", ["kappa_w10", "kappa10", "kappa16", "A16", "D16"], "kappa_w10")
 @option.number("--period", limits=(0.5, 600), default=6.0, metavar="SECONDS")
@@ -702,7 +701,7 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit: 0, 2 for invalid input, 130 for Ctrl-C or SIGTERM.
+    """Run the command line and exit with status 0, 2 (invalid input) or 130 (Ctrl-C, SIGTERM).
 
     `reproduce` and `calibrate` can have status 1. A live session that the user ends has status 0.
     """
@@ -714,13 +713,13 @@ def main(arguments: list[str] | None = None) -> None:
             warnings.simplefilter("ignore")
             os.environ["PYTHONWARNINGS"] = "ignore"  # for the processes of a study
         try:
-            status = _run_with_exit_status(arguments)
+            status = _run_and_get_exit_status(arguments)
         finally:
             INTERRUPTED_EVENT.clear()
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _run_with_exit_status(arguments: list[str] | None) -> Any:
+def _run_and_get_exit_status(arguments: list[str] | None) -> Any:
     try:
         return cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:

@@ -22,7 +22,7 @@ from drake_teleop.common.registry import REGISTRIES
 
 
 class Utf8Path(click.Path):
-    """Parameter type of paths; rejects empty paths and names outside UTF-8."""
+    """Parameter type of paths; rejects empty paths and names that are not UTF-8."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
@@ -67,12 +67,12 @@ _SHARED_HELP = """
     --gripper: identification.json of the gripper without the object, in the same sensor frame.
     --jobs: Number of parallel processes.  [default: one for each core]
     --load: identification.json of the load.
-    --model: Model of the arm (URDF, SDF, MJCF), if SOURCE gives joint angles, no poses.
-    --motion: Another source of the motion, as for SOURCE.
+    --model: Model of the arm (URDF, SDF, MJCF); required if SOURCE contains joint angles, no poses.
+    --motion: Source of the motion, if not SOURCE; same forms.
     --out: Output folder.
     --package-path: Folder to search for package:// files of the model; may be repeated.
     --quiet: Print no progress bars and no tables.
-    --range: Range of the sensor [N, N m]; readings at its limits are not used.
+    --range: Range of the sensor, force [N] and torque [N m]; readings at its limits are not used.
     --real-time: Replay a log at its recorded speed.
     --seed: Seed of noise.  [default: the scenario's]
     --sensor-frame: Frame or link of the model at which the wrist sensor measures.
@@ -88,7 +88,7 @@ def _parse_option_help(text: str) -> dict[str, str]:
 
 
 class DocumentedCommand(click.Command):
-    """Command whose docstring ends with `Options:` and the help of its own options."""
+    """Command that reads the help of its own options from `Options:` at the docstring's end."""
 
     def __init__(self, name: str | None, *, help: str | None = None, **settings: Any) -> None:
         text, _, listed = cleandoc(help or "").partition("\n\nOptions:")
@@ -100,7 +100,7 @@ class DocumentedCommand(click.Command):
 
 
 class CommandGroup(click.Group):
-    """Group of a `DocumentedCommand` for each decorated function."""
+    """Group whose decorator `command` makes a `DocumentedCommand`."""
 
     command_class = DocumentedCommand
 
@@ -123,8 +123,6 @@ class FiniteNumber(click.FloatRange):
 
 
 class IntegerInRange(click.IntRange):
-    """Parameter type of integers in a range."""
-
     name, _type_without_range, convert = "integer", click.INT, FiniteNumber.convert
 
 
@@ -143,7 +141,7 @@ def choice(name: str, words: list[str], default: str) -> Any:
 
 
 class DelayOrAuto(click.ParamType):
-    """Parameter type: seconds or "auto"."""
+    """Parameter type of a delay: seconds from -10 to 10, or "auto"."""
 
     name = "auto|SECONDS"
 
@@ -168,11 +166,11 @@ class CommaSeparated(click.ParamType):
 
 
 NAMES_TYPE = CommaSeparated("NAME", click.STRING)
-POSITIVES_TYPE = CommaSeparated("number", POSITIVE_TYPE)
+POSITIVE_NUMBERS_TYPE = CommaSeparated("number", POSITIVE_TYPE)
 
 
 class RegisteredName(click.Choice):
-    """Parameter type: name of a part of this kind, shipped or registered by the user."""
+    """Parameter type of names in the registry of `kind`: `shipped`, or registered by the user."""
 
     def __init__(self, kind: str, *shipped: str) -> None:
         super().__init__(shipped)
@@ -189,7 +187,7 @@ class RegisteredName(click.Choice):
 
 
 def output_folder(command: str) -> Callable[[Any], Any]:
-    """Return the option `--out DIR`; a command that fails leaves no new empty folder there."""
+    """Return a decorator for `--out DIR`; new folders that remain empty are removed at the end."""
     return click.option(
         "--out",
         type=PATH_TYPE,
@@ -241,7 +239,7 @@ sensor_pose = click.option(
 
 
 def refuse_given_options(*names: str, remedy: str) -> None:
-    """Raise DrakeTeleopError if the command line has one of these options, which has no effect."""
+    """Raise DrakeTeleopError if the user gave one of these options: it would have no effect."""
     context = click.get_current_context()
     for parameter in context.command.params:
         source = context.get_parameter_source(str(parameter.name))
@@ -250,15 +248,15 @@ def refuse_given_options(*names: str, remedy: str) -> None:
 
 
 def refuse_without_model(options: dict[str, object]) -> None:
-    """Raise DrakeTeleopError for the first of these options (name -> value) that has a value."""
+    """Raise DrakeTeleopError if one of these options, name -> value, is given without --model."""
     for name, value in options.items():
         if value not in (None, ()):
-            remedy = "add --model or remove it"
+            remedy = f"add --model or remove {name}"
             raise DrakeTeleopError("requires --model", where=name, remedy=remedy)
 
 
 def confirm_at_terminal(question: str) -> bool:
-    """Return the answer of a user at a terminal, True for yes; False without a terminal."""
+    """Ask a question at the terminal; return True for yes, False for no or without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
@@ -274,7 +272,7 @@ def sigma_weight_and_inertia(command: Any) -> Any:
 
 
 def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a live SOURCE; those of the arm's model become the argument `arm`."""
+    """Add the options of a live SOURCE to a command, which gets the arm of --model as `arm`."""
 
     @wraps(command)
     def call_with_arm(

@@ -1,4 +1,4 @@
-"""Lifetime, scalar types and fault codes of Drake systems."""
+"""Weak callbacks, base class, fault codes and value range for Drake systems."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NO_EXTRA_SLOTS: tuple[str, ...] = ()
 
 
 def weak_callback(method: Any) -> Callable[..., None]:
-    """Return a callback for C++ that refers weakly to the system of `method`."""
+    """Return a callback that calls `method` but does not keep its system alive."""
     system, function = weakref.ref(method.__self__), method.__func__
 
     def call_method(context: Any, output: Any) -> None:
@@ -25,7 +25,7 @@ def weak_callback(method: Any) -> Callable[..., None]:
 
 
 class DoubleOnlySystem:
-    """Base class of Drake systems without AutoDiffXd or symbolic version; a conversion raises."""
+    """Base class of Drake systems for double only; ToAutoDiffXd and ToSymbolic raise an error."""
 
     __slots__ = NO_EXTRA_SLOTS
 
@@ -42,7 +42,7 @@ LARGEST_PORT_VALUE = 1e6
 
 
 class Fault(IntEnum):
-    """Faults that suppress the force at the operator's hand, by priority."""
+    """Faults that suppress the force at the operator's hand; of several the lowest code counts."""
 
     NONE = 0
     STALE = 1
@@ -54,15 +54,15 @@ class Fault(IntEnum):
     RESUMING = 7
 
 
-_OUT_OF_RANGE = f"not finite or above {LARGEST_PORT_VALUE:g} in SI units"
+_OUT_OF_RANGE_TEXT = f"not finite or above {LARGEST_PORT_VALUE:g} in SI units"
 FAULT_WARNINGS = {
-    Fault.STALE: "the wrist sensor's last sample is over 50 ms (and two periods) old or ahead",
+    Fault.STALE: "the wrist sensor's last sample is more than 50 ms and two periods from now",
     Fault.READING: "the wrist sensor gives no reading, or one beyond its valid range",
-    Fault.JOINTS: f"the slave's joint angles are {_OUT_OF_RANGE}",
-    Fault.LOAD: f"the load estimate is {_OUT_OF_RANGE}",
-    Fault.WRENCH: f"the wrench for the hand is {_OUT_OF_RANGE}",
-    Fault.HAND: f"the hand's joint angles are {_OUT_OF_RANGE}",
-    Fault.RESUMING: "the force at the hand comes back after a fault",
+    Fault.JOINTS: f"the slave's joint angles are {_OUT_OF_RANGE_TEXT}",
+    Fault.LOAD: f"the load estimate is {_OUT_OF_RANGE_TEXT}",
+    Fault.WRENCH: f"the wrench for the hand is {_OUT_OF_RANGE_TEXT}",
+    Fault.HAND: f"the hand's joint angles are {_OUT_OF_RANGE_TEXT}",
+    Fault.RESUMING: "the force at the hand increases again after a fault",
 }
 """Warning text of each fault."""
 

@@ -1,4 +1,4 @@
-"""`njit` with a disk cache that processes share and that detects changed callees in any file."""
+"""`njit` with a disk cache that processes share; a changed function or callee is recompiled."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _TYPES_IDENTIFIED_BY_REPR = (
 
 
 def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[[Any], Any]:
-    """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code.
+    """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code on disk.
 
-    `omits_reference_counting` omits reference counting: the function must create no arrays.
+    With `omits_reference_counting` the function must create no arrays.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not omits_reference_counting
@@ -53,7 +53,7 @@ def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[
 
 
 def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled function f(address, arguments) that calls machine code at an address."""
+    """Return a compiled f(address, values) that calls machine code with these argument types."""
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
@@ -113,7 +113,7 @@ class _CacheFiles:
             temporary.touch(mode=0o644)  # not writable by others, with any umask
             temporary.write_bytes(dumps((key, code)))
             os.replace(temporary, path)
-            self._remove_cache_files(keep=self._prefix + fingerprint_of_code(self._dispatcher))
+            self._remove_cache_files(self._prefix + fingerprint_of_code(self._dispatcher))
         except OSError:  # full disk: compile again next time
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
@@ -125,9 +125,9 @@ class _CacheFiles:
         this = sha256(str(key).encode()).hexdigest()[:16]
         return self._folder / f"{self._prefix}{fingerprint_of_code(self._dispatcher)}-{this}.nbc"
 
-    def _remove_cache_files(self, keep: str | None = None) -> None:
+    def _remove_cache_files(self, kept_prefix: str | None = None) -> None:
         for path in self._folder.glob(f"{self._prefix}*.nbc"):
-            if keep is None or not path.name.startswith(keep):
+            if kept_prefix is None or not path.name.startswith(kept_prefix):
                 path.unlink(missing_ok=True)
 
 
@@ -208,7 +208,7 @@ def _cache_key_text(value: Any) -> str:
     if isinstance(value, _TYPES_IDENTIFIED_BY_REPR):
         return repr(value)
     what = f"a cached compiled function uses {value!r}, whose changes are not detected"
-    raise TypeError(f"{what}; pass it as an argument")
+    raise TypeError(f"{what}; pass it to the function as an argument")
 
 
 def _qualified_name(value: Any) -> str:

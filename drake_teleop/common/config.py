@@ -1,4 +1,4 @@
-"""Dataclass fields with unit, plausible range and meaning, and checks of their values."""
+"""Dataclass fields with unit, plausible range and meaning; checks of their values."""
 
 from __future__ import annotations
 
@@ -29,11 +29,10 @@ _assignment_checks_enabled = ContextVar("checks_assignments", default=True)
 def quantity(
     default: Any, unit: str, low: float, high: float, doc: str, *, length: int | None = None
 ) -> Any:
-    """Return a dataclass field for a number or, with a list or mapping as default, several.
+    """Return a dataclass field for a number, or for a list or mapping of numbers, as `default` is.
 
-    `unit` is an SI unit, "1" if dimensionless; `low` and `high` limit the plausible range.
-    `length` is that of a vector whose default is None. A list that is empty by default has any
-    length.
+    `unit` is an SI unit, "1" if dimensionless; each number must be from `low` to `high`. A list
+    has the length of its default; after [] any length; after None `length`.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "length": length}
     if isinstance(default, list) and default:
@@ -50,7 +49,7 @@ def _field_with_default(default: Any, metadata: dict[str, Any]) -> Any:
 def choice(
     default: str, choices: Sequence[str], doc: str, registry: Registry[Any] | None = None
 ) -> Any:
-    """Return a dataclass field for one of the words `choices`, or a name in the registry."""
+    """Return a dataclass field for one of the words `choices` or of the names in `registry`."""
     metadata = {"choices": tuple(choices), "doc": doc, "registry": registry}
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -60,15 +59,15 @@ def plain(
 ) -> Any:
     """Return a dataclass field for a flag, word, integer, list or mapping of names.
 
-    With `is_path`, the field has one path or several, see `with_absolute_paths`.
+    With `is_path` the texts are paths, which `with_absolute_paths` resolves.
     """
     return _field_with_default(default, {"doc": doc, "registry": registry, "is_path": is_path})
 
 
 def with_absolute_paths(config: Any, folder: Path) -> Any:
-    """Return a copy with absolute paths, also in inner blocks; relative ones begin in `folder`.
+    """Return a copy of a dataclass whose paths, relative to `folder`, are absolute, at any depth.
 
-    The default of a field, a shipped model, remains unless `folder` contains such a file.
+    A path that equals the field's default is a shipped model: it remains unless it is in `folder`.
     """
 
     def resolve(value: Any, entry: dataclasses.Field[Any]) -> Any:
@@ -99,7 +98,10 @@ def short_text(value: Any) -> str:
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Check field names and types of parsed YAML by a dataclass; `tagged` allows a YAML tag."""
+    """Raise DrakeTeleopError if parsed YAML does not fit the fields and types of a dataclass.
+
+    `tagged` allows the key "_tag" with a YAML tag.
+    """
     if not isinstance(data, dict):
         what = f"expected a mapping of fields, found {short_text(data)}"
         remedy = f"the fields are {', '.join(_field_names(schema))}"
@@ -124,7 +126,7 @@ def check_field_name(schema: type, name: Any, where: str) -> None:
 
 
 def check_field(schema: type, name: str, value: Any, where: str) -> None:
-    """Raise DrakeTeleopError, for the place `where`, if the field cannot have this value."""
+    """Raise DrakeTeleopError, for the place `where`, if the field does not allow the value."""
     check_field_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
     if not entry.init and value != entry.default:
@@ -134,7 +136,7 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
 
 
 def check_all_field_values(config: Any, where: str) -> None:
-    """Check types, lengths, ranges and choices of all values of a dataclass, recursively."""
+    """Raise DrakeTeleopError if any value in a dataclass, at any depth, is not allowed."""
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_location(where, field.name)
@@ -208,7 +210,7 @@ def _field_names(schema: type) -> list[str]:
 class FieldType(NamedTuple):
     """Structure of a field's type: `list[A | B] | None` is (1, (A, B), True).
 
-    With `is_mapping` the type is a mapping of names to items, `dict[str, A]`.
+    `is_mapping` is True for `dict[str, A]`, a mapping of names to items.
     """
 
     list_depth: int
@@ -257,7 +259,7 @@ def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> 
         check_structure(_block_class_of_tag(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
-        remedy = f"make one: {first.__name__}(...), with fields {fields}"
+        remedy = f"pass {first.__name__}(...) with fields {fields}"
         expected = " or ".join(block.__name__ for block in kind.items)
         raise _make_type_error(expected, value, place, remedy)
 
@@ -300,10 +302,10 @@ class FieldInfo:
     """Description of a dataclass field.
 
     Attributes:
-        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass), of the
-            innermost items.
+        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass); for a
+            list or mapping, that of its items.
         list_depth: number of nested lists, 0 for one value.
-        is_mapping: whether the value is a mapping of names to items.
+        is_mapping: True if the value maps names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
         low, high: range of a quantity, limits included.
         choices: the allowed words; empty if all are allowed.
@@ -334,7 +336,7 @@ class FieldInfo:
         return " or ".join(block.__name__ for block in self.blocks)
 
     @property
-    def text(self) -> str:
+    def docstring_entry(self) -> str:
         metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
             metadata.append(f"default {_format_value(self.default)}")
@@ -342,14 +344,14 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Decorate a dataclass: check assigned values, and list the fields in its docstring.
+    """Decorate a dataclass: check values at assignment, and list the fields in its docstring.
 
-    Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
+    Its module must not import `annotations` from `__future__`: Drake reads the fields' types.
     """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     block.__str__ = _describe_changed_fields  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
-    lines = [wrap.fill(entry.text) for entry in fields_of(block)]
+    lines = [wrap.fill(entry.docstring_entry) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 

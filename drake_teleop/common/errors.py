@@ -1,4 +1,4 @@
-"""Exception for errors that a user can fix: invalid scenarios, logs, numbers."""
+"""Exception for errors that users can fix, such as invalid scenarios or logs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
-_POLARS_PROCESS_ID: list[int] = []  # PID of the process that first used polars
+_FIRST_POLARS_PROCESS_ID: list[int] = []  # PID of the process that first used polars
 
 MAX_ERROR_LINE_LENGTH = 1000
 """Maximum length of an error line of the command line."""
@@ -35,7 +35,7 @@ class DrakeTeleopError(ValueError):
 
 
 def to_one_line(text: str, max_length: int = MAX_ERROR_LINE_LENGTH) -> str:
-    """Return the text as one printable line; the middle of a longer text is cut out."""
+    """Return the text as one printable line; of a long text the middle is replaced by "..."."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:
         return text
@@ -63,22 +63,22 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
         if not (panic or isinstance(error, Exception)):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        reason = "it is damaged" if panic else reason
+        reason = "the file is damaged" if panic else reason
         raise DrakeTeleopError(f"{what}: {reason}", where=str(path), remedy=remedy) from error
 
 
 def refuse_polars_in_forked_process() -> None:
     """Raise DrakeTeleopError in a process forked after the first call: polars would hang there."""
-    _POLARS_PROCESS_ID.append(os.getpid())
-    del _POLARS_PROCESS_ID[1:]
-    if [os.getpid()] != _POLARS_PROCESS_ID:
+    _FIRST_POLARS_PROCESS_ID.append(os.getpid())
+    del _FIRST_POLARS_PROCESS_ID[1:]
+    if [os.getpid()] != _FIRST_POLARS_PROCESS_ID:
         what = "would hang in this process, which was forked after polars was used"
         remedy = 'start processes by multiprocessing.get_context("spawn")'
         raise DrakeTeleopError(what, where="polars", remedy=remedy)
 
 
 def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:
-    """Return the remedy for an unknown name: a similar or longer name, or `otherwise`."""
+    """Return "did you mean 'x'?" with a name x that resembles `name`, else `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
     near = near or [other for other in names if len(str(name)) > 2 and str(name) in other]
     return f"did you mean '{near[0]}'?" if near else otherwise
@@ -95,7 +95,7 @@ def require_library(module: str, library: str, extra: str, where: str) -> None:
 
 
 def field_location(where: str, name: Any) -> str:
-    """Return the place of a field: `file:field`, or `file:field.inner`."""
+    """Return the place `where:name`, or `where.name` if `where` is itself a field."""
     return f"{where}.{name}" if ":" in where else f"{where}:{name}"
 
 
@@ -105,7 +105,7 @@ _STDERR_LOCK = RLock()
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Discard all output to stderr, also that of C and Rust code."""
+    """Discard stderr in this context, also that of C and Rust code."""
     with _STDERR_LOCK:
         try:
             sys.stderr.flush()

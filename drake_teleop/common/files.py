@@ -36,10 +36,10 @@ class CannotWrite(DrakeTeleopError):
 def replace_file_on_success(
     path: Path, *, temporary_base: Path | None = None, shared: bool = False
 ) -> Iterator[Path]:
-    """Yield a temporary name to write under; then rename the file to `path`.
+    """Yield a temporary path to write to; then rename this file to `path`.
 
-    After a failure `path` is unchanged. `temporary_base` is another base of the temporary name;
-    `shared` allows several writing processes.
+    After a failure `path` is unchanged. The temporary path extends that of `temporary_base`, by
+    default `path`. `shared` allows several writing processes.
     """
     place, ending = temporary_base or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -80,7 +80,7 @@ def write_picture(path: Path, figure: Figure, **options: Any) -> None:
 def write_table(
     path: Path, table: pl.DataFrame, *, temporary_base: Path | None = None, **options: Any
 ) -> None:
-    """Write CSV, or Parquet for other extensions; pass `options` to polars."""
+    """Write a table as CSV if `path` ends with .csv, else as Parquet; polars gets `options`."""
     import polars as pl
 
     refuse_polars_in_forked_process()
@@ -96,9 +96,9 @@ def write_table(
 def output_folder(
     out: Path, completion_file: str = "summary.json", *, valid_after_failure: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create a command's output folder; the output is complete when `completion_file` exists.
+    """Create `out` and remove its `completion_file`, which this context then writes last.
 
-    `valid_after_failure` are names of earlier files that remain valid after a failure.
+    A CannotWrite error lists the new files, and earlier ones in `valid_after_failure`.
     """
     make_folder(out)
     with wrap_write_errors(out / completion_file):
@@ -109,11 +109,11 @@ def output_folder(
     except CannotWrite as error:
         found = _file_times_and_inodes(out).items()
         valid = [x for x, state in found if x in valid_after_failure or before.get(x) != state]
-        raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(valid)}") from error
+        raise CannotWrite(str(error), remedy=f"{out} contains {_join_file_names(valid)}") from error
 
 
 def refuse_to_replace_inputs(path: Path, input_path: str | Path | None = None) -> None:
-    """Raise DrakeTeleopError if `path` would replace `input_path` or be in a drive's folder.
+    """Raise DrakeTeleopError if `path` is the file `input_path` or a file of a recorded drive.
 
     An `input_path` that is no file, such as a shipped name, is ignored.
     """
@@ -132,7 +132,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        what = f"cannot be made a folder ({_reason_of_failure(error)})"
+        what = f"cannot be created as a folder ({_reason_of_failure(error)})"
         raise CannotWrite(what, where=str(folder), remedy=remedy) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise CannotWrite("is a folder without write permission", where=str(folder), remedy=remedy)
@@ -157,7 +157,7 @@ def log_part_path(folder: Path, first_row: int) -> Path:
 
 
 def remove_log(path: Path) -> None:
-    """Remove a log (file or folder); raise DrakeTeleopError if the folder has other files."""
+    """Remove a log file or the parts in a log folder; raise DrakeTeleopError for other files."""
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
@@ -176,7 +176,7 @@ def _reason_of_failure(error: OSError) -> str:
 
 
 def to_json_data(data: Any) -> Any:
-    """Return data with lists in place of arrays and tuples, and None in place of nan and inf."""
+    """Return data with arrays and tuples as lists, and nan and inf as None."""
     if isinstance(data, dict):
         return {key: to_json_data(value) for key, value in data.items()}
     if hasattr(data, "tolist"):  # of NumPy

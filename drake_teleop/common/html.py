@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def render_page(package: str, template: str, **values: Any) -> str:
-    """Return the page of a Jinja template, which may extend page.html.j2.
+    """Return the page of a Jinja template in `package`, which may extend page.html.j2.
 
-    `values` are escaped; a missing one is an error.
+    `values` are escaped; a missing value is an error.
     """
 
     def read_template(name: str) -> str:
@@ -42,7 +42,7 @@ def png_data_url(path: Path) -> str:
 def write_report_page_and_pictures(
     out: Path, package: str, pictures: Mapping[str, Figure], **values: Any
 ) -> None:
-    """Write NAME.png for each picture, and report.html, which has their data URLs as `pictures`."""
+    """Write NAME.png for each picture, and report.html; its template gets the data URLs."""
     from drake_teleop.common.style import PAGE_DPI
 
     for name, figure in pictures.items():
@@ -55,7 +55,7 @@ _SCRIPT_PATTERN = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
 def content_security_policy(page: str, host: str = "") -> str:
-    """Return a page's Content-Security-Policy; `host`: server's "address:port", "" for a file."""
+    """Return the Content-Security-Policy of a page; `host`: "address:port", or "" for a file."""
     scripts = (script.replace("\r\n", "\n") for script in _SCRIPT_PATTERN.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)

@@ -1,4 +1,4 @@
-"""Handling of SIGINT and SIGTERM where C code would lose the KeyboardInterrupt."""
+"""Handling of SIGINT and SIGTERM, also where C code would lose a KeyboardInterrupt."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DELAYED_SIGNALS = _DelayedSignalState()
 
 
 def install_interrupt_handlers() -> None:
-    """Let SIGTERM, and SIGINT unless ignored, raise KeyboardInterrupt; set `INTERRUPTED_EVENT`."""
+    """Let SIGTERM, and SIGINT unless ignored, set INTERRUPTED_EVENT and raise KeyboardInterrupt."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _raise_interrupt)
@@ -28,7 +28,7 @@ def install_interrupt_handlers() -> None:
 
 @contextmanager
 def raise_interrupt_on_sigint() -> Iterator[None]:
-    """Raise KeyboardInterrupt at SIGINT in this context, if Python would handle it."""
+    """Handle SIGINT in this context as `install_interrupt_handlers`, if Python's handler is set."""
     before = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
     if before is not signal.default_int_handler or not in_main_thread:
@@ -53,7 +53,7 @@ def _raise_interrupt(number: int, _frame: Any) -> None:
 
 
 class delayed_signals(ContextDecorator):
-    """Context or decorator that delays the KeyboardInterrupt of a signal to its end."""
+    """Context or decorator that delays the KeyboardInterrupt of a signal to the context's end."""
 
     def __enter__(self) -> None:
         _DELAYED_SIGNALS.open_contexts += 1

@@ -1,4 +1,4 @@
-"""Random numbers without hidden state: hashes of key and counter."""
+"""Random numbers without hidden state: hashes of a key and a counter."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drake_teleop.common.compiled import njit
 
 @njit(cache=True)
 def random_bits(key, counter):
-    """Return 53 random bits by splitmix64 (Steele, Lea, Flood 2014); `key` is a np.uint64."""
+    """Return 53 random bits from np.uint64 `key` and int `counter`: splitmix64 (Steele 2014)."""
     z = key + np.uint64(counter + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -20,7 +20,7 @@ def random_bits(key, counter):
 
 @njit(cache=True)
 def random_normal(key, counter):
-    """Return a standard normal number (Box and Muller), with arguments as for `random_bits`."""
+    """Return a standard normal number (Box and Muller); arguments as for `random_bits`."""
     u = (float(random_bits(key, 2 * counter)) + 1.0) * 2.0**-53
     angle = 2.0 * math.pi * float(random_bits(key, 2 * counter + 1)) * 2.0**-53
     return math.sqrt(-2.0 * math.log(u)) * math.cos(angle)

@@ -21,28 +21,25 @@ _ThriftStruct = dict[int, Any]
 
 
 def check_parquet_sizes(path: Path) -> None:
-    """Raise ValueError if a Parquet file is empty or damaged.
-
-    A file is damaged if its numbers of rows, values or bytes are inconsistent.
-    """
+    """Raise ValueError if a Parquet file is empty or its numbers of rows or bytes do not agree."""
     with path.open("rb") as file:
         if not file.read(1):
-            raise ValueError("it is empty")
+            raise ValueError("the file is empty")
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             check_parquet_content_sizes(content)
 
 
 def check_parquet_content_sizes(content: bytes | mmap.mmap) -> None:
     try:
-        _check_sizes_in_file(content)
+        _check_footer_and_columns(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
-        raise ValueError("it is damaged: its metadata cannot be read") from None
+        raise ValueError("the file is damaged: its metadata cannot be read") from None
 
 
-def _check_sizes_in_file(content: bytes | mmap.mmap) -> None:
+def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
     end = len(content) - _FOOTER_END_BYTES
     if end < len(_MAGIC_BYTES) or content[-len(_MAGIC_BYTES) :] != _MAGIC_BYTES:
-        raise ValueError("it does not end with PAR1, as a Parquet file does")
+        raise ValueError("the file does not end with PAR1, as a Parquet file does")
     start = end - int.from_bytes(content[end : end + 4], "little")
     _require(start >= len(_MAGIC_BYTES), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
@@ -72,7 +69,7 @@ def _leaf_names_and_is_flat(schema: list[_ThriftStruct]) -> Iterator[tuple[str, 
 
 
 def _check_column(
-    content: bytes | mmap.mmap, end: int, column: _ThriftStruct, name: str, rows: int | None
+    content: bytes | mmap.mmap, data_end: int, column: _ThriftStruct, name: str, rows: int | None
 ) -> None:
     values = _read_size(column, 5, f"values in {name}")
     _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
@@ -80,14 +77,14 @@ def _check_column(
     length = _read_size(column, 7, f"bytes in {name}")
     at = _read_size(column, 9, f"the first byte of {name}")
     at = min(at, _read_size(column, 11, f"the first byte of {name}", 0) or at)
-    _require(at + length <= end, f"{name} goes beyond the end of the file")
+    _require(at + length <= data_end, f"{name} goes beyond the end of the file")
     found, where = 0, f"a page of {name}"
     while found < values:
         reader = _ThriftReader(content, at)
         page = reader.read_struct()
         length = _read_size(page, 3, f"bytes in {where}")
         at = reader.at + length
-        _require(at <= end, f"{where} goes beyond the end of the file")
+        _require(at <= data_end, f"{where} goes beyond the end of the file")
         size = _read_size(page, 2, f"bytes in {where}")
         _require(size <= largest, f"{where} is larger than {name}")
         found += _count_values_of_page(page, length, where)
@@ -119,9 +116,9 @@ def _read_size(struct: _ThriftStruct, number: int, what: str, default: int | Non
     return int(size)
 
 
-def _require(condition: bool, otherwise: str) -> None:
+def _require(condition: bool, damage: str) -> None:
     if not condition:
-        raise ValueError(f"it is damaged: {otherwise}")
+        raise ValueError(f"the file is damaged: {damage}")
 
 
 class _ThriftReader:
@@ -180,4 +177,4 @@ class _ThriftReader:
             number |= (byte & 127) << 7 * place
             if byte < 128:
                 return number
-        raise ValueError("it is damaged: a number in its metadata is too long")
+        raise ValueError("the file is damaged: a number in its metadata is too long")

@@ -1,4 +1,4 @@
-"""Progress bars on a terminal, elsewhere lines on stderr."""
+"""Progress bars on a terminal or in a notebook, elsewhere lines on stderr."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def show_no_progress(name: str) -> UpdateProgress:
 
 @contextmanager
 def show_progress(progress: bool | StartStage, *, after: float = 0.0) -> Iterator[StartStage]:
-    """Yield a `StartStage` that shows progress in this context, after `after` seconds."""
+    """Yield a `StartStage` that shows progress, from `after` seconds on; or `progress` itself."""
     if callable(progress):
         yield progress
     elif not progress:
         yield show_no_progress
     elif not _is_interactive():
-        yield _stages_as_lines(after)
+        yield _show_stages_as_lines(after)
     else:
-        yield from _stages_as_bars(after)
+        yield from _show_stages_as_bars(after)
 
 
 def _is_interactive() -> bool:
@@ -38,7 +38,7 @@ def _is_interactive() -> bool:
     return console.is_terminal or console.is_jupyter
 
 
-def _stages_as_lines(after: float) -> StartStage:
+def _show_stages_as_lines(after: float) -> StartStage:
     opened = time.monotonic()
 
     def start_stage(name: str) -> UpdateProgress:
@@ -56,7 +56,7 @@ def _stages_as_lines(after: float) -> StartStage:
     return start_stage
 
 
-def _stages_as_bars(after: float) -> Iterator[StartStage]:
+def _show_stages_as_bars(after: float) -> Iterator[StartStage]:
     from rich import progress as rich_progress
     from rich.errors import LiveError
 

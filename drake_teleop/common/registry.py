@@ -1,4 +1,4 @@
-"""Tables of parts, such as estimators, by name; scripts can add parts (docs/extend.md)."""
+"""Tables of named parts, such as estimators, to which scripts can add (docs/extend.md)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Registry(dict[str, _Part]):
     """Parts of one kind by name; an unknown name raises DrakeTeleopError.
 
     Args:
-        kind: name of the kind of parts, such as "passivity method".
+        kind: name of the kind, such as "passivity method".
         shipped: parts of this package by name.
-        part_type: class of the parts, or the base class of parts that are classes; None: any.
+        part_type: class of the parts, or base class if the parts are classes; None: any.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Registry(dict[str, _Part]):
         REGISTRIES[kind] = self
 
     def register(self, name: str, part: _Part | None = None) -> Any:
-        """Add a part, or decorate its definition; an earlier part of this name is replaced."""
+        """Add a part, or return a decorator that does; it replaces an added part of this name."""
         if part is None:
             return partial(self.register, name)
         if not isinstance(name, str) or not re.fullmatch(r"[.\w][\w.-]*", name, re.ASCII):
@@ -46,7 +46,7 @@ class Registry(dict[str, _Part]):
             raise DrakeTeleopError(f"{name!r} is not a valid name", where=self.kind, remedy=remedy)
         if name in self.shipped:
             what = f"'{name}' is the name of a shipped part"
-            raise DrakeTeleopError(what, where=self.kind, remedy="use another")
+            raise DrakeTeleopError(what, where=self.kind, remedy="use another name")
         self._check_type(name, part)
         self[name] = part
         return part

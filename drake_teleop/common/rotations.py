@@ -27,10 +27,10 @@ EULER_AXES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) of `columns`; forms: `NUM_COLUMNS_OF_ROTATION_FORM`.
+    """Return rotation matrices (N, 3, 3) of `columns` (N, k) in a `form`, without normalization.
 
-    Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad]. Nothing is
-    normalized.
+    The forms are in `NUM_COLUMNS_OF_ROTATION_FORM`: matrices row by row, angles in rad. `axes` is
+    one of `EULER_AXES`.
     """
     if form == "euler":
         from scipy.spatial.transform import Rotation
@@ -55,7 +55,7 @@ def orthogonality_error(R: Array) -> Array:
 
 
 def nearest_rotation(R: Array) -> Array:
-    """Return the rotation closest to each near-rotation (..., 3, 3)."""
+    """Return the rotation closest to each nearly orthogonal matrix (..., 3, 3)."""
     # Newton-Schulz iteration for the polar factor; 4 steps reduce an error of 0.3 below 1e-15.
     for _ in range(4):
         R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)
@@ -63,7 +63,7 @@ def nearest_rotation(R: Array) -> Array:
 
 
 def quaternions_from_matrices(R: Array) -> Array:
-    """Return quaternions (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
+    """Return quaternions (N, 4) [w, x, y, z] of rotations (N, 3, 3); their signs are arbitrary."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])
@@ -91,7 +91,7 @@ def signed_permutations() -> list[Array]:
 
 
 def axis_names_of_rows(P: Array) -> list[str]:
-    """Return the names of the rows of a signed permutation P (3, 3), such as ["-y", "x", "z"]."""
+    """Return the axis in each row of a signed permutation P (3, 3), such as ["-y", "x", "z"]."""
     return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in P]
 
 

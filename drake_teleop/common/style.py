@@ -39,6 +39,5 @@ class Picture(Figure):
 
 
 def shade_contact(axes: Axes, t: ArrayLike, contact: ArrayLike) -> None:
-    """Shade the time spans in which `contact` (N,) is true; `t` (N,) are the times [s]."""
     for start, stop in contact_spans(t, contact):
         axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)

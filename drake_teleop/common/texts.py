@@ -74,7 +74,7 @@ for _kind, _, _first in _YAML_CORE_SCHEMA:
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """Return the data of a YAML file; with `tagged` a mapping's tag is under the key "_tag"."""
+    """Return the data of a YAML file; `tagged` allows tags of mappings, under the key "_tag"."""
     return parse_yaml(read_text(path), str(path), tagged=tagged)
 
 
@@ -99,9 +99,9 @@ def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
 def to_yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data.
+    """Return YAML text that `read_yaml` reads as the same data.
 
-    `head` are comment lines at the top; `comments` are texts after fields, by "field.inner".
+    `head` are comment lines at the top; `comments` maps "field.inner" to a comment after the field.
     """
     lines, place, left = [f"# {to_one_line(text)}" for text in head], list[str](), comments or {}
     for line in format_yaml_value(data, flow=None).splitlines():
@@ -117,14 +117,14 @@ def to_yaml_text(
 
 
 def format_yaml_value(value: Any, flow: bool | None = True) -> str:
-    """Return a value as YAML in one line; with `flow` None, blocks have their own lines."""
+    """Return a value as YAML in one line; with `flow` None, nested mappings have several lines."""
     options: dict[str, Any] = {"Dumper": _YamlDumper, "allow_unicode": True, "sort_keys": False}
     text: str = yaml.dump(value, default_flow_style=flow, width=math.inf, **options)
     return text.removesuffix("...\n").strip("\n")
 
 
 def read_json(path: str | Path) -> Any:
-    """Return the data of a JSON file; raise DrakeTeleopError if invalid or ambiguous."""
+    """Return the data of a JSON file; raise DrakeTeleopError if invalid or if a key repeats."""
     where, text = str(path), read_text(path)
 
     def check_unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -132,7 +132,7 @@ def read_json(path: str | Path) -> Any:
         for name, value in pairs:
             if name in found:
                 place = field_location(where, name)
-                raise DrakeTeleopError("is defined twice", where=place, remedy="remove one")
+                raise DrakeTeleopError("is defined twice", where=place, remedy="remove one of both")
             found[name] = value
         return found
 
@@ -153,7 +153,8 @@ def read_text(path: str | Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DrakeTeleopError(f"is not UTF-8 text (byte {error.start})", where=str(path)) from None
+        what = f"is not UTF-8 text (byte {error.start})"
+        raise DrakeTeleopError(what, where=str(path), remedy="save it as UTF-8 text") from None
     except OSError as error:
         raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
@@ -171,7 +172,8 @@ class _NodeConverter:
             return self._convert_mapping(node, place)
         if isinstance(node, yaml.SequenceNode):
             if node.tag != f"{_TAG_PREFIX}seq":
-                raise _error_at_node(f"a list takes no tag {_quote_value(node.tag)}", node, place)
+                what = f"a list cannot have the tag {_quote_value(node.tag)}"
+                raise _error_at_node(what, node, place)
             return [self.convert_node(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
         return _convert_scalar(node, place)
 
@@ -179,7 +181,7 @@ class _NodeConverter:
         found: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
-                what = f"a field's name is a word, not {_quote_value(key.value)}"
+                what = f"a field's name must be a word, not {_quote_value(key.value)}"
                 raise _error_at_node(what, key, place)
             field = field_location(place, key.value)
             if key.value in found:
@@ -191,7 +193,7 @@ class _NodeConverter:
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
                 what = f"the tag {_quote_value(node.tag)} is not allowed here"
-                raise _error_at_node(what, node, place)
+                raise _error_at_node(what, node, place, "remove the tag")
             found["_tag"] = node.tag
         return found
 

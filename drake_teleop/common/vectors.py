@@ -16,7 +16,6 @@ from drake_teleop.common.compiled import njit
 
 @register_jitable
 def vector_at(x, i):
-    """Return the 3 numbers of x from index i as a vector."""
     return x[i], x[i + 1], x[i + 2]
 
 
@@ -27,7 +26,7 @@ def quaternion_at(x, i):
 
 @register_jitable
 def matrix_at(x, i):
-    """Return the 9 numbers of x from index i as a rotation matrix."""
+    """Return the 9 numbers of x from index i as a tuple, a matrix row by row."""
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6], x[i + 7], x[i + 8]
 
 
@@ -93,7 +92,6 @@ def add_cross_product(c, a, b):
 
 @register_jitable
 def apply_matrix(R, a):
-    """Return the vector R a for any matrix R of 9 numbers."""
     return (
         R[0] * a[0] + R[1] * a[1] + R[2] * a[2],
         R[3] * a[0] + R[4] * a[1] + R[5] * a[2],
@@ -103,14 +101,14 @@ def apply_matrix(R, a):
 
 @register_jitable
 def symmetric_matrix_at(x, i):
-    """Return the symmetric matrix (9 numbers) of xx, xy, xz, yy, yz, zz from index i of x."""
+    """Return a symmetric matrix (9 numbers) from xx, xy, xz, yy, yz, zz at index i of x."""
     xx, xy, xz, yy, yz, zz = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
 @register_jitable(inline="always")
 def cholesky(M, n):
-    """Replace the lower half of M (n, n), symmetric and positive definite, by L of M = L L^T."""
+    """Replace the lower triangle of a positive definite M (n, n) by L of M = L L^T."""
     for i in range(n):
         for j in range(i + 1):
             value = M[i, j]
@@ -121,7 +119,7 @@ def cholesky(M, n):
 
 @register_jitable(inline="always")
 def solve_by_cholesky(M, b, n):
-    """Solve M x = b in place: replace b (n,) by x, and M (n, n) as in `cholesky`."""
+    """Solve M x = b: replace b (n,) by x, and the lower triangle of M (n, n) as `cholesky` does."""
     cholesky(M, n)
     for i in range(n):
         for k in range(i):
@@ -158,10 +156,10 @@ def conjugate_quaternion(a):
 
 
 @njit(cache=True)
-def rotate_vector(a, v):
-    axis = vector_at(a, 1)
+def rotate_vector(quaternion, v):
+    axis = vector_at(quaternion, 1)
     t = scale_vector(2.0, cross(axis, v))
-    return add_cross_product(plus(v, scale_vector(a[0], t)), axis, t)
+    return add_cross_product(plus(v, scale_vector(quaternion[0], t)), axis, t)
 
 
 @njit(cache=True)
@@ -176,7 +174,7 @@ def quaternion_exponential(v):
 
 @njit(cache=True)
 def quaternion_logarithm(a):
-    """Return the rotation vector [rad] of a quaternion, |v| <= pi; it is equal for a and -a."""
+    """Return the rotation vector [rad] of a quaternion, norm <= pi; a and -a have the same."""
     sine = math.sqrt(a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     scale = 2.0 * math.atan2(sine, abs(a[0])) / sine if sine > 1e-12 else 2.0
     if a[0] < 0.0:

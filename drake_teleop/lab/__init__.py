@@ -1,1 +1,1 @@
-"""Experiments that simulate or analyse a station."""
+"""Experiments that simulate or analyse stations."""

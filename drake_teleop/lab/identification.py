@@ -46,11 +46,11 @@ _TRAJECTORIES_AND_KAPPAS: dict[str, tuple[FourierTrajectory, float]] = {}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoadIdentification:
-    """Result of an identification run.
+    """Result of a simulated load identification.
 
     Attributes:
         estimate: (16,) final recursive estimate of Eq. (7): sensor offsets [N, N m], then phi.
-        batch: estimate by batch total least squares from the same record.
+        batch: estimate by total least squares from all samples at once.
         kappa_w10: condition number, see `excitation.criteria`.
         real_time_factor: simulated time over elapsed time.
     """
@@ -68,7 +68,7 @@ class LoadIdentification:
 
     @property
     def identification(self) -> Identification:
-        """Recursive estimate, with uncertainties and residuals of the batch estimate."""
+        """Recursive estimate, with the uncertainties and residuals of `batch`."""
         return dataclasses.replace(
             self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
         )
@@ -97,7 +97,7 @@ def slave_arm(scenario: Scenario) -> ArmModel:
 
 
 def true_load(scenario: Scenario) -> Array:
-    """Return zero sensor offsets, then the true parameters phi of tool and payload (16,)."""
+    """Return (16,) zero sensor offsets, then the true parameters phi of tool and payload."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
@@ -129,7 +129,7 @@ def identify_load(
 
     Args:
         progress: True shows progress bars; or a `StartStage` that receives the progress.
-        trajectory: excitation of the scenario's duration; None: one that each process designs once.
+        trajectory: excitation of the scenario's duration; None: this process designs one, once.
         log: folder of the log, see `simulate`.
 
     Raises:
@@ -200,7 +200,7 @@ def _trajectory_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[Fourie
 
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
-        what = f"has {len(trajectory.q0)} joints, but the arm {robot.arm.num_joints}"
+        what = f"has {len(trajectory.q0)} joints, but the arm has {robot.arm.num_joints}"
         raise DrakeTeleopError(what, where="trajectory", remedy="compute a trajectory for this arm")
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
         what = f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s"
@@ -208,15 +208,13 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
         raise DrakeTeleopError(what, where="trajectory", remedy=remedy)
     worst = check_trajectory(robot, trajectory)[0]
     if worst.used_share > 1:
-        raise DrakeTeleopError(
-            f"uses {worst}", where="trajectory", remedy="compute a trajectory for these limits"
-        )
+        what, remedy = f"uses {worst} (at most 100 %)", "compute a trajectory for these limits"
+        raise DrakeTeleopError(what, where="trajectory", remedy=remedy)
 
 
 def simulate_with_real_time_factor(
     station: Diagram, simulation: Simulation, progress: UpdateProgress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
-    """Return the result of a simulation, and simulated time over elapsed time."""
     start = time.perf_counter()
     result = simulate(station, simulation, progress=progress, log=log)
     elapsed = time.perf_counter() - start

@@ -56,7 +56,7 @@ def identified_load(
 ) -> IdentifiedLoad:
     """Return the load of a scenario from the cache, or identify and cache it.
 
-    `fresh` ignores the cached load. Errors of cache files are ignored.
+    `fresh` ignores the cached load. A damaged or unwritable cache file raises no error.
     """
     check_scenario(scenario)
     # Another seed: noise of identification and run must be independent.

@@ -73,7 +73,7 @@ class RecordedDrive(Protocol):
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load identified before the session; None if estimated during it."""
+        """Load identified before the session; None if it was estimated in the session."""
 
     def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""
@@ -89,9 +89,9 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run one scenario or `drive`; write all results into `out` and delete those of an earlier run.
+    """Run a scenario, or repeat `drive`; replace the results in `out`.
 
-    Return the content of summary.json and session.json. The message of a KeyboardInterrupt
+    Return summary.json and session.json in one dictionary. The message of a KeyboardInterrupt
     contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
@@ -157,9 +157,9 @@ def run_scenario(
     *,
     fresh: bool = False,
 ) -> ScenarioRun:
-    """Run a scenario; estimate the load during the run, or use the cached or newly identified load.
+    """Run a scenario; the load is estimated during the run, or else cached or identified before.
 
-    An estimation without intended motion or task uses an excitation trajectory.
+    A run that estimates the load without intent and task uses an excitation trajectory.
 
     Args:
         progress: True shows progress bars; or a `StartStage` that receives the progress.
@@ -195,7 +195,7 @@ def _repeat_drive(drive: RecordedDrive, progress: StartStage, log: Path) -> Scen
 def _describe_unfinished_log(log: Path) -> str:
     if not log.exists():
         return ""
-    return f"{log} contains the {len(SimulationResult.scan_parquet(log).t)} samples until then"
+    return f"{log} contains the first {len(SimulationResult.scan_parquet(log).t)} samples"
 
 
 def _print_summary(summary: dict[str, Any], out: Path) -> None:
@@ -239,7 +239,7 @@ def _format_ms(delay: float | None) -> str:
 
 
 def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return whether each sample (N,) is in contact; gaps below `FILTER_SETTLING_S` are closed."""
+    """Return flags (N,) of true contact; gaps shorter than `FILTER_SETTLING_S` count as contact."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touch = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -296,7 +296,6 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
 
 
 def draw_overview(result: SimulationResult) -> Figure:
-    """Draw wrenches, motion and force to the master over time."""
     signals = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
     if "contact_wrench_S" not in result:
         signals = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")

@@ -26,7 +26,7 @@ _WARNED_PACKET_SILENCE_S = 0.05  # s
 
 @njit(cache=True)
 def norm_range_into(vectors, origins, out):
-    """Write the smallest and largest norm of the rows' first three elements minus `origins`."""
+    """Write smallest and largest norm of vectors[k, :3] - origins[k, :3] to `out` (2,)."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -55,7 +55,7 @@ def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist,
 
 
 class PageValueCalculator:
-    """Calculator of the page's values from rows of the log."""
+    """Calculator of the values that the page displays, from new rows of the log."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
@@ -64,13 +64,13 @@ class PageValueCalculator:
             ("speed", "slave_state", slice(n, None), _WARNED_LIMIT_FRACTION * arm.velocity_limit),
             ("torque", "joint_torque", slice(None), _WARNED_LIMIT_FRACTION * arm.effort_limit),
         )
-        self._peak = scenario.master.device(0.0, 0.0).parameters.peak_force
+        self._peak_force = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
         self._last_row = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))
 
     def page_values(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Return the page's values for the new rows (at least one), as finite numbers for JSON."""
+        """Return the page's values for new rows (at least one); non-finite numbers become 0."""
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
@@ -104,8 +104,8 @@ class PageValueCalculator:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak:
-            yield f"the device renders its largest force, {self._peak:g} N"
+        if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak_force:
+            yield f"the device renders its largest force, {self._peak_force:g} N"
         hand = np.empty(2)
         norm_range_into(rows["hand_wrench_E"], zeros, hand)
         if hand[1] > _WARNED_HAND_FORCE_N:

@@ -1,4 +1,4 @@
-"""Client of a haptic device: sends its pose to the station, displays the force, at 1 kHz.
+"""Client of a haptic device: sends poses to the station and displays its forces at 1 kHz.
 
 python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
 python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
@@ -41,7 +41,7 @@ class HapticDevice(Protocol):
     def limits(self) -> DeviceLimits: ...
 
     def read(self) -> device_packets.DeviceState | None:
-        """Return the next pose, without number and time; None if none is received for 0.5 s."""
+        """Return the next pose, with number and time 0; None if none arrives within 0.5 s."""
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
@@ -53,7 +53,7 @@ class HapticDevice(Protocol):
 class DeviceClient:
     """Connection of a haptic device to a station.
 
-    `force_ages_s` contains the delays [s] from each device position to the force that answers it.
+    `force_ages_s`: age [s] of the position that each displayed force answers.
     """
 
     def __init__(self, device: HapticDevice, address: str, *, observe: bool = True) -> None:
@@ -69,12 +69,13 @@ class DeviceClient:
     def exchange_packets(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
-        """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
+        """Send the pose; limit, display and return the newest wrench (6,); None without a pose."""
         pose = self._device.read()
         now = clock()
         self._receive_force_commands()
         if pose is None:
             self._device.set_wrench((0.0,) * 6)
+            self.guard.reset_force_and_motion()
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
@@ -118,7 +119,7 @@ class DeviceClient:
 
 
 class VirtualDevice:
-    """Simulated device in a moving hand; `energy`: work against the rendered force [J]."""
+    """Simulated device in a moving hand; `energy`: its work against the rendered force [J]."""
 
     def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
         held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
@@ -127,7 +128,7 @@ class VirtualDevice:
         self.energy, self._t = 0.0, 0.0
 
     def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
-        """Simulate `seconds` under a constant force (3,) on the hand [N]."""
+        """Advance the simulation by `seconds` under a constant rendered force (3,) [N]."""
         steps = max(math.ceil(seconds * 1e3 * _SIMULATION_STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps
         for _ in range(steps):
@@ -143,7 +144,7 @@ class VirtualDevice:
 
 
 def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
-    """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""
+    """Return a hand motion that taps `hertz` times a second, from z = 10 mm to -`depth` [m]."""
     lift, hold = 0.01, 0.6
 
     def hand_motion(t: float) -> tuple[Sequence[float], Sequence[float]]:
@@ -162,7 +163,7 @@ def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
 
 
 class RealTimeVirtualDevice:
-    """Virtual device that runs in real time."""
+    """Virtual device in real time."""
 
     limits = DeviceLimits(force=10.0)
 
@@ -191,7 +192,7 @@ class RealTimeVirtualDevice:
 
 
 def open_device(address: str, grip: str, depth: float) -> HapticDevice:
-    """Return the device at `virtual` (tapping `depth` [m] deep) or haply://HOST:PORT."""
+    """Return the device `virtual` (a hand with `grip` taps `depth` [m] deep) or haply://HOST:PORT."""
     if address == "virtual":
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):

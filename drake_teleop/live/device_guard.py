@@ -51,7 +51,7 @@ class DeviceGuard:
     def limit_wrench(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
-        """Return the displayed wrench (6,); `age` of the command, `period` between calls [s]."""
+        """Return `wrench` (6,) after all limits; `age` of the command, `period` of calls [s]."""
         x = np.array(position, dtype=float)
         motion = np.zeros(3) if self._position is None else x - self._position
         work = -float(self._force @ motion)
@@ -75,6 +75,11 @@ class DeviceGuard:
             force = _limit_norm(self._limit_returned_energy(force, next_motion), limits.force)
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
+
+    def reset_force_and_motion(self) -> None:
+        """Set the last force and velocity to zero, after a tick without a pose."""
+        self._force, self._torque, self._velocity = np.zeros((3, 3))
+        self._position = None
 
     def _allowed_force_fraction(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
@@ -101,9 +106,9 @@ def _zeros_if_any_not_finite(a: Sequence[float]) -> Array:
     return vector if math.isfinite(vector.sum()) else np.zeros(3)
 
 
-def _limit_norm(a: Array, longest: float) -> Array:
+def _limit_norm(a: Array, max_norm: float) -> Array:
     length = math.hypot(*a)
-    return a if length <= longest else longest / length * a
+    return a if length <= max_norm else max_norm / length * a
 
 
 def _limit_slew(last: Array, requested: Array, max_change: float) -> Array:

@@ -34,14 +34,14 @@ _CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 
 
 class DeviceLink:
-    """UDP link to one device client on this machine; 50 ms of silence admit another client.
+    """UDP link to one device client on this machine; another may follow after 50 ms of silence.
 
-    The address is udp://127.0.0.1:PORT, or haply://HOST:PORT, whose client is a child process.
+    An address haply://HOST:PORT also starts the client, as a child process.
 
     Attributes:
         refused: number of invalid packets and packets of other senders.
         refusal: reason of the last refusal.
-        lost: number of missing or overtaken packets.
+        lost: number of packets that did not arrive.
     """
 
     def __init__(self, address: str) -> None:
@@ -73,7 +73,7 @@ class DeviceLink:
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def receive_state(self, now: float) -> DeviceState | None:
-        """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
+        """Receive waiting packets; return the newest device state, None if silent for 50 ms."""
         self._polled_at = now
         for _ in range(_MAX_PACKETS_PER_POLL):
             try:
@@ -106,7 +106,7 @@ class DeviceLink:
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send_wrench(self, wrench: np.ndarray) -> None:
-        """Answer the newest device state with the wrench (6,) [N, N m]."""
+        """Send the wrench (6,) [N, N m] to the device, as answer to its newest state."""
         if self._state is None or self._peer is None:
             return
         command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
@@ -116,11 +116,11 @@ class DeviceLink:
             return
 
     def reset_pose_origin(self, now: float) -> None:
-        """Map the device's present pose to the station's start pose."""
+        """Make the device's present pose the origin of `hand_inputs`, the hand's start pose."""
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the device's pose; a silent device counts as let go."""
+        """Return `Inputs` values for the device's motion from its origin; held = 0 if silent."""
         state = self.receive_state(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -133,7 +133,7 @@ class DeviceLink:
         return values
 
     def link_statistics(self, now: float) -> dict[str, float]:
-        """Return packet rate [Hz], lost packets, lateness and delays [ms]."""
+        """Return packet rate [Hz], lost packets, percentiles of lateness and age of forces [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = np.inf

@@ -1,8 +1,8 @@
 """Packets between a haptic device and the station: little-endian, in the device's base frame B.
 
 From the device: "DTD1", flags, number, time [s], position (3) [m], orientation (4) [w, x, y, z],
-delay of the force [s]. To the device: "DTF1", 0, number and time of the answered packet, wrench (6)
-[N, N m].
+age of the position that the displayed force answers [s]. To the device: "DTF1", 0, number and time
+of the answered packet, wrench (6) [N, N m].
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class DeviceState(NamedTuple):
         position: p_BE [m].
         quaternion_wxyz: (4,) unit quaternion of R_BE.
         flags: 0 or `CLUTCH_OPEN`.
-        behind: age of the position from which the displayed force follows [s]; 0: no force.
+        behind: age of the position that the displayed force answers [s]; 0: no force.
     """
 
     number: int
@@ -82,7 +82,7 @@ def valid_state(number: int, t: float, flags: int, numbers: Sequence[float]) -> 
 
 
 def rejection_reason(packet: bytes) -> str:
-    """Return as text why a packet is invalid; only for a packet that `unpack_state` rejects."""
+    """Return the reason for which `unpack_state` rejects a packet, as the end of a sentence."""
     if len(packet) != _STATE_FORMAT.size:
         length = len(packet) if len(packet) < MAX_PACKET_BYTES else f"more than {MAX_PACKET_BYTES}"
         return f"is {length} bytes long, not {MAX_PACKET_BYTES}"

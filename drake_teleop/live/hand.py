@@ -1,4 +1,4 @@
-"""Hand of a live session: simulated, on a smooth path to the newest target, or at a real device."""
+"""Hand of a live session: simulated, or at a real device."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # largest slew rate [1/s].
 _WRENCH_LIMIT_FADE_S, _LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
 # Path of a device: held flag, start time [s], start pose (7,), displacement, rotation vector (3,).
-_START_POSE_INDEX, _DISPLACEMENT_INDEX, _TURN_INDEX = 2, 9, 12
+_START_POSE_INDEX, _DISPLACEMENT_INDEX, _ROTATION_VECTOR_INDEX = 2, 9, 12
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT_INDEX, _ALLOWED_SHARE_INDEX, _DISPLAY_STATE_SIZE = 6, 7, 8
 _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
@@ -53,7 +53,7 @@ _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 
 @njit(cache=True)
 def _intended_motion_into(path, time, pose, out):
-    """Write intended X_BE (7,), twist (6,), acceleration (3,) of a smooth path to the target."""
+    """Write intended X_BE (7,), twist (6,), acceleration (3,) on the path at a time to `out`."""
     if path[_IS_HELD_INDEX] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
@@ -133,7 +133,7 @@ def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, 
 
 
 class LiveHand(operator.Operator):
-    """Hand of an operator that follows external targets.
+    """Simulated hand of an operator, on smooth paths to the targets of `SetTarget`.
 
     .. pydrake_system::
 
@@ -170,7 +170,7 @@ class LiveHand(operator.Operator):
     def KeepWrench(
         self, context: Context, before: operator.HandImpedance, after: operator.HandImpedance
     ) -> None:
-        """Shift the intended motion so that the new impedance causes no step of the wrench."""
+        """Shift the intended motion so that changing the impedance causes no step of the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_IS_HELD_INDEX] < 0.5:
             return
@@ -210,7 +210,7 @@ class LiveHand(operator.Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the master side with a `LiveHand`; `cross_fade`: with a block `CrossFade`."""
+    """Return the master side with a `LiveHand` and, if `cross_fade`, a block `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
@@ -221,7 +221,7 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
 @njit(cache=True)
 def _pose_and_twist_on_path_into(path, time, out):
     share = min(max((time - path[_START_TIME_INDEX]) / POSE_PERIOD_S, 0.0), 1.0)
-    r = vectors.scale_vector(share, vectors.vector_at(path, _TURN_INDEX))
+    r = vectors.scale_vector(share, vectors.vector_at(path, _ROTATION_VECTOR_INDEX))
     rotation = vectors.quaternion_product(
         vectors.quaternion_exponential(r), vectors.quaternion_at(path, _START_POSE_INDEX)
     )
@@ -231,7 +231,7 @@ def _pose_and_twist_on_path_into(path, time, out):
     for k in range(3):
         out[4 + k] = path[_START_POSE_INDEX + 4 + k] + share * path[_DISPLACEMENT_INDEX + k]
         out[7 + k] = moves * path[_DISPLACEMENT_INDEX + k]
-        out[10 + k] = moves * path[_TURN_INDEX + k]
+        out[10 + k] = moves * path[_ROTATION_VECTOR_INDEX + k]
 
 
 @njit(cache=True)

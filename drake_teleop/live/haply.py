@@ -1,4 +1,4 @@
-"""Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
+"""Client of a Haply Inverse3, through the websocket of Haply's Inverse Service 3.
 
 Tested only with a virtual service, not with the device.
 """
@@ -16,11 +16,12 @@ from drake_teleop.live.device_guard import DeviceLimits
 from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, valid_state
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
-_GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
+_START_REMEDY = "start Haply's Inverse Service"
+_VERSE_GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
 def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
-    """Return the device's name and its state in its base frame B, or None without a valid pose."""
+    """Return device name and state, in the device's base frame B; None without a valid pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
@@ -28,7 +29,7 @@ def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
         cursor = content["inverse3"][0]
         place, name = cursor["state"]["cursor_position"], cursor["device_id"]
         x, y, z = (_require_finite_float(place[axis]) for axis in "xyz")
-        grip: Any = next((content[key][0]["state"] for key in _GRIP_KEYS if content.get(key)), {})
+        grip: Any = next((content[k][0]["state"] for k in _VERSE_GRIP_KEYS if content.get(k)), {})
         turn = grip.get("orientation") or {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
         w, i, j, k = (_require_finite_float(turn[axis]) for axis in "wxyz")
         pressed = (grip.get("buttons") or {}).get("a") is True
@@ -78,7 +79,7 @@ class HaplyDevice:
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             what = f"Haply's service does not answer ({error})"
-            raise DrakeTeleopError(what, where=address, remedy="start it") from error
+            raise DrakeTeleopError(what, where=address, remedy=_START_REMEDY) from error
         self._device = ""
 
     def read(self) -> DeviceState | None:
@@ -90,7 +91,7 @@ class HaplyDevice:
             return None
         except ConnectionClosed as error:
             what = "Haply's service has closed the connection"
-            raise DrakeTeleopError(what, where="haply", remedy="restart the service") from error
+            raise DrakeTeleopError(what, where="haply", remedy=_START_REMEDY) from error
         if message is None:
             return None
         self._device, state = message

@@ -23,9 +23,9 @@ from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
-AS_IN_SCENARIO = "as in the scenario"
-NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")
-SENSOR_NAMES = (AS_IN_SCENARIO, *SENSOR_PRESETS)
+AS_IN_SCENARIO_NAME = "as in the scenario"
+NETWORKS = (AS_IN_SCENARIO_NAME, *NETWORK_PRESETS, "custom")
+SENSOR_NAMES = (AS_IN_SCENARIO_NAME, *SENSOR_PRESETS)
 
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
@@ -35,13 +35,13 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def choice_names() -> dict[str, tuple[str, ...]]:
-    """Return the names that the inputs network, grip, sensor and method index."""
+    """Return the options of the inputs network, grip, sensor and method, which are indices."""
     shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSOR_NAMES}
     return shipped | {"method": tuple(METHODS)}
 
 
 def choices_as_in_scenario(scenario: Scenario) -> dict[str, int]:
-    """Return the choices (input -> integer) that leave a scenario unchanged."""
+    """Return values of network, grip and other choices that leave a scenario unchanged."""
     return {
         "network": 0,
         "method": list(METHODS).index(scenario.passivity.method),
@@ -66,8 +66,8 @@ class Inputs:
         held: 1 while the hand holds the stylus.
         clutch: 1 while motion is transmitted.
         sigma: scale of the non-contact wrench of the gripper, or of an undivided load [%].
-        sigma_weight: scale of the load's weight alone [%]; -1: as its inertia.
-        sigma_object: the same of a gripped object [%].
+        sigma_weight: scale of the load's weight [%]; -1: the scale of its inertia.
+        sigma_object: scale of the non-contact wrench of a gripped object [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
         network, method, grip, sensor: index into `choice_names()`.
@@ -129,7 +129,7 @@ class Inputs:
 
     @property
     def station_choices(self) -> tuple[int, ...]:
-        """Inputs whose change requires a new station."""
+        """Values of the inputs whose change requires a new station."""
         line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
@@ -177,7 +177,7 @@ def input_range(name: str) -> tuple[int, int]:
 def inputs_at_displacement(
     displacement: Sequence[float] | Array, rotation: Any
 ) -> dict[str, float]:
-    """Return the inputs of a hand that holds the stylus, as floats.
+    """Return held, x ... rz of a hand at a displacement, as floats in units of `Inputs`.
 
     `displacement` (3,) is in B [m], `rotation` a quaternion [w, x, y, z].
     """
@@ -203,9 +203,9 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 def read_inputs(
     path: Path, made_by: Mapping[str, str] = _WRITER_PACKAGE_AND_VERSION
 ) -> list[tuple[int, Inputs]]:
-    """Return the recorded times [ms] and inputs of each change; the last is the end.
+    """Return the recorded changes as (time [ms], inputs); the last is the end.
 
-    Raise DrakeTeleopError if the file is invalid, or if its versions differ from `made_by`.
+    Raise DrakeTeleopError if the file is invalid or not of the versions `made_by`.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
@@ -218,7 +218,7 @@ def read_inputs(
     recorded = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
         if recorded.get(name) != value:
-            what = f"was recorded with {name} {recorded.get(name, 'unknown')}, and this is {value}"
+            what = f"was recorded with {name} {recorded.get(name, 'unknown')}, not with {value}"
             changed = "the models or other files that its scenario names have changed"
             raise _not_repeatable(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
@@ -230,7 +230,7 @@ def read_inputs(
 
 def _not_repeatable(what: str, path: Path) -> DrakeTeleopError:
     folder = shlex.quote(str(path.parent))
-    remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {folder}"
+    remedy = f"it cannot be repeated exactly; to see its log, run drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 

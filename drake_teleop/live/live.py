@@ -51,11 +51,11 @@ _SCHEDULE_STATISTICS_SLICES = 400  # slices
 
 
 class SliceSchedule:
-    """Schedule of the simulation slices of `slice_s` simulated seconds; times `now` in s.
+    """Schedule of slices of `slice_s` simulated seconds; `now`: clock time [s].
 
     Attributes:
         slowdown: clock time per simulated time; 1: real time.
-        lost_time_s: lost time that is not caught up [s].
+        lost_time_s: total lateness that was not caught up [s].
     """
 
     def __init__(self, slice_s: float, now: float) -> None:
@@ -83,7 +83,7 @@ class SliceSchedule:
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated over clock time of the last slices, at most 400; 0 before the second one."""
+        """Ratio of simulated to clock time of the last 400 slices; 0 before the second one."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
@@ -107,7 +107,7 @@ def without_garbage_collection() -> Iterator[None]:
 
 
 class Live:
-    """Event handler of a live session: messages of pages and ticks of a clock; times `now` in s.
+    """Event handler of a live session for messages and clock ticks; `now`: clock time [s].
 
     Attributes:
         refused: number of invalid messages.
@@ -116,7 +116,7 @@ class Live:
         recorded: folders of completed records.
 
     Args:
-        record: folder of the record; if not empty, the next free one; None: no record.
+        record: folder of the record (NAME-2 ... if it is not empty); None: no record.
         show: function that returns the 3D scene's part of a frame.
         link: link to a haptic device; None: the page moves the hand.
     """
@@ -141,7 +141,7 @@ class Live:
         self._drives, self._paused, self.stopped = 0, False, ""
         self.recorded: list[str] = []
         self._write_error = ""
-        self._alone_since = now
+        self._idle_since = now
         self.pace = SliceSchedule(1e-3 * self._slice_ms, now)
         self._frame_due, self._last_frame_at, self._show_now = now, now, False
         self._start_session(now)
@@ -161,7 +161,7 @@ class Live:
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=device)
         self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
-        self._refusal, self._pressed = "", False
+        self._refusal, self._touched = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()
         self._last_target = self._requested.hand_pose_and_held
         self._last_frame: dict[str, Any] = {}
@@ -210,7 +210,7 @@ class Live:
     def leave(self, client: int, now: float) -> None:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
-            self._driver, self._alone_since = None, now
+            self._driver, self._idle_since = None, now
             self._requested = self._requested.with_changes({"held": 0, "clutch": 0})
             self._rates = RateInputs()
 
@@ -263,7 +263,7 @@ class Live:
         return max(0.0, due)
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate at most four due slices of time; return a frame for the pages if one is due."""
+        """Simulate the due slices, at most four; return a frame for the pages if one is due."""
         for _ in range(_MAX_SLICES_PER_TICK):
             now = clock()
             if self.is_halted or self.pace.time_to_next_slice(now) > 0:
@@ -272,7 +272,7 @@ class Live:
             self._simulate_slice(now)
         now = clock()
         self._wake_if_device_sends(now)
-        if self._driver is None and not self._asleep and now - self._alone_since >= _MAX_UNDRIVEN_S:
+        if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
             self._stop_on_failure(self._session.write_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
@@ -287,7 +287,7 @@ class Live:
     def _wake_if_device_sends(self, now: float) -> None:
         if self._link is None or self._link.receive_state(now) is None:
             return
-        self._alone_since = now
+        self._idle_since = now
         if self._asleep:
             self._asleep = False
             self.pace.restart(now)
@@ -319,8 +319,8 @@ class Live:
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.contact_force() > MIN_DISPLAYED_TOUCH_FORCE_N
-            self._show_now |= pressed and not self._pressed
-            self._pressed = pressed
+            self._show_now |= pressed and not self._touched
+            self._touched = pressed
         if self._link is not None and not self.stopped:
             self._link.send_wrench(self._session.device_wrench())
         if self._session.ms >= live_inputs.MAX_DURATION_MS:
@@ -391,7 +391,7 @@ def _unused_folder_path(folder: Path) -> Path:
 
 
 def parse_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a message of either page, or None."""
+    """Return the valid requests in a message of a page, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:

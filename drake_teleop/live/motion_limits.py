@@ -17,7 +17,7 @@ _TOOL_TRANSLATION_LIMITS, _TOOL_ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
-    """Integrator of rates (of keys, sticks) in simulated time."""
+    """Integrator of the rates of inputs (from keys, sticks) in simulated time."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
@@ -46,9 +46,9 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limiter of the hand's target: its speed, and for a device also its acceleration.
+    """Limiter of the target's speed, and for a device also of its acceleration.
 
-    `scales` are the tool's translation and rotation over the hand's.
+    `scales` are the ratios of tool to hand motion, for translation and rotation.
     """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
@@ -64,7 +64,7 @@ class MotionLimiter:
                 self._axes[name] = _AxisLimiter(units * speed, change, INPUT_RANGES[name])
 
     def limit_inputs(self, inputs: Inputs, *, may_jump: bool) -> Inputs:
-        """Return the limited inputs of the next period; `may_jump` permits jumps of the target."""
+        """Return the inputs of the next slice, limited unless the target `may_jump`."""
         axes = self._axes.items()
         return inputs.with_changes(
             {name: axis.limit_target(getattr(inputs, name), may_jump) for name, axis in axes}
@@ -74,20 +74,20 @@ class MotionLimiter:
 class _AxisLimiter:
     def __init__(self, speed: float, change: float, ends: tuple[float, float]) -> None:
         self._speed, self._change, self._ends = speed, change, ends
-        self._at = self._target = self._moved = 0.0
+        self._at = self._target = self._last_change = 0.0
 
     def limit_target(self, target: float, may_jump: bool) -> float:
         last, self._target = self._target, target
         if may_jump:
-            self._at, self._moved = target, 0.0
+            self._at, self._last_change = target, 0.0
             return target
         behind = last - self._at
         speed = target - last + math.copysign(self._max_braking_speed(abs(behind)), behind)
         least, most = (self._max_braking_speed(abs(end - self._at)) for end in self._ends)
         speed = min(max(speed, -min(least, self._speed)), min(most, self._speed))
-        change = min(max(speed - self._moved, -self._change), self._change)
-        self._moved += change
-        self._at += self._moved
+        change = min(max(speed - self._last_change, -self._change), self._change)
+        self._last_change += change
+        self._at += self._last_change
         return self._at
 
     def _max_braking_speed(self, distance: float) -> float:

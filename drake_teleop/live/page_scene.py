@@ -48,7 +48,7 @@ class PageScene:
             self._report_scene_failure(error)
 
     def scene_values(self, rows: LogRows) -> dict[str, Any]:
-        """Return a message: poses (4x4, by columns) and sizes of the last row by Meshcat path."""
+        """Return the page's message of the last row: 4x4 poses (column-major), sizes by path."""
         moves = {} if self.failure else self._poses_and_sizes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 

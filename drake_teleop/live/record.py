@@ -97,7 +97,7 @@ class SessionRecord:
 
 
 class BackgroundLog(LogOnDisk):
-    """Log written by a thread; only `wait_until_written` and the next write wait for the disk."""
+    """Log that a thread writes; only `wait_until_written` and the next write wait for it."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)

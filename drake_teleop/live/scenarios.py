@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSOR_NAMES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORKS, SENSOR_NAMES, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
@@ -57,7 +57,7 @@ def with_task_space_device(scenario: Scenario) -> Scenario:
 
 
 def scenario_of_scene(name: str, user_scenario: Scenario) -> Scenario:
-    """Return the scenario of a scene in `SCENE_NAMES`; "own" is that of the user."""
+    """Return the scenario of a scene in `SCENE_NAMES`; "own" is `user_scenario`."""
     if name == "own":
         return user_scenario
     scenario = LoadScenario(_SHIPPED_SCENES[name])
@@ -69,9 +69,9 @@ def scenario_of_scene(name: str, user_scenario: Scenario) -> Scenario:
 
 
 def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`.
+    """Return the scenario with the driver's choices (network, grip ...) in `inputs`.
 
-    Contact detection requires the noise floor of `load`, which belongs to the scenario's sensor.
+    Contact detection is off if `load` has no noise floor or the inputs select another sensor.
     """
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {"passivity__method": method}
@@ -87,7 +87,7 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
         delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter
         loss = _LOSS_INPUT_UNIT * inputs.loss
         changes["channel"] = Channel(delay=delay, jitter=jitter, distribution="gamma", loss=loss)
-    elif name != AS_IN_SCENARIO:
+    elif name != AS_IN_SCENARIO_NAME:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSOR_NAMES[inputs.sensor]]
@@ -114,23 +114,23 @@ def _payload_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenario) -> Array | None:
-    """Return the estimate (16,) of `load` for `before`, adapted to payload, sensor of `after`."""
+    """Return the estimate (16,) of `load` for `before`, corrected to payload, sensor of `after`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
-    estimate[:6] += _wrist_sensor_offset(after) - _wrist_sensor_offset(before)
+    estimate[:6] += _sensor_wrench_offset(after) - _sensor_wrench_offset(before)
     arms = (NominalSlave(scenario.slave).arm for scenario in (after, before))
     estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
     return estimate
 
 
-def _wrist_sensor_offset(scenario: Scenario) -> Array:
+def _sensor_wrench_offset(scenario: Scenario) -> Array:
     sensor = scenario.wrist_sensor
     return np.zeros(6) if sensor.ideal else np.array(sensor.offset)
 
 
 def channel_fill_time_s(scenario: Scenario) -> float:
-    """Return the longest round trip of a new channel plus its time to resume [s]; 0: no channel."""
+    """Return the longest round trip of the channel plus its resume time [s]; 0: no channel."""
     if scenario.has_no_network_or_passivity:
         return 0.0
     return RESUME_TIME_S + sum(map(longest_delay, scenario.channel.networks_of_directions()))

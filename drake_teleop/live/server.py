@@ -54,7 +54,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 _HOST = "127.0.0.1"
 _MAX_CONNECTED_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
-_ASYNCIO_ITERATIONS_PER_MESSAGE = 3
+_EVENT_LOOP_ITERATIONS_PER_MESSAGE = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
@@ -238,7 +238,7 @@ class LiveDrive:
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.time_to_next_tick(time.perf_counter()))
-        for _ in range(_ASYNCIO_ITERATIONS_PER_MESSAGE):
+        for _ in range(_EVENT_LOOP_ITERATIONS_PER_MESSAGE):
             await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
@@ -331,7 +331,7 @@ def _identify_load(scenario: Scenario, progress: bool | StartStage) -> Identifie
 
 
 def compile_slice_functions(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile the functions of the first simulation slices, which takes a minute once."""
+    """Compile the functions of the first simulation slices, which takes a minute."""
     session, cockpit = Session(scenario, load, device=device), PageValueCalculator(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.page_values(session.new_rows(), session.inputs)

@@ -59,7 +59,7 @@ _NO_EVENT_STATUS = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Integrate in steps of `shortest` [s] for 4 ms after a step is rejected."""
+    """Let the integrator use steps of `shortest` [s] for 4 ms after each rejected step."""
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
     shortest = min(shortest, longest)
@@ -69,7 +69,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
     station: Any = weakref.ref(simulator)
     rejected, until = 0, math.inf
 
-    def set_step_mode(context: Context) -> EventStatus:
+    def select_step_mode(context: Context) -> EventStatus:
         nonlocal rejected, until
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
@@ -83,11 +83,11 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
             integrator.set_fixed_step_mode(False)
         return _NO_EVENT_STATUS
 
-    simulator.set_monitor(set_step_mode)
+    simulator.set_monitor(select_step_mode)
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log with signals that some stations lack: commands as received, else zeros."""
+    """Return the log with missing signals added: pose_received = pose_command, others zero."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -138,9 +138,9 @@ class _Station:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
     def take_over_state(self, replaced: _Station, new_channel: bool) -> float:
-        """Take over the replaced station's state and fade to this station's force.
+        """Copy the replaced station's state; cross-fade from its force to that of this one.
 
-        With a new channel, open the clutch and return how long it must stay open [s]; else 0.
+        Return the time [s] for which the clutch stays open: 0 without a new channel.
         """
         excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
@@ -195,7 +195,7 @@ class Session:
         self.scenario, self._load, self._device = scenario, load, device
         self.inputs, self.ms = Inputs.from_scenario(scenario), 0
         self._start = np.array(scenario.master.position)
-        self._station_count, self._rows_read, self._filled_at_ms = 1, 0, 0
+        self._station_count, self._rows_read, self._channel_filled_at_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
         self._station = _Station(scenario, estimate, load, 0, device=device)
         self._record: SessionRecord | None = None
@@ -208,7 +208,7 @@ class Session:
         self._station.simulator.Initialize()
 
     def apply_inputs(self, inputs: Inputs) -> None:
-        """Set and record the inputs from now on; a changed choice replaces the station."""
+        """Apply and record the inputs; a change of `station_choices` replaces the station."""
         before = self.inputs
         if inputs == before:
             return
@@ -219,7 +219,7 @@ class Session:
             hand, context = self._station.block_and_context("live_hand")
             hand.SetTarget(context, inputs.intended_pose(self._start))
         if inputs.clutch != before.clutch or inputs.station_choices != before.station_choices:
-            self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
+            self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._channel_filled_at_ms)
         if inputs.force_scales != before.force_scales:
             scaling, context = self._station.block_and_context("force_scaling")
             scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_S)
@@ -234,7 +234,7 @@ class Session:
         has_new_channel = inputs.channel_choices != self.inputs.channel_choices
         wait_s = station.take_over_state(self._station, has_new_channel)
         if wait_s:
-            self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
+            self._channel_filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
             self._on_disk.write_and_clear_rows()
             self._on_disk.switch_simulator(station.simulator)
@@ -247,12 +247,12 @@ class Session:
     @property
     def is_channel_filling(self) -> bool:
         """Whether the clutch is open until a new channel delivers packets."""
-        return self.ms < self._filled_at_ms
+        return self.ms < self._channel_filled_at_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
         end = self.ms + ms
-        if self.ms < self._filled_at_ms <= end:
-            self._advance_to(self._filled_at_ms)
+        if self.ms < self._channel_filled_at_ms <= end:
+            self._advance_to(self._channel_filled_at_ms)
             self._station.set_clutch(bool(self.inputs.clutch))
         self._advance_to(end)
         if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _ROWS_PER_LOG_PART:
@@ -278,7 +278,7 @@ class Session:
         return rows
 
     def contact_force(self) -> float:
-        """Return the last contact force at the hand's scale [N]; 0 if unknown."""
+        """Return the last contact force times the force scale [N]; 0 if unknown."""
         part, sink = self._station.columns.get("contact_wrench_S"), self._station.sink
         if part is None or not sink.num_samples():
             return 0.0
@@ -286,7 +286,7 @@ class Session:
         return self.inputs.force_scales["force_scale"] * math.sqrt(float(force @ force))
 
     def inputs_at_stylus(self) -> Inputs:
-        """Return the inputs of a hand that takes the stylus at its present pose."""
+        """Return the inputs of a hand that holds the stylus at its present pose."""
         return self.inputs.with_hand_at_pose(self._station.signal_value("pose_master"), self._start)
 
     def device_wrench(self) -> Array:
@@ -294,7 +294,7 @@ class Session:
         return self._station.signal_value("force_to_master")
 
     def force_above_limit(self) -> float:
-        """Return the force [N] that the force limit after a channel change removes."""
+        """Return by how much the limit after a channel change reduces the force [N]."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block_and_context("cross_fade")
@@ -344,7 +344,7 @@ class RecordedDrive:
     def repeat(
         self, progress: UpdateProgress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
-        """Simulate the session again in steps of at most `slice_ms`; return the same log."""
+        """Simulate the session again, in slices of at most `slice_ms`; return its log."""
         session = Session(self.scenario, self.load, log=log, device=self.device)
         end = self.changes[-1][0]
         for ms, inputs in self.changes:

@@ -28,7 +28,7 @@ _BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_station_state(
     old: Diagram, old_context: Context, new: Diagram, new_context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states, changeable parameters of a station, except of blocks `excluded`."""
+    """Copy time, states and changeable parameters, except of blocks with names in `excluded`."""
     new_context.SetTime(old_context.get_time())
     sources = dict(_blocks_by_path(old))
     for path, block in _blocks_by_path(new):
@@ -92,7 +92,7 @@ def _force_norm(wrench):
 def build_master_side(
     builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
 ) -> Diagram:
-    """Export the ports of a master side, with a block `CrossFade` on request, and build it."""
+    """Return a master side with exported ports and, if `cross_fade`, a block `CrossFade`."""
     wrench = master.GetInputPort("wrench_command")
     if cross_fade:
         block = builder.AddNamedSystem("cross_fade", CrossFade(period))

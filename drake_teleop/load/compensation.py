@@ -16,7 +16,7 @@ from drake_teleop.load.regressor import wrench_of_load
 def scaled_wrench_into(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
-    """Write the wrench of `scaled_wrench` to out (6,)."""
+    """Write `scaled_wrench` (6,), with equal scales of weight and inertia, to `out`."""
     a, b = sigma_gr - gamma, sigma_obj - gamma
     phi = (
         a * phi_gripper[0] + b * phi_object[0],
@@ -39,7 +39,7 @@ def scaled_wrench_into(
 
 @njit(cache=True)
 def add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    """Add the weights, times `excess_...` (weight scale minus inertia scale), to a wrench (6,)."""
+    """Add the parts' weights, times excess scales (weight minus inertia), to the wrench `out`."""
     a, b = excess_gripper, excess_object
     up = scale_vector(-1.0, vector_at(gravity, 0))
     h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
@@ -102,9 +102,9 @@ def scaled_wrench(
         wrench, offsets, s, omega, alpha: as for `contact_wrench`.
         phi_gripper, phi_object: (10,) loads about So in S; zeros for a missing part.
         sigma_gripper, sigma_object, gamma: scales >= 0.
-        sigma_weight, sigma_inertia: scales >= 0 of weight and inertia (gripper and object); None:
+        sigma_weight, sigma_inertia: scales >= 0 of both parts' weight and inertia; None:
             sigma_gripper and sigma_object.
-        gravity: (3,) or (..., 3) g in S [m/s^2]; needed if weight and inertia have other scales.
+        gravity: (3,) or (..., 3) g in S [m/s^2]; needed if weight and inertia differ in scale.
     """
     weights, inertias = weight_scales_and_inertia_scales(
         _check_scale("sigma_gripper", sigma_gripper),
@@ -145,10 +145,10 @@ def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return sigma_gripper, sigma_object, gamma that keep the share eta of the object, Eq. (14)."""
+    """Return sigma_gripper 0, sigma_object eta (share of the object) and gamma 1, Eq. (14)."""
     if not 0.0 <= to_float("eta", eta) <= 1.0:
         what = f"{eta:g} is outside 0 to 1"
-        raise DrakeTeleopError(what, where="eta", remedy="give the share of the object that stays")
+        raise DrakeTeleopError(what, where="eta", remedy="give the object's remaining share")
     return 0.0, float(eta), 1.0
 
 

@@ -49,14 +49,14 @@ class Identification:
         phi: (10,) load about the sensor origin So in S [kg, kg m, kg m^2].
         offsets: (6,) sensor offsets [N, N m].
         covariance: (16, 16) of [offsets; phi] [SI]; undetermined: variance inf (null in the file).
-        identifiable: (16,) True for identified parameters.
-        condition_number: of the scaled matrix [E V] of Eq. (8), over determined directions.
+        identifiable: (16,) True for identified parameters, see `verdicts`.
+        condition_number: of the scaled matrix [E V] of Eq. (8), in the determined directions.
         delay_s: delay of the motion behind the wrench [s].
         residual_rms: (6,) RMS residual of the wrench channels [N, N m].
         method: name of the estimator.
         weight_removed: True if the robot had removed the load's weight from the wrench.
-        degrees_of_freedom: (16,) of the variances; inf (null) for specified noise.
-        prior_dominated: (16,) True if the value is mostly that of the prior.
+        degrees_of_freedom: (16,) of the estimated variances; inf (null) for specified noise.
+        prior_dominated: (16,) True if the standard deviation is at least half that of the prior.
     """
 
     phi: Array
@@ -78,7 +78,7 @@ class Identification:
 
     @property
     def mass(self) -> float:
-        """Mass [kg]; negative if the wrench has the opposite sign."""
+        """Mass [kg]; negative if the sign of the wrench is opposite to Eq. (1)."""
         return float(self.phi[0])
 
     @property
@@ -106,7 +106,7 @@ class Identification:
         """Verdicts (16,) on [offsets; phi]: "identified", "weakly", "not" or "prior".
 
         "identified": standard deviation up to 5 % of `natural_scales`; "weakly": up to 50 %;
-        "prior": the value is mostly that of the prior.
+        "prior": `prior_dominated`.
         """
         share = self.standard_deviations / natural_scales(self.phi)
         weakly = np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not")
@@ -118,7 +118,7 @@ class Identification:
         return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PARAMETER)
 
     def with_nothing_identified(self) -> Identification:
-        """Return the result with unknown deviations: the verdict on all parameters is "not"."""
+        """Return the result with infinite variances: all `verdicts` are "not"."""
         unknown = np.ones(16, dtype=bool)
         covariance = mark_undetermined(self.covariance, unknown)
         return replace(self, covariance=covariance, identifiable=~unknown, prior_dominated=~unknown)
@@ -176,7 +176,8 @@ class Identification:
             stated, value = fields[name], getattr(result, name)
             is_flag = isinstance(value, bool)
             if not (stated is value if is_flag else np.allclose(stated, value, 1e-6, 1e-9)):
-                raise DrakeTeleopError("contradicts phi", where=f"{path}:{name}", remedy="edit phi")
+                what, remedy = "contradicts phi", "edit phi, or run `identify` again"
+                raise DrakeTeleopError(what, where=f"{path}:{name}", remedy=remedy)
         return result
 
 
@@ -189,7 +190,6 @@ def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = 
 
 
 def com_standard_deviations(phi: Array, covariance: Array) -> Array:
-    """Return standard deviations (3,) of the centre of mass [m]."""
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
     part = covariance[6:10, 6:10]
@@ -289,8 +289,8 @@ def _check_numbers(where: str, value: Any, expected: str = "") -> None:
         raise _file_error(what, where)
 
 
-SIGNIFICANT_STDS_BELOW_ZERO = 3.0
-"""Standard deviations below zero at which a mass counts as negative."""
+MIN_SIGNIFICANT_STDS = 3.0
+"""Distance from zero of a significant value [standard deviations]."""
 
 _IS_LOAD_PARAMETER = np.arange(16) >= 6
 
@@ -303,7 +303,7 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     undetermined = np.isinf(np.diag(covariance))
     covariance = mark_undetermined(covariance, undetermined)
     deviations = np.sqrt(np.diag(covariance))
-    if phi[0] < -SIGNIFICANT_STDS_BELOW_ZERO * deviations[6] or phi[0] == 0.0:
+    if phi[0] < -MIN_SIGNIFICANT_STDS * deviations[6] or phi[0] == 0.0:
         what = f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)"
         remedy = "give the gripper alone as gripper, and the record with the object as the load"
         raise DrakeTeleopError(what, where="gripper", remedy=remedy)
@@ -330,9 +330,9 @@ def _degrees_of_freedom_of_difference(total: Identification, gripper: Identifica
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return smallest eigenvalue of the normalised pseudo-inertia, and its standard deviation.
+    """Return the smallest eigenvalue of the pseudo-inertia, Eq. (T1), and its standard deviation.
 
-    No rigid body has a negative one.
+    Units of mass and length are m and sqrt(tr Sigma / m). Rigid bodies have no negative eigenvalue.
     """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))

@@ -34,7 +34,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
 
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2], all in S."""
+    """Return mass [kg], centre of mass c (3,) [m] and inertia (3, 3) about c [kg m^2] of phi."""
     phi = finite_array("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
@@ -64,7 +64,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
     J = finite_array("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         what = "the pseudo-inertia is not symmetric"
-        raise DrakeTeleopError(what, where="J", remedy="give, say, (J + J.T) / 2")
+        raise DrakeTeleopError(what, where="J", remedy="give (J + J.T) / 2")
     Sigma = J[:3, :3]
     I = np.trace(Sigma) * np.eye(3) - Sigma  # noqa: E741
     return np.concatenate([[J[3, 3]], J[:3, 3], I[np.triu_indices(3)]])
@@ -73,7 +73,8 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
-    Eigenvalues of the normalised pseudo-inertia may be as low as -`tolerance`.
+    The pseudo-inertia, scaled as in `consistency_margin`, may have eigenvalues down to
+    -`tolerance`.
     """
     J = pseudo_inertia(phi)
     if not J.any():

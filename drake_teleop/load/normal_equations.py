@@ -1,6 +1,6 @@
 """Load and sensor offsets by batch least squares, from second moments of a record.
 
-The regressor [E V] of [offsets; phi] has rows T_c z with constant T_c, s = a - g, w = omega:
+Row c of the regressor [E V] of [offsets; phi] is T_c z, T_c (16, 19), s = a - g, w = omega:
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
 
@@ -45,7 +45,7 @@ _MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_DISTANCE_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
-_MAX_ROUNDING_RESIDUAL = 1e-6
+_MAX_ROUNDING_ERROR = 1e-6
 # Indices of wrench, specific force and products w_i w_j in z.
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
 _OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
@@ -58,7 +58,7 @@ class NoiseStd:
     Attributes:
         wrench: (6,) [N, N m]; None to estimate it from the residual.
         s, omega, alpha: (3,), or a number for all axes [m/s^2, rad/s, rad/s^2].
-        walk: (12,) of the steps per sample of random walks of [wrench, s, alpha]; 0: no walk.
+        walk: (12,) per sample, of random walk steps of [wrench, s, alpha]; 0: no walk.
         motion: (3, 3) rows s, omega, alpha.
     """
 
@@ -81,7 +81,7 @@ class NoiseStd:
 
 
 class SecondMoments:
-    """Sum of z z^T (19, 19) over the samples, from which load and offsets are solved.
+    """Sum of z z^T (19, 19) over the added samples, from which load and offsets are solved.
 
     z = [1; wrench; s; alpha; products of omega].
 
@@ -132,7 +132,7 @@ class SecondMoments:
             self._sums += part + np.triu(part, 1).T
 
     def mean_noise_covariance_of_z(self, noise: NoiseStd, wrench: Array) -> Array:
-        """Return the mean covariance (19, 19) of z by noise, with wrench noise (6,) [N, N m]."""
+        """Return the mean covariance (19, 19) of z by noise; `wrench` (6,) is noise [N, N m]."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
@@ -156,7 +156,7 @@ class SecondMoments:
             identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
             delay_s=float(finite_array("delay_s", delay_s)),
-            residual_rms=np.sqrt(self.residual_squares(theta) / self.num_samples),
+            residual_rms=np.sqrt(self.residual_square_sums(theta) / self.num_samples),
             method="batch least squares",
             samples=int(self.num_samples),
             degrees_of_freedom=degrees,
@@ -194,17 +194,20 @@ class SecondMoments:
     def unexcited_columns(self) -> NDArray[np.bool_]:
         return ~excited_columns(self.mean_products)
 
-    def residual_squares(self, theta: ArrayLike) -> Array:
+    def residual_square_sums(self, theta: ArrayLike) -> Array:
         squares = np.diag(residual_covariance(self._sums, finite_array("theta", theta, 16)))
         return np.maximum(squares, 0.0)
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Return residual variances (6,) with correlation in time, and their degrees of freedom."""
+        """Return long-run variances (6,) of the residual, and their degrees of freedom.
+
+        They are n times the variances of means of n samples, for large n.
+        """
         inverse = self._minimum_norm_solution()[1]
         return self._long_run_variances(finite_array("theta", theta, 16), inverse)[:2]
 
     def has_slow_noise(self) -> NDArray[np.bool_]:
-        """Return (6,) True for wrench channels whose noise is slower than the record resolves."""
+        """Return (6,) True for wrench channels with drift, or noise as slow as the record."""
         return self._long_run_variances(*self._minimum_norm_solution()[:2])[2]
 
     def _long_run_variances(
@@ -212,13 +215,13 @@ class SecondMoments:
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         grams = self._channel_grams()
         n = float(self.num_samples)
-        power = self.residual_squares(theta)
+        square_sums = self.residual_square_sums(theta)
         if self._resolution is not None:
-            absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
-            rest_variances = self._residual_variances_of_poses_at_rest(power, absorbed, theta)
+            absorbed = self._degrees_of_freedom_of_fit(grams, inverse)
+            rest_variances = self._residual_variances_of_poses_at_rest(square_sums, absorbed, theta)
             return *rest_variances, np.zeros(6, dtype=bool)
         variances, degrees, sample_absorbed = self._unbiased_residual_variances(
-            power, n, grams, grams, inverse
+            square_sums, n, grams, grams, inverse
         )
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
@@ -230,10 +233,10 @@ class SecondMoments:
         blocks = self._blocks[: last + (filled == length)]
         while len(blocks) > _MIN_DOF_OF_VARIANCE:
             rows = _regressors_of_blocks(blocks)
-            power = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
+            square_sums = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
             estimated, counted, absorbed = self._unbiased_residual_variances(
-                power, len(blocks), between, grams, inverse
+                square_sums, len(blocks), between, grams, inverse
             )
             usable = ~found & (counted >= _MIN_DOF_OF_VARIANCE)
             correlation = np.divide(estimated, of_samples, out=np.ones(6), where=of_samples > 0.0)
@@ -257,13 +260,13 @@ class SecondMoments:
         weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
         variances = np.where(weaker, longest, variances)
         degrees = np.where(weaker, longest_degrees, degrees)
-        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_RESIDUAL**2 * wrench)
+        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_ERROR**2 * wrench)
 
     def _residual_variances_of_poses_at_rest(
-        self, power: Array, absorbed: Array, theta: Array
+        self, square_sums: Array, absorbed: Array, theta: Array
     ) -> tuple[Array, Array]:
         assert self._resolution is not None
-        squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
+        squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (square_sums, absorbed))
         min_variance = np.array(self._resolution) ** 2 / 12.0
         blocks = self._blocks[: self._state[0] + 1]
         count = blocks[:, 0]
@@ -282,22 +285,22 @@ class SecondMoments:
         variances = np.maximum(squares / np.maximum(degrees, 1.0), min_variance)
         return variances.repeat(3), degrees.repeat(3)
 
-    def _absorbed_degrees_of_freedom(self, between: Array, inverse: Array) -> Array:
+    def _degrees_of_freedom_of_fit(self, between: Array, inverse: Array) -> Array:
         return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
     def _unbiased_residual_variances(
-        self, power: Array, count: float, between: Array, grams: Array, inverse: Array
+        self, square_sums: Array, count: float, between: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array, Array]:
         w = self._weights
-        absorbed = self._absorbed_degrees_of_freedom(between, inverse)
+        absorbed = self._degrees_of_freedom_of_fit(between, inverse)
         shares = np.einsum("cij,kji->ck", between, inverse @ grams @ inverse) * w**2
         degrees = np.maximum(count - absorbed, 0.0)
         equations = np.diag(count - 2.0 * absorbed) + shares
         if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
-            return power / np.maximum(degrees, 1.0), degrees, absorbed
-        solution = np.linalg.solve(equations, power)
+            return square_sums / np.maximum(degrees, 1.0), degrees, absorbed
+        solution = np.linalg.solve(equations, square_sums)
         # Errors of the other channels can make a small solution negative.
-        return np.maximum(solution, power / count), degrees, absorbed
+        return np.maximum(solution, square_sums / count), degrees, absorbed
 
 
 def identify(
@@ -344,9 +347,9 @@ def regressor_coefficients() -> Array:
 
 
 def omega_product_jacobians(indices: NDArray[np.intp], size: int) -> Array:
-    """Return derivatives (3, 3, size) of products w_i w_j by w_k, as coefficients of w_i.
+    """Return J (3, 3, size): J[k, i, m] is the factor of w_i in the derivative of product m by w_k.
 
-    `indices` (3, 3) are the positions of the products in a vector of this size.
+    `indices` (3, 3) contain the index m of each product w_i w_j.
     """
     jacobians = np.zeros((3, 3, size))
     for i in range(3):

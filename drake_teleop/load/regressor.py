@@ -1,6 +1,6 @@
 """Wrench of a moving load: regressor V of Eq. (5), and Newton-Euler Eqs. (1)-(2).
 
-A sample is one row of numbers (logs: the first 15):
+A sample is one row of these numbers, in logs the first 15::
 
     [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
      saturated or lost | joint positions (n) | time (output of the wrist sensor only)]
@@ -116,7 +116,7 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
 
 
 def signal_sizes_of_sample(num_joints: int) -> dict[str, int]:
-    """Return the signals of a wrist sensor's sample and their sizes, in order."""
+    """Return signal names and sizes of a wrist sensor's sample, in order."""
     return {
         "measured_wrench_S": 6,
         "specific_force_S": 3,

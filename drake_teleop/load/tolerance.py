@@ -67,18 +67,18 @@ def parse_tolerance(text: str) -> Tolerance:
         except ValueError:
             name = ""
         if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
-            what = f"{part.strip()!r} is no tolerance (quantity, number, unit) or a repeated one"
-            remedy = "write, say, mass 0.5 %, com 0.5 mm, inertia 5 %"
+            what = f"{part.strip()!r} is not a tolerance (quantity, number, unit), or is repeated"
+            remedy = "write, for example, mass 0.5 %, com 0.5 mm, inertia 5 %"
             raise DrakeTeleopError(what, where=text, remedy=remedy)
         if not _MIN_TOLERANCE <= value <= _MAX_TOLERANCE:
-            what = f"{part.strip()!r} is outside 1e-9 to 10 (as a share, or in m)"
+            what = f"{part.strip()!r} is outside 1e-9 to 10 (for %: of 1; for com: in m)"
             raise DrakeTeleopError(what, where=text, remedy="correct the number or its unit")
         found[name] = value
     return Tolerance(**found)
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the required entries by [offsets; phi], over tolerances."""
+    """Return derivatives (k, 16) of the k required entries by [offsets; phi], over tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -98,7 +98,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) over tolerances; inf for undetermined entries."""
+    """Return standard deviations (k,) of required entries over tolerances; inf: undetermined."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", derivatives, finite, derivatives)

@@ -73,13 +73,13 @@ def summarize_grasped_object(alone: Identification) -> dict[str, Any]:
 
 def notes_on_grasped_object(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
+    if alone.mass < identification.MIN_SIGNIFICANT_STDS * deviation:
         excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
         return [f"no object: the total mass exceeds the gripper's by {excess}"]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = identification.consistency_margin(alone)
-    if margin < -identification.SIGNIFICANT_STDS_BELOW_ZERO * deviation:
+    if margin < -identification.MIN_SIGNIFICANT_STDS * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"

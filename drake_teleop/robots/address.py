@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """Parsed address; `allowed` are names of parameters, `port` and `host` defaults."""
+    """Parsed address; `allowed` are its possible parameters, `port` and `host` the defaults."""
 
     def __init__(
         self, text: str, port: int | None, allowed: tuple[str, ...], *, host: str = ""
@@ -26,7 +26,7 @@ class Address:
         self.path = parts.path.strip("/")
         if unknown := self._parameters.keys() - set(allowed):
             what = f"unknown parameter {min(unknown)!r}"
-            raise DrakeTeleopError(what, where=text, remedy=f"use {', '.join(allowed)}")
+            raise DrakeTeleopError(what, where=text, remedy=f"use only {', '.join(allowed)}")
 
     def optional_parameter(self, name: str) -> str | None:
         return self._parameters.get(name)
@@ -45,7 +45,7 @@ class Address:
         return values
 
     def wrench_name(self) -> str:
-        """Return the parameter wrench, "contact" (default) or "scaled"."""
+        """Return the parameter `wrench`: "contact" (default) or "scaled"."""
         text = self._parameters.get("wrench", "contact")
         if text not in ("contact", "scaled"):
             what = f"wrench={text!r} is unknown"
@@ -53,7 +53,7 @@ class Address:
         return text
 
     def wrench_sign(self) -> float:
-        """Return 1 or -1: sign of the reported wrench relative to sensor on load, Eq. (1)."""
+        """Return the factor, -1 (default) or 1, from the reported wrench to that of Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             what = f"sign={text!r} is unknown"

@@ -49,9 +49,9 @@ MAX_DELAY_SLEW = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
-INLIER_DELAY_ERROR_AT_START_S = 0.03
+MAX_INLIER_DELAY_ERROR_AT_START_S = 0.03
 """Delay error that the residual of a sample may contain before the delay is known [s]."""
-INLIER_DELAY_ERROR_TRACKED_S = 0.004
+MAX_INLIER_DELAY_ERROR_TRACKED_S = 0.004
 """Delay error in a residual once the delay is known, besides the remaining correction [s]."""
 DELAY_SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
@@ -62,7 +62,7 @@ TimedMotion = tuple[float, Array]
 
 
 class DelayTracker:
-    """Estimator of the motion's delay behind the wrench, `delay_s` [s]."""
+    """Estimator of `delay_s` [s], by which the motion's time stamps lag behind the wrench's."""
 
     def __init__(
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
@@ -80,12 +80,12 @@ class DelayTracker:
     def _reset_estimate(self, t: float) -> None:
         self._t = self._fitted = t
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
-        self._delay_error = INLIER_DELAY_ERROR_AT_START_S
+        self._delay_error = MAX_INLIER_DELAY_ERROR_AT_START_S
 
     def update_delay(
         self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
     ) -> None:
-        """Update the delay with a wrench (6,), its motion `at`, and the neighbouring motions."""
+        """Update the delay by a wrench (6,), its motion `at`, and motions `before` and `after`."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
         if 0.0 <= elapsed < DELAY_SAMPLE_PERIOD_S or step <= 0.0:
@@ -128,13 +128,13 @@ class DelayTracker:
         estimate = float(self._weights @ (gr - g * r)) / information
         rest = rr - r * r - estimate * (gr - g * r)
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
-        self._delay_error = INLIER_DELAY_ERROR_AT_START_S
+        self._delay_error = MAX_INLIER_DELAY_ERROR_AT_START_S
         if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
             max_change = MAX_DELAY_SLEW * elapsed
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
-            tracked = INLIER_DELAY_ERROR_TRACKED_S + abs(correction)
-            self._delay_error = min(INLIER_DELAY_ERROR_AT_START_S, tracked)
+            tracked = MAX_INLIER_DELAY_ERROR_TRACKED_S + abs(correction)
+            self._delay_error = min(MAX_INLIER_DELAY_ERROR_AT_START_S, tracked)
 
 
 _GRAVITY_W = np.array([0.0, 0.0, -9.81])
@@ -157,7 +157,7 @@ class ArmKinematics(Protocol):
 
 
 class WrenchAndMotionStreams(Source):
-    """Source of wrenches and motions, from one or two sources; `where` names that of the motion.
+    """Source of wrenches and motions, from one or two sources; errors name `where`.
 
     The kinematics `arm` convert joint positions to poses of the sensor frame S.
     """
@@ -221,8 +221,8 @@ class MotionWindow:
 
     Args:
         cutoff_hz: cut-off of the smoothing; None for the shortest window.
-        X_FS: (7,) pose of the sensor in F.
-        gravity_W: (3,) gravity [m/s^2].
+        X_FS: (7,) pose of S in F.
+        gravity_W: (3,) gravity in the world frame [m/s^2].
     """
 
     def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY_W) -> None:
@@ -246,7 +246,7 @@ class MotionWindow:
             self.reset()
 
     def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
-        """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
+        """Add a sample; return new times [s], motions [s, omega, alpha, gravity (of poses)]."""
         row = self._row_of_valid_motion(sample)
         if row is None:
             return []
@@ -296,12 +296,12 @@ class MotionWindow:
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
-    """Return the pose (7,), [w x y z, position], from x, y, z [m], roll, pitch, yaw [deg]."""
+    """Return [w x y z, position] for x, y, z [m], roll, pitch, yaw about fixed axes [deg]."""
     R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
     return np.concatenate([quaternions_from_matrices(R)[0], numbers[:3]])
 
 
-class _StreamClockOffset:
+class _ClockOffsetEstimator:
     def __init__(self) -> None:
         self.offset, self._now = math.inf, 0.0
 
@@ -339,7 +339,7 @@ class ReadingAssembler(Source):
         self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY_W)
         half_window_s = 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / (cutoff_hz or math.inf)
         self.lag_s = max(0.0, half_window_s + delay_s)
-        self._clocks = _StreamClockOffset(), _StreamClockOffset()
+        self._clocks = _ClockOffsetEstimator(), _ClockOffsetEstimator()
         self._motions: deque[tuple[float, Array]] = deque()
         self._pending: deque[Reading] = deque(maxlen=round(_STREAM_BUFFER_S / self.dt))
 

@@ -34,7 +34,7 @@ FIRST_RECORD_S = 1.0
 """Length of the record at the first result [s]."""
 MIN_DEGREES_OF_FREEDOM = 20.0
 """Minimum degrees of freedom of the variance of a known parameter."""
-_RESTART_ADVICE = "start again: the record has another zero or another load from t = {t:.2f} s on"
+_RESTART_ADVICE = "start again: the sensor's zero or the load changes at t = {t:.2f} s"
 _GRAVITY_M_S2 = 9.81
 # Load and noise [N, N m] for the advice before the first identification.
 _ASSUMED_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
@@ -42,7 +42,7 @@ _ASSUMED_WRENCH_NOISE = np.repeat([0.25, 0.012], 3)
 _RELATIVE_GRAM_REGULARIZATION = 1e-12  # relative information that keeps matrices regular
 # Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
 _ADVISED_MOTIONS = (
-    ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
+    ("rotate the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
     ("swing the wrist about {axis}, briskly, by 20 deg back and forth", np.radians(20.0), 1.5),
 )
 _ADVISED_MOTION_S, _ADVISED_MOTION_SAMPLES = 4.0, 80
@@ -57,8 +57,9 @@ class RecordEvaluation:
     Attributes:
         identified_log: the identification; None if it failed for the reason `failure`.
         relative_half_widths: (k,) of the 95 % intervals, divided by the tolerances.
-        is_within_tolerance: (k,) True where the interval of level `TOLERANCE_CONFIDENCE` is.
-        is_known: (k,) True where the previous result was within the tolerance, too.
+        is_within_tolerance: (k,) True if the `TOLERANCE_CONFIDENCE` interval fits, without
+            `doubts`.
+        is_known: (k,) True if the previous result was within the tolerance, too.
         doubts: problems of the record; no parameter is known then.
     """
 
@@ -80,7 +81,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> RecordEvaluation:
-    """Identify a record's load; compare its uncertainty with the tolerance; advise a motion."""
+    """Return a record's identified load, its uncertainty over the tolerance, and advice."""
     count, found, why = len(tolerance.required_entry_names), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -116,7 +117,7 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: tolerances.Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return relative half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom (k,)."""
+    """Return half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom, (k,) each."""
     load = found.identification
     errors = tolerances.derivatives_over_tolerances(tolerance, load.phi)
     deviations = tolerances.deviations_over_tolerances(errors, load.covariance)
@@ -143,10 +144,10 @@ def advise_motion(
     errors: Array,
     noise: Array,
 ) -> str:
-    """Return as text the next motion that reduces the uncertainty most.
+    """Return the next motion that reduces the uncertainty most, in words.
 
-    `motion` is s, omega, alpha, (N, 3) each; `errors`: `derivatives_over_tolerances`; `noise` (6,)
-    [N, N m].
+    `motion`: recorded s, omega, alpha, (N, 3) each; `errors`: `derivatives_over_tolerances`;
+    `noise` (6,) [N, N m].
     """
     rate = 1.0 / dt
     if cutoff_hz is not None:
@@ -158,7 +159,7 @@ def advise_motion(
     gram = gram + _RELATIVE_GRAM_REGULARIZATION * size**2 * np.eye(16)
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
-    for words, of_motion in _candidate_information_matrices(last, noise, rate):
+    for words, of_motion in _information_of_advised_motions(last, noise, rate):
         left = tolerances.deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
@@ -166,7 +167,7 @@ def advise_motion(
     return best
 
 
-def _candidate_information_matrices(
+def _information_of_advised_motions(
     up: Array, noise: Array, rate: float
 ) -> Iterator[tuple[str, Array]]:
     s0 = _GRAVITY_M_S2 * up / max(float(np.linalg.norm(up)), 1e-9)
@@ -206,7 +207,7 @@ def calibrate(
     seconds: float = 120.0,
     show: Callable[[RecordEvaluation], None] = lambda _: None,
 ) -> list[RecordEvaluation]:
-    """Record a stream until the tolerance is met, the source ends or the time is over."""
+    """Record a stream until the tolerance is met, it ends or `seconds` pass; return evaluations."""
     results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S
     earlier = [path.with_name(name) for name in recorder.file_names] if source.live else []

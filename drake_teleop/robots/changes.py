@@ -39,7 +39,7 @@ TimedChangeText = tuple[float, str]
 
 
 class ZeroAndLoadMonitor:
-    """Monitor that reports each change of sensor zero or load once, by `report`."""
+    """Monitor that calls `report` once for each change of the sensor's zero or load."""
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
@@ -111,7 +111,7 @@ def _find_changes_in_process(rows: Array, dt: float) -> list[TimedChangeText]:
 
 
 def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
-    """Return changes of sensor zero and load; rows (N, 16): time [s] and `Reading` values."""
+    """Return zero and load changes in `rows` (N, 16): time [s], values of `Reading`."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
     if len(t) * dt < _MIN_TESTED_RECORD_S:
@@ -147,7 +147,7 @@ def _text_of_zero_or_load_change(cause: Finding) -> str:
         change = " ".join(f"{x:+.3g}" for x in np.array(cause.values["change"]))
         return (
             f"t = {cause.start_s:.2f} s: the sensor has another zero, {change} N and N m more (a"
-            " tare, or a push that turns with the tool); tare the compensation too"
+            " tare, or a push that rotates with the tool); tare the compensation too"
         )
     return (
         f"t = {cause.start_s:.2f} s: another load, {cause.values['mass_change']:+.4g} kg; run"

@@ -29,7 +29,7 @@ _STALE_WRENCH_PERIOD_S = 0.01  # period of zero wrenches while nothing comes
 
 
 class TareRequestPort:
-    """UDP port of this machine that accepts the request `tare`."""
+    """UDP port on localhost that accepts the request `tare`."""
 
     def __init__(self, port: int) -> None:
         self._socket = open_udp_receiver(LOCALHOST, port)
@@ -58,7 +58,7 @@ def compensate_stream(
     changes: ZeroAndLoadMonitor | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the source ends, or Ctrl-C; count wrenches and flags."""
+    """Compensate readings until the source ends or Ctrl-C; return numbers of wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
 

@@ -32,7 +32,7 @@ def reading_problem(values, largest, limits):
 
 @njit(cache=True)
 def low_pass_into(x, low_pass, memory):
-    """Filter a sample (n,) in place, by a second-order low-pass as in `scipy.signal.lfilter`."""
+    """Filter x (n,) in place by b, a, zi (7,) of `scipy.signal.lfilter`, state `memory` (2, n)."""
     start = math.isnan(memory[0, 0])
     for i in range(len(x)):
         u = x[i]
@@ -48,11 +48,11 @@ def low_pass_into(x, low_pass, memory):
 def contact_and_scaled_wrench_into(
     values, gravity, offsets, phi, no_load, scales, low_pass, memory, rest, at, out
 ):
-    """Write contact wrench and scaled wrench (`scaled_wrench`) of a valid reading to out (12,).
+    """Write contact wrench and scaled wrench of a valid reading `values` (15,) to out (12,).
 
-    `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
-    unfiltered contact wrench. `gravity` (3,) matters if scales of weight and inertia differ.
-    `no_load` (10,) is 0, `memory` (2, 12) is the filter's; `set_scale_factors_into` sets `scales`.
+    Row `at` of `rest` (rows, 21), for a tare, receives the reading and its unfiltered contact
+    wrench. `gravity` (3,) matters if weight and inertia differ in scale. `no_load` (10,) is 0,
+    `memory` (2, 12) the filter's state; `set_scale_factors_into` sets `scales`.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]
@@ -69,14 +69,14 @@ def contact_and_scaled_wrench_into(
 
 @njit(cache=True)
 def set_scale_factors_into(sigma_weight, sigma_inertia, gamma, scales):
-    """Write the scales (4,) of inertia (gripper, object), contact, and excess weight."""
+    """Write to `scales` (4,): inertia scale twice, gamma, weight scale minus inertia scale."""
     scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
     scales[3] = sigma_weight - sigma_inertia
 
 
 @njit(cache=True)
 def add_to_statistics(row, count, mean, squares):
-    """Add a row to the mean and the sum of squared deviations of `count` rows (Welford 1962)."""
+    """Add row number `count` to mean and sum of squared deviations (Welford 1962)."""
     for i in range(len(row)):
         step = row[i] - mean[i]
         mean[i] += step / count
@@ -85,7 +85,7 @@ def add_to_statistics(row, count, mean, squares):
 
 @njit(cache=True)
 def update_tare_offsets(count, mean, squares, noise_limits, offsets):
-    """Add the mean contact wrench to the offsets (6,); return 0, or the reason of a refusal."""
+    """Add the mean contact wrench to the offsets (6,); return 0, or a reason (`TARE_...`)."""
     for i in range(6, 9):
         if squares[i] > count * (_MAX_REST_SPECIFIC_FORCE_RMS * _MAX_REST_SPECIFIC_FORCE_RMS):
             return TARE_IN_MOTION
@@ -107,7 +107,7 @@ def update_tare_offsets(count, mean, squares, noise_limits, offsets):
 
 @njit(cache=True)
 def clip_wrenches(wrenches, limits):
-    """Limit two wrenches (12,) to the sensor's range (6,); return whether a value exceeded it."""
+    """Limit two wrenches (12,) to the sensor's range (6,); return whether one exceeded it."""
     beyond = False
     for i in range(12):
         limit = limits[i % 6]

@@ -32,14 +32,14 @@ MIN_CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 MAX_CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
-RATE_TOLERANCE = 0.05
+RELATIVE_RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
 SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 """Arguments of `Compensator.set_scales`."""
-_MAX_DRIFTS = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
-MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_DRIFTS, 3)
+_MAX_FORCE_AND_TORQUE_DRIFT = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
+MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_FORCE_AND_TORQUE_DRIFT, 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_CHECK_READINGS, _RATE_CHECK_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_STAMP_S = 1e12  # [s]
@@ -78,7 +78,7 @@ class _RateCheck:
         self._count += 1
         if self._count > self._readings:
             spacing = (reading.t - self._start_t) / max(1, reading.number - self._start_number)
-            wrong = abs(spacing / self._dt - 1.0) > RATE_TOLERANCE
+            wrong = abs(spacing / self._dt - 1.0) > RELATIVE_RATE_TOLERANCE
             self._flag, self._count = _WRONG_RATE_FLAG if wrong else 0, 0
         return self._flag
 
@@ -87,7 +87,7 @@ class Compensator:
     """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
-        delay_readings: delay of the motion, in readings, for which the source has corrected.
+        delay_readings: motion delay that the source has removed, and delay of outputs [readings].
         predicted: extrapolate over `delay_readings` and the delay of the low-pass.
         sensor_range: (6,) range of the sensor [N, N m].
         scales: arguments of `set_scales`.
@@ -161,9 +161,9 @@ class Compensator:
         sigma_weight: float | None = None,
         sigma_inertia: float | None = None,
     ) -> None:
-        """Set the scales of load wrench and contact wrench in the scaled wrench.
+        """Set the scales of load (`sigma`) and contact wrench (`gamma`) in the scaled wrench.
 
-        `sigma_weight`, `sigma_inertia` are those of the load's weight and inertia; None: sigma.
+        `sigma_weight` and `sigma_inertia` replace sigma for the load's weight and inertia.
         """
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
@@ -203,7 +203,7 @@ class Compensator:
     def tare(self) -> str:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_readings_in_row < len(self._tare_rows):
-            return f"refused: fewer than {TARE_REST_S:g} s of good readings so far"
+            return f"refused: fewer than {TARE_REST_S:g} s of valid readings so far"
         problem, step, offsets = self._tare_problem_step_and_offsets()
         if problem == kernel.TARE_IN_MOTION:
             return "refused: the sensor moves"
@@ -212,7 +212,7 @@ class Compensator:
         if problem == kernel.TARE_EXCEEDS_DRIFT:
             force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             return (
-                f"refused: {force:.3g} N and {torque:.3g} N m exceed the drift of offsets:"
+                f"refused: {force:.3g} N and {torque:.3g} N m exceed the permitted drift:"
                 " contact, or another load"
             )
         self.offsets = offsets

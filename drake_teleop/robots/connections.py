@@ -21,7 +21,7 @@ from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import UdpSink, UdpSource, UdpWrenchPoseSource
 
 _REPLAY_PREFIX = "replay:"
-_UNUSED_SOURCE_RATE_HZ = 1000.0
+_PLACEHOLDER_RATE_HZ = 1000.0
 
 
 def open_source(
@@ -41,9 +41,9 @@ def open_source(
         rate_hz: rate of the wrenches, if the source does not deliver its own.
         cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live streams.
         real_time: replay a log in real time.
-        motion_options: `motion`, address of a second source, for the motion; `sensor_pose`, x, y, z
-            [m], roll, pitch, yaw [deg] of the sensor in the posed frame; `arm`, kinematics for a
-            source of joint positions.
+        motion_options: `motion`, address of a separate source of motion; `sensor_pose`, x, y, z
+            [m], roll, pitch, yaw [deg] of the sensor in the frame of the poses; `arm`, kinematics
+            for joint positions.
     """
     if _address_scheme(address) == "replay":
         _refuse_motion_options(address, **motion_options)
@@ -72,13 +72,13 @@ def open_source(
 def open_source_and_recorder(
     address: str, sensor_range: Array | None, *, real_time: bool = False, **motion_options: Any
 ) -> tuple[Source, Recorder]:
-    """Return the source that `calibrate` reads, and its recorder."""
+    """Return the source that `calibrate` reads, and a recorder for its readings."""
     kind = _address_scheme(address)
     if kind == "replay":
         source = open_source(address, None, real_time=real_time, **motion_options)
         return source, Recorder(sensor_range=sensor_range)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
+    rate_hz = None if kind == "netft" else _PLACEHOLDER_RATE_HZ
     source = _open_streams(address, rate_hz, **motion_options)
     two_clocks = isinstance(source, assembly.WrenchAndMotionStreams) and source.two_clocks
     X_FS = _pose_from_option(motion_options.get("sensor_pose"))
@@ -138,7 +138,7 @@ def _open_streams(
         if motion is not None:
             opened.append(_open_registered_source(motion, 1.0 / opened[0].dt, joints))
             if WRENCH_AND_MOTION in opened[1].streams:
-                what = "delivers no motion apart from its wrench"
+                what = "delivers its motion only with a wrench"
                 remedy = "give a source such as rtde://HOST"
                 raise DrakeTeleopError(what, where=motion, remedy=remedy)
         return assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)

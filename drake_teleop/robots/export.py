@@ -91,7 +91,7 @@ def export_load(
 
 def unused_sensor_pose_error(to: str) -> DrakeTeleopError:
     what = f"{to} takes its values in the sensor's frame"
-    return DrakeTeleopError(what, where="--sensor-pose", remedy="remove it")
+    return DrakeTeleopError(what, where="--sensor-pose", remedy="remove the option")
 
 
 def refuse_removed_weight(found: Identification, to: str) -> None:
@@ -121,8 +121,6 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
 
 
 def _make_template_writer(name: str) -> Callable[[ExportedLoad], str]:
-    """Return the function that writes a load by the template `formats/NAME.j2`."""
-
     def numbers(values: Iterable[float], separator: str = ", ") -> str:
         return separator.join(repr(float(value) + 0.0) for value in values)
 

@@ -36,7 +36,7 @@ class _WrenchChannelSink:
 
 
 class FoxgloveSink(_WrenchChannelSink):
-    """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
+    """Sink with a server at foxglove://[HOST][:PORT]; messages have this computer's time."""
 
     def __init__(self, address: str) -> None:
         host, port = host_and_port(address, DEFAULT_SERVER_PORT)

@@ -54,7 +54,6 @@ def wrench_json_line(out: CompensatedWrench) -> str:
 
 
 def flag_names(flags: int) -> list[str]:
-    """Return the names of the set flags, such as "out of range"."""
     return [str(flag.name).lower().replace("_", " ") for flag in ReadingFlag if flag & flags]
 
 

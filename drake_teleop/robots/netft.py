@@ -1,7 +1,4 @@
-"""Source for ATI Net F/T and compatible OnRobot sensors: RDT (raw data transfer) over UDP.
-
-A request of 8 bytes starts the stream of records of 36 bytes, both big-endian.
-"""
+"""Source for ATI Net F/T and compatible OnRobot sensors: RDT (raw data transfer) over UDP."""
 
 from __future__ import annotations
 
@@ -131,7 +128,7 @@ def parse_counts_and_rate(content: bytes) -> list[float]:
     counts = [x / _SI_VALUE_OF_SENSOR_UNIT[u] for x, u in zip(per_unit, units, strict=True)]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
-        raise ValueError("not positive numbers")
+        raise ValueError("counts and rate are not positive")
     return values
 
 
@@ -142,7 +139,7 @@ _SAMPLE_NUMBER_RESTART_STEP_S = 1.0  # a larger step of the number is a restart
 class SampleClock:
     """Clock that derives times from sample numbers.
 
-    Its period is first the configured `dt` [s], after a second the measured one.
+    Its period is `dt` [s] in the first second, then the measured one.
     """
 
     def __init__(self, dt: float) -> None:
@@ -151,7 +148,7 @@ class SampleClock:
         self._first: tuple[int, float] | None = None
 
     def time_of_sample(self, number: int, now: float) -> float:
-        """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock."""
+        """Return the time [s] of a sample received at `now` [s] of a monotonic clock."""
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _SAMPLE_NUMBER_RESTART_STEP_S:
             self._first = number, now

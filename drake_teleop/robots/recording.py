@@ -51,18 +51,17 @@ _NEW_CLOCK_CONFIRMATION_SAMPLES = 50  # successive samples that confirm another 
 class Recorder:
     """Recorder of a source's readings, which are written as a log.
 
-    If the source's clock is set, a new record starts; the longest one is written.
+    A jump of the source's clock starts a new record; the longest one is written.
 
     Args:
         streams: streams of the source.
         sensor_range: (6,) range of the sensor [N, N m]; None: unknown.
-        X_FS: (7,) pose of the sensor in the posed frame F.
+        X_FS: (7,) pose of the sensor in the frame F of the poses.
         two_clocks: whether wrench and motion have different clocks.
 
     Attributes:
         log_file_name, file_names: name of the log, and of all its files.
         left_out: number of rejected readings.
-        clock_changes: number of clock changes.
     """
 
     def __init__(
@@ -105,7 +104,7 @@ class Recorder:
         if same_clock or other.is_clock_jump(t):
             self.left_out += len(other.t)
             other = self._other_clock[stream] = _SampleSeries()
-        self.left_out += not (samples if same_clock else other).add(reading)
+        self.left_out += not (samples if same_clock else other).add_if_newer(reading)
         if len(other.t) == _NEW_CLOCK_CONFIRMATION_SAMPLES:
             self.clock_changes += 1
             self._longest = self._longest_part()
@@ -158,7 +157,7 @@ class _SampleSeries:
     def is_clock_jump(self, t: float) -> bool:
         return bool(self.t) and abs(t - self.t[-1]) > MIN_CLOCK_JUMP_S
 
-    def add(self, reading: Reading) -> bool:
+    def add_if_newer(self, reading: Reading) -> bool:
         if self.t and reading.t <= self.t[-1]:
             return False
         self.t.append(reading.t)
@@ -166,9 +165,9 @@ class _SampleSeries:
         self.min_offset = min(self.min_offset, reading.arrival - reading.t)
         return True
 
-    def times_and_values(self, width: int, left_out: int) -> tuple[Array, Array]:
+    def times_and_values(self, width: int, num_invalid: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
-            counts = f"{len(self.t)} valid and {left_out} invalid readings"
+            counts = f"{len(self.t)} valid and {num_invalid} invalid readings"
             what, remedy = f"{counts} received (minimum: 2 valid)", "check the source's address"
             raise DrakeTeleopError(what, where="calibrate", remedy=remedy)
         return np.array(self.t), np.array(self._values).reshape(-1, width)

@@ -1,4 +1,4 @@
-"""Source and sink for ROS 2 by rclpy, in one node of this process; conversion of its messages."""
+"""Source and sink for ROS 2 by rclpy, and conversion of its messages."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def checked_topic_name(address: Address, name: str) -> str:
 def topics_frames_and_streams(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics in an address by stream, the two frames of `tf`, and the streams."""
+    """Return the topics by name, the frames (parent, child) of `tf`, and the streams."""
     topics = {WRENCH: checked_topic_name(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.optional_parameter(stream)) is not None:
@@ -81,7 +81,7 @@ def damaged_reading_of_topic(name: str) -> Reading:
 
 
 class MessageConverter:
-    """Converter of ROS 2 messages; `frames` are parent and child of the pose in `/tf`."""
+    """Converter of ROS 2 messages; `sign` multiplies wrenches; `frames`: parent, child in `/tf`."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
@@ -103,7 +103,7 @@ class MessageConverter:
         ]
 
     def add_transforms(self, data: Any) -> None:
-        """Store the transforms of a TFMessage; those of `/tf_static` yield no pose."""
+        """Store the transforms of a TFMessage for later poses."""
         for each in data.transforms:
             link = _pose_array(each.transform.translation, each.transform.rotation)
             self._links[each.child_frame_id] = each.header.frame_id, link
@@ -195,7 +195,6 @@ def parse_ros2_address(text: str, allowed: tuple[str, ...]) -> Address:
 
 
 def message_class(message_type: str, where: str) -> Any:
-    """Return the class of a message type such as "sensor_msgs/msg/Imu"."""
     package, _, name = message_type.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)

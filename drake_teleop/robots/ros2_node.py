@@ -29,10 +29,10 @@ _CALIBRATE_PYTHON_CODE = "import sys; from drake_teleop.cli.main import main; ma
 
 
 class ServedCompensator:
-    """Compensator whose load and scales the services and parameters of a node change.
+    """Compensator whose load and scales are set by services and parameters of a node.
 
-    `make` maps a load to a compensator; `calibrate` maps tolerance and seconds to the arguments of
-    the command `calibrate`, whose results are written to `out`.
+    `make` returns the compensator of a load; `calibrate` returns, for tolerance and seconds, the
+    arguments of the command `calibrate`, whose results are in `out`.
     """
 
     @delayed_signals()
@@ -93,7 +93,7 @@ class ServedCompensator:
                 continue
             lowest = -math.inf if each.name in SCALE_NAMES[2:] else 0.0
             if not (math.isfinite(each.value) and each.value >= lowest):
-                reason = f"{each.name}: {each.value} is not a finite number of at least 0"
+                reason = f"{each.name}: {each.value} is outside {lowest:g} to inf"
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 

@@ -69,7 +69,7 @@ def open_session(address: Address) -> Any:
 
 
 def topic_key(domain: int, topic: str, message_type: str, type_hash: str = "*") -> str:
-    """Return the zenoh key of a topic, by default for any hash of the type."""
+    """Return the zenoh key of a topic; "*" is any hash of the message type."""
     return f"{domain}/{topic}/{_dds_type_name(message_type)}/{type_hash}"
 
 
@@ -86,7 +86,7 @@ def liveliness_tokens(
 
 
 def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Return number, time [ns] and sender of a message as bytes (rmw_zenoh since 0.2.4)."""
+    """Return number, time [ns] and sender id of a message as bytes (rmw_zenoh since 0.2.4)."""
     return _ATTACHMENT_FORMAT.pack(number, ns, len(sender), sender)
 
 
@@ -105,7 +105,7 @@ def _dds_type_name(message_type: str) -> str:
 
 
 class CdrConverter(MessageConverter):
-    """Converter of ROS 2 messages in CDR."""
+    """Converter of ROS 2 messages in CDR (common data representation)."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
@@ -132,7 +132,7 @@ class CdrConverter(MessageConverter):
 
 
 class ZenohSource(Source):
-    """Source at zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
+    """Source at zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&...], parameters as for `Ros2Source`.
 
     The first TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
     """

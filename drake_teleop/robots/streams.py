@@ -17,7 +17,7 @@ NUM_READING_VALUES = 15
 
 
 class ReadingFlag(IntFlag):
-    """Flag of a wrench: reason why it is zero, or information; bits as in the packets."""
+    """Flag of an output wrench, also in packets: reason why it is zero, or information."""
 
     SATURATED = 1  #: reported by the sensor, or a channel at its range
     DAMAGED = 2  #: invalid packet
@@ -49,12 +49,12 @@ class Reading(NamedTuple):
     """Sample of the stream `stream`: number, time [s] on the source's clock, values, flags.
 
     Attributes:
-        values: in S, of WRENCH_AND_MOTION (15,): wrench of sensor on load [N, N m], specific force,
-            angular velocity and acceleration. Of other streams: that wrench (6,); pose X_WF of a
-            frame on the wrist (7,); specific force and angular velocity of S (6,); joint positions
-            (n,); tool acceleration (3,).
+        values: WRENCH_AND_MOTION (15,): wrench of sensor on load [N, N m], specific force, angular
+            velocity and acceleration, in S. WRENCH (6,): that wrench. POSE (7,): X_WF of a frame F
+            on the wrist. IMU (6,): specific force and angular velocity of S. JOINTS (n,):
+            positions. ACCELERATION (3,): of the tool.
         gravity: (3,) in S [m/s^2]; None without an orientation.
-        arrival: time at which a reading of several streams arrived, on our clock [s].
+        arrival: arrival time of a reading of several streams on this computer's clock [s].
     """
 
     number: int
@@ -88,7 +88,7 @@ class Source(Protocol):
     Attributes:
         dt: period of the wrenches [s].
         live: whether the readings arrive in real time; else as fast as they are read.
-        streams: WRENCH_AND_MOTION, or the streams to assemble.
+        streams: WRENCH_AND_MOTION, or streams of wrench and motion to combine.
     """
 
     dt: float
@@ -96,7 +96,7 @@ class Source(Protocol):
     streams: tuple[str, ...] = (WRENCH_AND_MOTION,)
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """Return the readings after a wait for the first; [] after the timeout, None at the end."""
+        """Wait for a reading; return all that arrived, [] after the timeout, None at the end."""
 
     def close(self) -> None:
         return

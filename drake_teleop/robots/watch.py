@@ -27,20 +27,20 @@ LOAD_WRENCH_ERROR_FRACTION = 0.02
 MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
 # Accuracy at which another load would replace the present one.
-_MASS_STD_RATIO_TO_REPLACE_LOAD = 1e-12
+_UNREACHABLE_MASS_STD_RATIO = 1e-12
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def white_wrench_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return the white noise (6,) of a reading, rms [N, N m], from the filtered residual."""
+    """Return the rms (6,) [N, N m] of white noise that explains the load's filtered residual."""
     bandwidth_hz = _NOISE_BANDWIDTH_OVER_CUTOFF * (math.inf if cutoff_hz is None else cutoff_hz)
     noise = load.residual_rms / math.sqrt(min(1.0, 2.0 * bandwidth_hz * dt))
     return np.maximum(noise, MIN_WRENCH_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt))
 
 
 class ContactAndLoadMonitor:
-    """Detector of contact and of another load than the identified one."""
+    """Detector of contact, and of another load than the identified one."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = white_wrench_noise(load, dt, cutoff_hz)
@@ -50,7 +50,7 @@ class ContactAndLoadMonitor:
             np.zeros(9),
             dt,
             relative_wrench_error=LOAD_WRENCH_ERROR_FRACTION,
-            mass_std_ratio=_MASS_STD_RATIO_TO_REPLACE_LOAD,
+            mass_std_ratio=_UNREACHABLE_MASS_STD_RATIO,
         )
         self._phi = phi_with_inertia_replaced(load)[0]
         self._covariance = limit_covariance_to_scales(self._phi, load.covariance)
@@ -60,7 +60,6 @@ class ContactAndLoadMonitor:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Restart with other sensor offsets (6,)."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched.initial_monitor_memory(self._out, self._covariance)
 
@@ -79,11 +78,11 @@ MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
 _CONTACT_STATISTIC = "level"
-_FREE_LOG_RATE_TOLERANCE = 0.05
+_RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
-    """Contact detector with the noise floor of a free-motion log."""
+    """Contact detector with the noise floor of the free-motion log `free`."""
 
     def __init__(
         self,
@@ -97,7 +96,7 @@ class StreamContactDetector:
             what = f"needs a low-pass below half the stream's rate, {0.5 / dt:g} Hz"
             raise DrakeTeleopError(what, where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
-        if abs(source.dt / dt - 1.0) > _FREE_LOG_RATE_TOLERANCE:
+        if abs(source.dt / dt - 1.0) > _RELATIVE_FREE_LOG_RATE_TOLERANCE:
             what = f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz"
             remedy = "use the log that `calibrate` wrote from this stream"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)

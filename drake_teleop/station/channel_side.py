@@ -83,9 +83,9 @@ def _passivity_config_for_arm_and_device(scenario: Scenario) -> PassivityConfig:
 
 
 def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
-    """Return the scenario's passivity settings, with mass and servo of the arm if needed.
+    """Return passivity settings, with the arm's mass and servo if `ledger` has no `slave_mass`.
 
-    An arm with fewer than six joints, whose mass is then unbounded, raises a DrakeTeleopError.
+    An arm with fewer than six joints raises a DrakeTeleopError then: its mass is unbounded.
     """
     passivity = scenario.passivity
     if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
@@ -105,12 +105,12 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 
 
 def slave_wrench_power_scale(scenario: Scenario) -> Array:
-    """Return factors (2,) from the slave's wrench to the master's power units: force, torque."""
+    """Return factors (2,) from slave wrench to master's power units (T29): force, torque."""
     scales = scenario.kinematic_scaling.scales
     return _rendered_force_per_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
 def _rendered_force_per_contact_force(scenario: Scenario) -> float:
-    """Return force scale times gamma, the rendered share of contact; gamma 0 counts as 1."""
+    """Return rendered over measured contact force: force_scale times gamma, with 1 for gamma 0."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

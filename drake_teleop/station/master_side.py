@@ -1,4 +1,4 @@
-"""Master side of the station: operator, haptic device and kinematic scaling."""
+"""Master side of the station: operator, haptic device, scaling and force display."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.channel.network import mean_delay
-from drake_teleop.station.master.device import AddHapticDevice
+from drake_teleop.station.master.device import AddDeviceAndForceDisplay
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
@@ -55,7 +55,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
     q_start = model.inverse_kinematics(start_B)
-    device, display = AddHapticDevice(builder, period, model, q_start)
+    device, display = AddDeviceAndForceDisplay(builder, period, model, q_start)
     builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
     builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
     builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))

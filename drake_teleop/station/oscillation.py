@@ -17,7 +17,7 @@ Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].
 _MIN_SWING_M, _MIN_SWING_RAD = 5e-4, np.deg2rad(0.5)
-MAX_REVERSAL_DELAY_S = 0.25
+MAX_REVERSAL_LAG_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
 MAX_FORCE_RIPPLE_RMS_AT_REST_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
@@ -32,11 +32,11 @@ _MAX_TOUCH_INTERVAL_S = 0.2
 # Smallest number of touches, duration [s] and force [N] of a series.
 _MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.5
 # Largest time between a touch and the reversal of the command that explains it [s].
-_MAX_TOUCH_TO_REVERSAL_S = 0.1
+_MAX_TOUCH_TO_COMMAND_REVERSAL_S = 0.1
 
 
 def reversal_indices(x: Array, min_swing: float) -> NDArray[np.intp]:
-    """Return indices of maxima and minima of x (N,); successive ones differ by > `min_swing`."""
+    """Return indices of maxima and minima of x (N,); neighbours differ by > `min_swing`."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
@@ -54,12 +54,12 @@ def reversal_indices(x: Array, min_swing: float) -> NDArray[np.intp]:
 
 
 def flag_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, window: float = MAX_REVERSAL_DELAY_S
+    t: Array, command: Array, actual: Array, swing: float, window: float = MAX_REVERSAL_LAG_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
     An oscillation has at least four reversals larger than `swing`, each within 0.5 s of the
-    previous one. A reversal of the command excludes one of the motion within `window` [s].
+    previous one. Each command reversal removes the nearest motion reversal within `window` [s].
 
     Args:
         t: (N,) times [s].
@@ -76,11 +76,11 @@ def flag_unexplained_oscillation(
 
 
 def flag_pose_oscillation(
-    t: Array, command: Array, actual: Array, window: float = MAX_REVERSAL_DELAY_S
+    t: Array, command: Array, actual: Array, window: float = MAX_REVERSAL_LAG_S
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
 
-    `window` [s] is that of `flag_unexplained_oscillation`.
+    `swing` is 0.5 mm and 0.5 degrees; see `flag_unexplained_oscillation` for `window` [s].
     """
     turned, wanted = (doubled_quaternions(pose, command) for pose in (actual, command))
     swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, window)
@@ -88,23 +88,23 @@ def flag_pose_oscillation(
 
 
 def pose_reversal_times(t: Array, pose: Array) -> Array:
-    """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
+    """Return sorted times [s] when a pose component (N, 7) reverses by 0.5 mm or 0.5 degrees."""
     rows = [reversal_indices(x, _MIN_SWING_M) for x in pose[:, 4:].T]
     rows += [reversal_indices(x, _MIN_SWING_RAD) for x in doubled_quaternions(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
 def doubled_quaternions(pose: Array, reference: Array) -> Array:
-    """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
+    """Return twice the quaternions (N, 4) of a pose (N, 7); small differences are angles [rad].
 
-    Each has the sign that is nearer to the quaternion of the pose `reference[0]`.
+    Their signs are those nearer to the quaternion of the pose `reference[0]`.
     """
     q: Array = pose[:, :4]
-    return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
+    return 2 * q * np.where(q @ reference[0, :4] < 0.0, -1.0, 1.0)[:, np.newaxis]
 
 
 def remove_times_near_causes(times: Array, causes: Array, window: float) -> Array:
-    """Remove, for each cause, the nearest event within `window` [s]; return the other times [s]."""
+    """Return `times` [s] without, for each cause, the nearest one within `window` [s] of it."""
     for cause in causes:
         distances = np.abs(times - cause)
         if len(times) and distances.min() < window:
@@ -113,7 +113,7 @@ def remove_times_near_causes(times: Array, causes: Array, window: float) -> Arra
 
 
 def split_times_at_gaps(times: Array, max_gap: float) -> list[Array]:
-    """Split sorted times [s] where two are more than `max_gap` [s] apart."""
+    """Split sorted times [s] into series where two are more than `max_gap` [s] apart."""
     return np.split(times, np.flatnonzero(np.diff(times) > max_gap) + 1)
 
 
@@ -136,7 +136,7 @@ def dominant_frequency(t: Array, signal: Array) -> tuple[float, float]:
 
 
 class ContactChatter(NamedTuple):
-    """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
+    """Series of touches with number, mean rate [Hz], largest force [N], start and stop [s]."""
 
     num_touches: int
     rate_hz: float
@@ -146,7 +146,7 @@ class ContactChatter(NamedTuple):
 
 
 def find_contact_chatter(t: Array, force: Array, command_reversals: Array) -> list[ContactChatter]:
-    """Return each long series of touches, without touches explained by reversals of the command.
+    """Return each long series of touches, without those that command reversals explain.
 
     A series has 8 or more touches, at most 0.2 s apart, lasts 0.3 s or longer and reaches 0.5 N.
 
@@ -156,7 +156,7 @@ def find_contact_chatter(t: Array, force: Array, command_reversals: Array) -> li
         command_reversals: times of the command's reversals [s].
     """
     touches = _find_touches(t, force)
-    touches = remove_times_near_causes(touches, command_reversals, _MAX_TOUCH_TO_REVERSAL_S)
+    touches = remove_times_near_causes(touches, command_reversals, _MAX_TOUCH_TO_COMMAND_REVERSAL_S)
     found = []
     for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:

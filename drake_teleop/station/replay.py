@@ -89,15 +89,15 @@ def write_replay(
 ) -> None:
     """Write the replay of a run to an HTML file.
 
-    `slow_motion` is the initial speed in seconds of replay per second of the run; by default the
-    replay lasts at least 6 s.
+    `slow_motion` is the initial factor, seconds of replay per second of the run; by default the
+    replay lasts at least 6 s, with a factor of at most 100.
 
     Raises:
         DrakeTeleopError: if slave_state, measured_wrench_S or load_estimate is missing.
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
-        what = f"cannot be made: the log contains no {', '.join(missing) or 'samples'}"
+        what = f"a replay cannot be made: the log contains no {', '.join(missing) or 'samples'}"
         remedy = "give the log of a station with a simulated slave"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     start, stop = float(result.t[0]), float(result.t[-1])
@@ -116,7 +116,7 @@ def write_replay(
         slow_motion,
         displayed_numbers=_displayed_numbers(signals),
         shaded_spans=contact_spans(result.t, contact),
-        notes=("Arrows: 3 mm a newton, as large as at the slave.",),
+        notes=("Arrows: 3 mm per newton of the force at the slave.",),
         curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
 
@@ -170,7 +170,7 @@ def _find_scenario(log: Path) -> Path:
 class ReplayScene:
     """3D scene of a replay in Meshcat, which shows one sample of a log at a time.
 
-    `plant` contains slave, surroundings and haptic device, for shapes and kinematics only.
+    Its `plant` contains slave, surroundings and haptic device, for shapes and kinematics only.
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
@@ -221,14 +221,14 @@ class ReplayScene:
                 yield path, body
 
     def show_sample(self, replay_time: float, signals: Signals, sample: int) -> None:
-        """Record row `sample` of the signals as the scene at `replay_time` [s] of the replay."""
+        """Show row `sample` of the signals in the scene at `replay_time` [s] of the replay."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._device is not None:
             instance, to_plant_positions, *_ = self._device
             state = signals["master_state"][sample]
             plant.SetPositions(context, instance, to_plant_positions(state[: len(state) // 2]))
-        if self._sheet is not None:
+        if self._sheet is not None and "sheet_state" in signals:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
         for name, body in self._moving_bodies.items():
             if name in signals:

@@ -77,7 +77,7 @@ class ReplayFile:
         slow_motion: initial factor: seconds of replay per second of `times`.
         displayed_numbers: numbers that the page displays.
         shaded_spans: time spans (start, stop) that are shaded behind the curves.
-        clock_label, curves_label: "{top}" in `curves_label` is replaced by the largest value.
+        clock_label, curves_label: texts; "{top}" in `curves_label` becomes the largest value.
     """
 
     title: str
@@ -147,9 +147,9 @@ class ReplayFile:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return times (F,) of a replay's frames [s], and the seconds of replay per real second.
+    """Return times (F,) of a replay's frames [s], and its slow-motion factor.
 
-    By default this factor makes the replay last at least 6 s.
+    By default the factor is the smallest for a replay of at least 6 s, and at most 100.
     """
     span = stop - start
     if slow_motion is None:
@@ -173,7 +173,7 @@ def add_shapes(
     shapes: Iterable[GeometryId],
     colour: Rgba = _DEFAULT_SHAPE_COLOUR,
 ) -> None:
-    """Add a body's shapes to Meshcat below `path`; `colour` is for shapes without their own."""
+    """Add a body's shapes to Meshcat below `path`; `colour` is that of shapes without a colour."""
     for shape in shapes:
         seen = inspector.GetIllustrationProperties(shape)
         own = colour if seen is None else seen.GetPropertyOrDefault("phong", "diffuse", colour)

@@ -75,13 +75,13 @@ class SimulationResult:
     """Recorded signals of one simulation, sampled at common times.
 
     ``result["measured_wrench_S"]`` is an (N, k) array; ``result["measured_wrench_S.f_x"]`` and
-    ``result["t"]`` are (N,) columns. ``len(result)`` and iteration refer to the signals' names.
-    Arrays are read-only.
+    ``result["t"]`` are (N,) columns; ``result[10:20]`` is a result with these rows. ``len(result)``
+    and iteration refer to the signals' names. Arrays are read-only.
 
     Args:
         t: (N,) sample times [s].
         signals: arrays by name, (N, k), or (N,) for one component.
-        specs: description of each signal; they define the order.
+        specs: description of each signal, in the order of the signals.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class SimulationResult:
         return ["t", *self._specs, *self._columns]
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return the samples as a pandas frame, with the columns of `to_dataframe`."""
+        """Return the samples as a pandas data frame, with the columns of `to_dataframe`."""
         try:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
@@ -174,7 +174,7 @@ class SimulationResult:
             raise DrakeTeleopError(what, where="to_pandas", remedy=remedy) from None
 
     def to_dataframe(self) -> pl.DataFrame:
-        """Return one row per sample: ``t`` and a column ``signal.component`` per component."""
+        """Return a polars data frame with ``t`` and a column ``signal.component`` per component."""
         import polars as pl
 
         columns = {"t": self._t}
@@ -186,7 +186,7 @@ class SimulationResult:
         """Return the wrist sensor's samples as a log for `identify` and `eliminate`.
 
         Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S and
-        SI units, with the sign of Eq. (1). ``t`` is the sampling instant; each sample has one row.
+        SI units, with the sign of Eq. (1). Each sampling instant ``t`` has one row.
         """
         import polars as pl
 
@@ -219,7 +219,7 @@ class SimulationResult:
     def write_part(self, folder: Path, first_row: int) -> None:
         """Write this result as one part of a longer log, in the format of `write_parquet`.
 
-        A part with the same `first_row` is replaced.
+        A part with the same `first_row` is replaced, except by an empty result.
 
         Args:
             folder: folder of the log, prepared by `remove_log`.
@@ -232,13 +232,13 @@ class SimulationResult:
 
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:
-        """Read a file, or a folder of parts, from `write_parquet` or `simulate`."""
+        """Return the result in a file of `write_parquet` or a folder of `simulate`."""
         on_disk = cls.scan_parquet(path)
         return cls(on_disk.t, {name: on_disk[name] for name in on_disk}, on_disk.specs)
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log like `read_parquet`, but read a signal from the disk at each access to it."""
+        """Return the result as `read_parquet`, but read a signal from the disk at each access."""
         import polars as pl
 
         expect_type((str, Path), path, "result")
@@ -284,6 +284,8 @@ class SimulationResult:
         if name in self._columns:
             signal, index = self._columns[name]
             return [(signal, self._specs[signal].units[index], [index])]
+        if name == "t":
+            raise KeyError("'t' is the abscissa of every plot; give the names of signals")
         if name not in self._specs:
             self[name]  # a KeyError with a suggestion
         units = self._specs[name].units
@@ -317,7 +319,7 @@ class SimulationResult:
 
 
 class _SignalsOnDisk(dict[str, Any]):
-    """Columns of each signal; an access by name reads the signal from the disk."""
+    """Signals on disk: `[name]` reads an array (N, k), other methods give column names."""
 
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
         super().__init__((spec.name, spec.columns) for spec in specs)
@@ -325,7 +327,7 @@ class _SignalsOnDisk(dict[str, Any]):
 
     def __getitem__(self, name: str) -> Array:
         columns = super().__getitem__(name)
-        with errors.wrap_read_errors(self._path, "write it again"):
+        with errors.wrap_read_errors(self._path, "make the log again"):
             return _read_only_view(_read_columns(self._path, columns))
 
 

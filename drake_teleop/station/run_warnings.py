@@ -40,12 +40,12 @@ _SHARE_AT_MOTOR_LIMIT = 0.999  # of a leader's motors, which the joints' motion 
 _MIN_COMMAND_LAG_M = 2e-3
 _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = np.deg2rad(1.0), np.deg2rad(0.2)
 # Settling time of the command of `ledger` with sufficient energy [s].
-_LEDGER_COMMAND_SETTLING_S = 0.05
+_LEDGER_COMMAND_SETTLING_TIME_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude of a joint.
 _MIN_JOINT_OSCILLATION_RAD = np.deg2rad(0.1)
 # Number of time constants of the position loop until the error is 0.3 %.
-_SETTLING_TIME_CONSTANTS_OF_POSITION_LOOP = 6.0
+_NUM_SETTLING_TIME_CONSTANTS = 6.0
 # Time in which an intent at rest moves by less than a distance.
 _MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
@@ -58,9 +58,9 @@ _REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return a warning, with times, for each condition listed in docs/running.md that occurred.
+    """Return a warning, with times, for each condition in docs/running.md that occurred.
 
-    Checks whose signals were not recorded are skipped. `arm` is the slave's arm, with limits.
+    Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm.
     """
     found = chain(
         _check_faults(result),
@@ -90,7 +90,7 @@ def find_spans(t: Array, flags: Flags, min_duration: float = 0.0) -> Spans:
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """Return (N,) distances of the actual motion from the range of the last commands.
+    """Return (N,) distances of the actual motion from the range of the commands before it.
 
     The range covers the last `window` [s], so a pure delay gives 0. `t` (N,) are evenly spaced
     times [s], `command` and `actual` are (N, k).
@@ -119,7 +119,7 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
             advice = "use smaller or slower motions, or another start posture"
-            yield f"inverse kinematics: {status.name}", find_spans(t, happened), advice
+            yield f"inverse kinematics: status {status.name}", find_spans(t, happened), advice
     control = scenario.joint_control
     checked = [("torque", result["joint_torque"], arm.effort_limit)]
     if "joint_command" in result:
@@ -179,15 +179,15 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
             spans,
             "move more slowly, or use another passivity method",
         )
-    yield from _check_reserve_speed_limit(result, scenario)
-    window += oscillation.MAX_REVERSAL_DELAY_S
+    yield from _check_speed_limit_of_energy_reserve(result, scenario)
+    window += oscillation.MAX_REVERSAL_LAG_S
     oscillating = flag_pose_oscillation(t, sent, received, window)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     advice = "use another passivity method or network"
     yield f"the channel ({by}) makes the slave's command oscillate", spans, advice
 
 
-def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> Warnings:
+def _check_speed_limit_of_energy_reserve(result: SimulationResult, scenario: Scenario) -> Warnings:
     speed_limit = METHODS[scenario.passivity.method].speed_limit
     if speed_limit is None or len(result.t) < 2:
         return
@@ -199,11 +199,11 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     newest = newest_packets(forward, scenario.simulation.seed, FORWARD, step[-1] + 1, period)
     then = t - (step - newest[step]) * period  # when the newest received packet was sent
-    window = longest_delay(forward) + _LEDGER_COMMAND_SETTLING_S
+    window = longest_delay(forward) + _LEDGER_COMMAND_SETTLING_TIME_S
     parts = _pose_parts_with_lag_limits(sent, received)
     for g, (command, actual, least, unit, scale) in enumerate(parts):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
-        far = lag_beyond_delay(t, asked, actual, _LEDGER_COMMAND_SETTLING_S)
+        far = lag_beyond_delay(t, asked, actual, _LEDGER_COMMAND_SETTLING_TIME_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
         speed = _trailing_maximum(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
@@ -242,7 +242,7 @@ def _check_joints(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = _SETTLING_TIME_CONSTANTS_OF_POSITION_LOOP * scenario.joint_control.tracking_delay_s
+    window = _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
     window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)

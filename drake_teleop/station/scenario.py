@@ -52,7 +52,7 @@ _MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at th
 @settings
 @dataclass
 class Rates:
-    """Sampling rates. Those of the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
+    """Sampling rates; in the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
     hand_hz: float = quantity(
@@ -61,8 +61,8 @@ class Rates:
     joint_control_hz: float = quantity(
         2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz it samples inside steps"
     )
-    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator, detection of contact")
-    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
+    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator and contact detection")
+    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "rows of the log")
 
 
 @settings
@@ -70,8 +70,8 @@ class Rates:
 class Simulation:
     """Duration and integrator of a simulation.
 
-    The log starts with t = 0 after the settling time. The operator's intent counts its times from
-    the start of the simulation, `settle` earlier.
+    The log starts with t = 0 after the settling time. Times of the operator's intent and task are
+    from the start of the simulation, `settle` earlier.
     """
 
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
@@ -79,7 +79,7 @@ class Simulation:
     integrator: str = choice(
         "runge_kutta3", ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"), "Drake's scheme"
     )
-    max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
+    max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; sampling shortens it")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "tolerance of error-controlled integrators")
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
     end_with_task: bool = plain(False, "end within 20 ms after the operator finishes or gives up")
@@ -122,7 +122,7 @@ class Scenario:
 
     @property
     def first_sheet_spring(self) -> SheetSpring | None:
-        """Sheet spring from `sheet_spring` or `environment`, or None."""
+        """The scenario's sheet spring, from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._environments if isinstance(thing, SheetSpring)), None)
 
     @property
@@ -136,7 +136,7 @@ class Scenario:
 
     @property
     def has_no_network_or_passivity(self) -> bool:
-        """True if no network and no passivity method are between master and slave."""
+        """True if the channel has neither network effects nor a passivity method."""
         return (
             self.passivity.method == "none"
             and self.channel.networks_of_directions() == (NetworkConfig(),) * 2
@@ -177,7 +177,7 @@ def ScenarioNames() -> list[str]:
 def LoadScenario(name_or_path: str | Path) -> Scenario:
     """Load a shipped scenario by name, or a YAML file.
 
-    Missing fields keep their defaults. Paths in it are relative to the file's folder.
+    Missing fields have their defaults. Paths in the file are relative to its folder.
     """
     return ScenarioFromData(*ReadScenarioData(name_or_path))
 
@@ -189,9 +189,9 @@ def ReadScenarioData(name_or_path: str | Path, where: str = "") -> tuple[Any, st
 
 
 def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path, where: str = "") -> Path:
-    """Return the YAML file of this name in a folder of shipped files, or else the given path.
+    """Return the path of the YAML file with this name in `folder`, or else the given path.
 
-    A DrakeTeleopError for `where` that names `kind` is raised if neither exists.
+    A DrakeTeleopError is raised if neither exists. `kind` is the kind of file in its message.
     """
     expect_type((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -206,7 +206,7 @@ def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path, where: 
 def settings_without_range_check(
     schema: type[_T], data: Any, where: str, defaults: _T | None = None
 ) -> _T:
-    """Return settings from parsed YAML data, with unchecked ranges; `where` begins messages."""
+    """Return a `schema` object from YAML data, without range checks; `where` begins messages."""
     config.check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
@@ -242,7 +242,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
 
 
 def referenced_files(scenario: Scenario) -> list[Path]:
-    """Return the files at absolute paths in the scenario, and the files that these include."""
+    """Return the files with absolute paths in the scenario, and the files that these include."""
     leader = scenario.master.leader
     packages = map(Path, () if leader is None else leader.package_paths)
     folders = (*scenario.slave.package_folders, *packages)

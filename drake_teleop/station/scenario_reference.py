@@ -42,7 +42,7 @@ def _texts_in(value: Any) -> list[str]:
 def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) -> None:
     """Write every field of a scenario to a YAML file, with the lines `heading` as comment.
 
-    A DrakeTeleopError is raised if reading the file would not give the same scenario.
+    A DrakeTeleopError is raised if YAML cannot represent a text of the scenario.
     """
     scenario = with_absolute_paths(scenario, Path.cwd())
     text = "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario)
@@ -99,15 +99,15 @@ def _nested_block_lines(entry: FieldInfo) -> list[str]:
 
 def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.list_depth:
-        head = f"{entry.name}:{_tag_of_block(entry, value)}  # {entry.meaning}"
+        head = f"{entry.name}:{_yaml_tag(entry, value)}  # {entry.meaning}"
         return [head, *_prefix_lines("  ", _block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_tag_of_block(entry, item)}", *_prefix_lines(" " * 4, _block_lines(item))]
+        lines += [f"  -{_yaml_tag(entry, item)}", *_prefix_lines(" " * 4, _block_lines(item))]
     return lines
 
 
-def _tag_of_block(entry: FieldInfo, config: Any) -> str:
+def _yaml_tag(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 

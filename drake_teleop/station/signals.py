@@ -49,10 +49,10 @@ def _signals_for_joints(num_joints: int) -> dict[str, Signal]:
          "time of the wrist sensor's sample in this row; other signals are of t"),
         ("load_estimate", _LOAD_ESTIMATE_COMPONENTS, "offsets and phi, Eq. (7)"),
         ("slave_state", state, "true joint angles and velocities, at t"),
-        ("joint_torque", torques, "of the slave's motors"),
+        ("joint_torque", torques, "motor torques of the slave"),
         ("load_state", ("state", "1"),
-         "of the monitored load: 0 learning, 1 settled, 2 disturbed, 3 another load"),
-        ("true_contact_wrench_W", _WRENCH_COMPONENTS, "environment on the tool, about Wo, in W"),
+         "state of the load estimate: 0 learning, 1 settled, 2 disturbed, 3 another load"),
+        ("true_contact_wrench_W", _WRENCH_COMPONENTS, "contact wrench on the tool about Wo, in W"),
         ("sheet_state", ("z v_z", "m,m/s"), "deflection of the sheet spring's end, upwards"),
         ("intent", _POSE_COMPONENTS, "intended pose of the stylus, X_BE"),
         ("hand_wrench_E", _WRENCH_COMPONENTS, "wrench of the hand on the stylus at Eo, in B"),
@@ -86,10 +86,10 @@ SIGNALS = _signals_for_joints(6)
 
 
 def signal_with_size(name: str, size: int) -> Signal:
-    """Return the description of a signal with `size` components, for any number of joints."""
+    """Return the description of a recorded signal; `size` is its number of components."""
     if name.startswith(MOVING_BODY_POSE_PREFIX):
         body = name.removeprefix(MOVING_BODY_POSE_PREFIX)
-        return _signal(name, *_POSE_COMPONENTS, f"where the body {body} is, in W, at t")
+        return _signal(name, *_POSE_COMPONENTS, f"pose of the body {body} in W, at t")
     if size == len(SIGNALS[name].components):
         return SIGNALS[name]
     return _signals_for_joints(size // 2 if name in ("slave_state", "master_state") else size)[name]

@@ -50,11 +50,12 @@ def simulate(
 
     Raises:
         DrakeTeleopError: if a joint of the slave leaves its range, the folder contains other
-            files, or at a fault (`Simulation.on_fault`).
+            files, or a fault occurs with `simulation.on_fault` "stop".
     """
     expect_type(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
     if simulation is None:
-        raise DrakeTeleopError("is missing", where="simulation", remedy="pass scenario.simulation")
+        what = "the argument is missing"
+        raise DrakeTeleopError(what, where="simulation", remedy="pass scenario.simulation")
     expect_type(Simulation, simulation, "simulation", "pass scenario.simulation")
     check_all_field_values(simulation, "simulation")
     expect_type((str, Path, type(None)), log, "log", "give a folder")
@@ -99,13 +100,13 @@ def _raise_recorded_fault(simulator: Simulator, start: float, num_checked_rows: 
         for k in np.flatnonzero(log.data()[column][0, num_checked_rows:])[:1] + num_checked_rows:
             what = FAULT_WARNINGS[Fault(int(log.data()[column][0, k]))]
             what = f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}"
-            remedy = "correct the cause; or set it to continue, for a run on in the safe state"
+            remedy = "correct the cause, or set on_fault: continue to run on in the safe state"
             raise DrakeTeleopError(what, where="simulation.on_fault", remedy=remedy)
     return int(log.num_samples())
 
 
 def log_slices_of_signals(station: Diagram) -> dict[str, slice]:
-    """Return, by signal name, the slice of the signal's components in the station's log."""
+    """Return, by signal name, the slice of the signal's components in a row of the log."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
     return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
@@ -117,7 +118,7 @@ class LogOnDisk:
     Args:
         folder: folder of the log; an old log is replaced.
         start: simulation time that becomes t = 0 [s].
-        convert: function that converts each part before it is written.
+        convert: function that changes each part before it is written.
     """
 
     def __init__(
@@ -140,13 +141,13 @@ class LogOnDisk:
         return int(self._sink.num_samples())
 
     def write_and_clear_rows(self) -> None:
-        """Write the rows in memory as the next part and clear them; safe to repeat."""
+        """Write the rows in memory as the next part of the log, then clear them in memory."""
         rows = self.write_and_keep_rows()
         self._sink.Clear()
         self._rows += rows
 
     def write_and_keep_rows(self) -> int:
-        """Write the rows in memory; a later part replaces them; return their number."""
+        """Write the rows in memory as a part that the next write replaces; return their number."""
         part = self._convert(read_recorded_signals(self._simulator, self._start))
         self._write_part(part)
         return len(part.t)
@@ -167,7 +168,6 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance_without_garbage_collection(simulator: Simulator, time: float) -> None:
-    """Advance the simulator to `time` [s] without garbage collection."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

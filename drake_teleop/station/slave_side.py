@@ -1,4 +1,4 @@
-"""Slave side of the station: arm, inverse kinematics, wrist sensor, elimination of the load."""
+"""Slave side of the station: arm, inverse kinematics, wrist sensor, compensation of the load."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _add_slave_blocks(
     *,
     custom_torque: bool = False,
 ) -> tuple[SlavePlant, dict[str, OutputPort], float]:
-    """Add arm, joint control, sensor, load estimator; return arm, sample's ports, period [s]."""
+    """Add plant, servo, sensor, load estimator; return plant, sample ports, torque period [s]."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start, ports = slave.arm, slave.plant, slave.start, slave.ports

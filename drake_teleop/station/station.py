@@ -36,11 +36,11 @@ def MakeTeleopStation(
     Args:
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an identification.
             Optional if the estimator runs online or sigma = gamma; without an estimate there is no
-            `contact_wrench_S`.
-        load_covariance: (16, 16) covariance of the estimate: start value of a monitored load
+            signal `contact_wrench_S`.
+        load_covariance: (16, 16) covariance of the estimate, for a monitored load
             (`load_estimator.watch`). Use a method for noisy motion ("total"); the covariance of
             least squares is too small.
-        noise_floor: noise of the wrench without the load's part in free motion, at the estimator's
+        noise_floor: noise of the wrench minus the load's part in free motion, at the estimator's
             rate, for contact detection: `LoadIdentification.noise_floor`.
         master: custom system with the ports of `MakeMasterSide(scenario)`.
         channel: custom system with the ports of `MakeChannel(scenario)`; the scenario's channel and
@@ -54,7 +54,7 @@ def MakeTeleopStation(
     check_scenario(scenario)
     for name, side in (("master", master), ("channel", channel), ("slave", slave)):
         if side is not None:
-            expect_type(System, side, name, "docs/station.md lists the ports that each side has")
+            expect_type(System, side, name, "docs/station.md lists the ports of each side")
     builder = DiagramBuilder()
     if slave is None:
         slave = MakeSlaveSide(

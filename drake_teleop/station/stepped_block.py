@@ -15,14 +15,14 @@ from drake_teleop.common.numeric import Array
 
 
 class SteppedBlock(DoubleOnlySystem, LeafSystem):
-    """Block whose discrete states advance by a step that outputs and states share."""
+    """Block whose discrete states and outputs share one calculated step per period."""
 
     __slots__ = ()
 
     def _declare_step(self, results: list[Array], num_states: int, period: float) -> None:
-        """Declare states and the period [s].
+        """Declare the discrete states and the `period` [s] of their step.
 
-        `results` are start values of the step's results; the first `num_states` are the states.
+        `results` are initial values of the arrays of `_advance`; the first `num_states` are states.
         """
         # Integers are faster than Drake's own indices.
         self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
@@ -37,7 +37,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_step_results)
 
     def _declare_output(self, name: str, result: int, part: slice) -> None:
-        """Declare an output port with `part` of the step's result of index `result`."""
+        """Declare an output port with the slice `part` of the step's array number `result`."""
         block: Any = weakref.ref(self)
 
         def copy_part(context: Context, output: Any) -> None:
@@ -47,7 +47,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
 
     @abstractmethod
     def _advance(self, context: Context, results: list[Array]) -> None:
-        """Advance the states in `results` by one period, and write the other results."""
+        """Advance the states, the first arrays in `results`, and write the other arrays."""
 
     def _calc_step(self, context: Context, step: AbstractValue) -> None:
         results = step.get_mutable_value()

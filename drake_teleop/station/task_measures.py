@@ -109,14 +109,14 @@ def _required_contact_force(task: Task) -> float:
 
 
 def true_contact_force_magnitudes(result: SimulationResult) -> Array:
-    """Return (N,) magnitude of the true contact force at the tool [N]; zeros without contact."""
+    """Return (N,) magnitude of the true contact force at the tool [N]; zeros if not recorded."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t))
     return np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
 
 
 def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from the first contact to its detection [s]; nan if either is missing."""
+    """Return the time from the first contact to the next detection [s]; nan without either."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))

@@ -32,7 +32,7 @@ def connect_ports(
 
     A DrakeTeleopError is raised if a port is missing or the sizes differ.
     """
-    remedy = "docs/station.md lists the ports that each side has"
+    remedy = "give it the ports of this side in docs/station.md"
     for has_port, port_text, block in (
         (source.HasOutputPort(output_name), f"output port '{output_name}'", source),
         (target.HasInputPort(input_name), f"input port '{input_name}'", target),
@@ -54,7 +54,7 @@ def connect_ports(
 def connect_matching_inputs(
     builder: DiagramBuilder, block: System, sources: Mapping[str, OutputPort]
 ) -> None:
-    """Connect each output port to the input port of its name in `sources`, if the block has one."""
+    """Connect the output ports `sources` to inputs of `block` by name, skipping absent inputs."""
     for name, port in sources.items():
         if block.HasInputPort(name):
             builder.Connect(port, block.GetInputPort(name))
@@ -63,7 +63,7 @@ def connect_matching_inputs(
 def build_with_log(
     builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float
 ) -> Diagram:
-    """Export and record the sides' signals at `log_hz`; build the diagram."""
+    """Export the sides' signals, record them at `log_hz`, and return the built diagram."""
     outputs = {
         port.get_name(): port
         for side in sides

@@ -123,7 +123,7 @@ def test_verdict_reports_instability_with_delay_and_light_grip():
     found = figures(scenario)
     (free,) = found["diagram"]
     assert not free["stable"] and free["decay_1_per_s"] < 0
-    assert any("unstable: it doubles every" in sentence for sentence in found["verdict"])
+    assert any("unstable: motion doubles every" in sentence for sentence in found["verdict"])
     assert found["bounded"]["each"]["light"] == 0.0
     # Without the tool's inertia no delayed force exists.
     (sigmas,) = (m for m in found["maps"] if m["title"] == "Delay and σ, in free motion")

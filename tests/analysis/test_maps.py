@@ -179,6 +179,8 @@ def test_distortion_is_that_of_the_continuous_station_at_high_rates() -> None:
         ("stiffness", [1.0, 2.0], "wall_stiffness"),
         ("delay", [2.0, 1.0], "do not increase"),
         ("delay", [], "do not increase"),
+        ("delay", [np.nan], "finite"),
+        ("delay", [0.0, np.inf], "finite"),
     ],
 )
 def test_unknown_parameter_or_decreasing_values_raise(

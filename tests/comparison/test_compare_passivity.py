@@ -106,6 +106,8 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     [
         ({"networks": ["mars"]}, r"networks.*no network 'mars'.*lunar"),
         ({"methods": ["magic"]}, r"methods.*no passivity method 'magic'.*tdpa"),
+        ({"methods": []}, "methods: is empty; give"),
+        ({"networks": []}, "networks: is empty; give"),
     ],
 )
 def test_unknown_names_raise(tmp_path, arguments, message):
@@ -130,7 +132,7 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (
         0.3,
         3,
-        study._RATES_OF_EVERY_RUN,
+        study._COMPARISON_RATES,
     )
     assert base.surroundings is None and base.contact_detection is None
     # Steps longer than the events' period avoid extra steps by rounding.

@@ -364,7 +364,7 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
     fitting = replace(scenario, simulation__duration=2.4)
     with pytest.raises(DrakeTeleopError, match=r"trajectory: uses 1\d\d\.\d% of the"):
         identify_load(fitting, trajectory=short.trajectory.with_scaled_amplitudes(1.1))
-    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm 6"):
+    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm has 6"):
         less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
 
@@ -378,7 +378,7 @@ def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     assert noise == pytest.approx(sensor.wrench_std()[[0, 3]])
     assert robot.arm.joint_names == ("j1", "j2", "j3", "j4", "j5", "j6")
     words = "; ".join(robot.assumptions)
-    assert "turns without end for j4" in words
+    assert "unlimited rotation for j4" in words
     assert "a speed limit of 3.142 rad/s for j5" in words
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
     assert "shapes are missing of l3, l4, l5: meshes were not found (--package-path" in words
@@ -605,7 +605,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
     urdf.write_text(nothing)
     robot = RobotFromModel(urdf, "l6", WristSensorConfig())
     assert "no inertia of l6" in robot.assumptions
-    assert any("turns without end for j3" in words for words in robot.assumptions)
+    assert any("unlimited rotation for j3" in words for words in robot.assumptions)
 
 
 @pytest.mark.parametrize(
@@ -619,7 +619,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "model contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
-        (["--sensor-frame", "l0"], "no moving joint"),
+        (["--sensor-frame", "l0"], "no joint moves l0"),
         ([], "--sensor-frame"),
     ],
 )
@@ -664,7 +664,7 @@ def test_model_options_require_a_model(capsys, tmp_path):
         main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
     assert (stop.value.code, capsys.readouterr().err) == (
         2,
-        "error: --payload: requires --model; add --model or remove it\n",
+        "error: --payload: requires --model; add --model or remove --payload\n",
     )
 
 

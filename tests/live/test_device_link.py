@@ -310,6 +310,22 @@ class RestingDevice:
         self.set_wrench((0.0,) * 6)
 
 
+@pytest.mark.parametrize(("force", "moved"), [(4.0, -0.05), (-6.0, 0.02)])
+def test_motion_during_ticks_without_pose_stores_no_energy(link, force, moved):
+    device, poses = RestingDevice(), [0.0] * 100 + [None] * 3 + [moved] * 20
+    device.read = lambda: None if poses[0] is None else DeviceState(0, 0.0, (0.0, 0.0, poses[0]))
+    client = DeviceClient(device, f"udp://127.0.0.1:{link.port}")
+    for k in range(len(poses)):
+        client.exchange_packets(lambda now=MS * k: now)
+        link.hand_inputs(MS * k)
+        link.send_wrench(np.array([0.0, 0.0, force, 0.0, 0.0, 0.0]))
+        poses.pop(0)
+    displayed = [wrench[2] for wrench in device.was_set]
+    assert displayed[99] == pytest.approx(force) and displayed[100:103] == [0.0] * 3
+    assert client.guard.energy == 0.0
+    client.close()
+
+
 def test_client_displays_the_stations_force_and_none_after_silence(link):
     device = RestingDevice()
     client = DeviceClient(device, f"udp://127.0.0.1:{link.port}")

@@ -50,7 +50,7 @@ def until(socket, wanted) -> dict:
 
 def test_unwritable_record_fails_at_once(tmp_path):
     (tmp_path / "file").write_text("a file, and no folder")
-    with pytest.raises(DrakeTeleopError, match="cannot be made a folder"):
+    with pytest.raises(DrakeTeleopError, match="cannot be created as a folder"):
         server.drive(LEARNING, record=tmp_path / "file" / "record")
 
 

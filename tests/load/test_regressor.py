@@ -144,7 +144,7 @@ def test_leading_dimensions_are_broadcast():
         (np.zeros((5, 2)), np.zeros(3), TOOL, r"^s: has shape \(5, 2\) instead of \(\.\.\., 3\)"),
         (np.zeros((5, 3)), np.zeros((4, 3)), TOOL, r"numbers of samples differ.*omega \(4, 3\)"),
         ([0, 0, np.nan], np.zeros(3), TOOL, r"^s: is not finite at index \(2,\)"),
-        (np.zeros(3), "fast", TOOL, r"^omega: holds no numbers"),
+        (np.zeros(3), "fast", TOOL, r"^omega: contains no real numbers"),
         (np.zeros(3), np.zeros(3), np.zeros(9), r"^phi: has shape \(9,\) instead of \(10,\)"),
         (np.zeros(3), np.zeros(3), np.full(10, np.inf), r"^phi: is not finite"),
     ],

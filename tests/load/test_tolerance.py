@@ -39,7 +39,7 @@ def test_invalid_tolerance_is_refused(text: str) -> None:
 
 
 def test_number_that_is_not_numeric_is_no_tolerance() -> None:
-    with pytest.raises(DrakeTeleopError, match=r"'mass 1\.1\.1 %' is no tolerance"):
+    with pytest.raises(DrakeTeleopError, match=r"'mass 1\.1\.1 %' is not a tolerance"):
         parse_tolerance("mass 1.1.1 %")
 
 

@@ -391,7 +391,7 @@ def test_bag_with_excessive_uncompressed_size_raises_error(
         bags, "_MAX_UNPACK_RATIO", 1 if limit == "_UNPACKED_BYTES_MARGIN" else 10**6
     )
     monkeypatch.setattr(bags, limit, 40_000_000)
-    with pytest.raises(DrakeTeleopError, match="its uncompressed size is too large; cut it"):
+    with pytest.raises(DrakeTeleopError, match=r"its uncompressed size is too large \(.*\); cut"):
         read_topic(path, "/x")
     assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
 

@@ -90,8 +90,8 @@ def test_errors_name_file_and_field(
     ("text", "words"),
     [
         ("wrench: [", ["is not YAML"]),
-        ("- 1", ["holds no fields"]),
-        ("", ["holds no fields"]),
+        ("- 1", ["contains no fields"]),
+        ("", ["contains no fields"]),
         ("static: {}", ["static.file: is missing", "add file"]),
         (yaml.safe_dump({"wrench": BASE["wrench"]}), ["without kinematics", "add imu or pose"]),
         (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["cannot be combined"]),
@@ -113,7 +113,7 @@ def test_auto_without_the_required_streams_raises_error(tmp_path: Path) -> None:
     _expect_error(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
     data["imu"]["frame"] = "sensor"
     del data["imu"]["specific_force"]
-    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "found from specific_force"])
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "estimated from specific_force"])
 
 
 def test_missing_description_raises_error(tmp_path: Path) -> None:

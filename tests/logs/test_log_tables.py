@@ -73,6 +73,12 @@ def test_array_with_samples_as_rows_stays_beside_a_short_vector(tmp_path: Path) 
     assert read_table(tmp_path / "x.npz").finite_numbers(["F"], 3, "here").tolist() == F.tolist()
 
 
+def test_short_record_with_samples_as_rows_stays_beside_a_vector(tmp_path: Path) -> None:
+    F = np.arange(18.0).reshape(3, 6)
+    np.savez(tmp_path / "x.npz", t=np.arange(3.0), F=F, offset=np.zeros(6))
+    assert read_table(tmp_path / "x.npz").finite_numbers(["F"], 6, "here").tolist() == F.tolist()
+
+
 def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "1,2,3\n4,5,6\n"), header=False)
     assert table.finite_numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]

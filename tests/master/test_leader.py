@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.master.device import AddHapticDevice
+from drake_teleop.station.master.device import AddDeviceAndForceDisplay
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -43,7 +43,7 @@ class ConnectedLeader:
 
     def __init__(self, device):
         builder = DiagramBuilder()
-        self.block, self.display = AddHapticDevice(builder, PERIOD, device, device.home)
+        self.block, self.display = AddDeviceAndForceDisplay(builder, PERIOD, device, device.home)
         builder.ExportInput(self.block.GetInputPort("hand_wrench_E"), "hand")
         builder.ExportInput(self.display.GetInputPort("wrench_command"), "command")
         self.diagram = builder.Build()
@@ -213,7 +213,7 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
 @pytest.mark.parametrize(
     ("leader", "said"),
     [
-        (None, "master.leader: `model: leader` without the settings `leader` is invalid"),
+        (None, "master.leader: model: leader without a block leader is invalid"),
         (Leader(hand_frame="hand"), "master.leader.file: a leader arm requires a file"),
         (
             dataclasses.replace(LEADER, home=[0.0]),

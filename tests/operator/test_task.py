@@ -131,7 +131,7 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     assert decision._contact_force_at_tool_along_approach(packed, person, felt) == pytest.approx(
         -force_W @ axis
     )
-    across, size = decision._lateral_force_and_size.py_func(packed, person, felt)
+    across, size = decision._lateral_contact_force_W_and_size.py_func(packed, person, felt)
     np.testing.assert_allclose(across, force_W - (force_W @ axis) * axis, atol=1e-12)
     assert size == pytest.approx(np.linalg.norm(across))
 
@@ -335,7 +335,7 @@ def test_impossible_task_is_rejected(changes, message):
 
 def test_target_beyond_its_radius_is_accepted():
     check_target_beyond_standoff(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
-    with pytest.raises(DrakeTeleopError, match=r"not above 0\.02 m"):
+    with pytest.raises(DrakeTeleopError, match=r"within its radius or standoff of 0\.02 m"):
         check_target_beyond_standoff(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 

@@ -16,7 +16,7 @@ from drake_teleop.station.passivity.methods import (
     method_parameters,
     step_addresses,
 )
-from drake_teleop.station.passivity.packet import PACKET_SIZE, POSE, SECOND_ENERGY_COUNTER
+from drake_teleop.station.passivity.packet import PACKET_SIZE, POSE, SENDER_ENERGY
 
 
 def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
@@ -66,7 +66,7 @@ def test_drag_acts_only_below_the_reserve(short):
     memory = initial_method_memory("charged_tdpa", p, poses(np.random.default_rng(0), 1)[0])
     received, packet = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE)
     received[POSE] = [1, 0, 0, 0, 0, 0, 0]
-    received[SECOND_ENERGY_COUNTER] = 0.0 if short == "slave" else 1.0
+    received[SENDER_ENERGY] = 0.0 if short == "slave" else 1.0
     memory[STORED_ENERGY] = 0.0 if short == "master" else 1.0
     master_step(
         step_addresses("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),

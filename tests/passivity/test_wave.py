@@ -21,7 +21,7 @@ from drake_teleop.station.passivity.methods import (
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
-    METHOD_INTEGRAL,
+    METHOD_VALUES,
     PACKET_SIZE,
     POSE,
 )
@@ -55,9 +55,7 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
             step_addresses("wave"), at_hand, k not in missing, pose, dx / T, dx, zero,
             p[WRENCH_LIMIT], T, p, memory[0], wrench[k], sent[0, k],
         )  # fmt: skip
-        u[k] = (
-            sent[0, k, METHOD_INTEGRAL][0] - (sent[0, k - 1, METHOD_INTEGRAL][0] if k else 0.0)
-        ) / T
+        u[k] = (sent[0, k, METHOD_VALUES][0] - (sent[0, k - 1, METHOD_VALUES][0] if k else 0.0)) / T
         received = sent[0, k - forward] if k >= forward else nothing
         f_e = zero.copy()
         f_e[0] = contact(u[k - forward] if k >= forward else 0.0, command[k - 1, 4])

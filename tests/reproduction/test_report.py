@@ -66,9 +66,9 @@ def test_only_found_and_reported_values_agree():
     verdicts = {row.quantity: row.verdict for row in rows}
     assert set(verdicts.values()) == {"agrees", "as set", "within our bound", "for the record"}
     assert [row.quantity for row in rows if row.verdict == "agrees"] == [
-        "Fig. 6: largest force left, σ = 0",
-        "Fig. 8: found in the contact force after",
-        "Fig. 8: a threshold on the raw force finds it",
+        "Fig. 6: largest residual force, σ = 0",
+        "Fig. 8: detection delay in the contact force",
+        "Fig. 8: a threshold on the raw force detects contact",
         "Fig. 8: false alarm at about 600 ms",
         "Fig. 8: contact peak over inertial peak",
     ]
@@ -92,11 +92,21 @@ def test_unreported_values_never_agree():
         ("free_force.peak_raw_N", 130.0, "peak force at the slave", "not as set"),
         ("free_force.peak_raw_N", float("nan"), "peak force at the slave", "not as set"),
         ("free_force.half_ratio", 0.6, "σ = 0.5 over σ = 1", "not as set"),
-        ("free_force.residual_max_N", 5.1, "largest force left", "differs"),
-        ("ideal.residual_max_N", 1e-6, "All axes, ideal sensor, true φ: f", "beyond our bound"),
-        ("ideal.residual_max_Nm", 1e-6, "All axes, ideal sensor, true φ: t", "beyond our bound"),
-        ("contact.detected_s", 0.2404, "found in the contact force", "differs"),
-        ("contact.detected_s", 0.2154, "found in the contact force", "differs"),
+        ("free_force.residual_max_N", 5.1, "largest residual force", "differs"),
+        (
+            "ideal.residual_max_N",
+            1e-6,
+            "All axes, ideal sensor, true φ: residual f",
+            "beyond our bound",
+        ),
+        (
+            "ideal.residual_max_Nm",
+            1e-6,
+            "All axes, ideal sensor, true φ: residual t",
+            "beyond our bound",
+        ),
+        ("contact.detected_s", 0.2404, "detection delay in the contact force", "differs"),
+        ("contact.detected_s", 0.2154, "detection delay in the contact force", "differs"),
         ("contact.raw_detectable", True, "threshold on the raw force", "differs"),
         ("contact.false_alarm_0_6_s", True, "false alarm", "differs"),
         ("contact.peak_contact_N", 90.0, "over inertial peak", "differs"),

@@ -154,9 +154,7 @@ def test_no_parameter_is_known_after_a_change_of_load(tmp_path: Path) -> None:
     at = evaluate(both, "mass 1000 %", tmp_path / "log.parquet")
     assert at.relative_half_widths < 1.0 and not at.is_within_tolerance.any()
     assert at.doubts[0].startswith("from t = 3.00 s on there is another load")
-    assert (
-        at.advice == "start again: the record has another zero or another load from t = 3.00 s on"
-    )
+    assert at.advice == "start again: the sensor's zero or the load changes at t = 3.00 s"
 
 
 def contact(seconds: float) -> np.ndarray:

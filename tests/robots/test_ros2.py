@@ -225,7 +225,7 @@ def test_services_and_parameters_of_the_node(
         assert call("set gamma 2.0") == [True, ""]
         time.sleep(0.5)
         np.testing.assert_allclose(wrench(), 2.0 * before, atol=1e-6)
-        assert call("set sigma -1.0") == [False, "sigma: -1.0 is not a finite number of at least 0"]
+        assert call("set sigma -1.0") == [False, "sigma: -1.0 is outside 0 to inf"]
         assert call("set sigma 1.0")[0]
         time.sleep(0.5)
         np.testing.assert_allclose(wrench(), 2.0 * before + rest, atol=1e-6)

@@ -192,7 +192,7 @@ ERRORS = {
                        "<multiplier>1</multiplier></mimic></axis>")), "j moves with another"),
     "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "j is a gearbox joint"),
     "SDF of a fixed arm": ("sdf", sdf(sdf_joint("fixed")),
-                           "sensor_frame: no moving joint is between the world and l6"),
+                           "sensor_frame: no joint moves l6: all joints"),
     "directives that are none": ("dmd.yaml", "directives: [{add_modell: {}}]",
                                  "arm.dmd.yaml:1:14: YAML"),
     "directives with a field too many": ("dmd.yaml", "directives: [{add_model: {name: a, file: "
@@ -203,16 +203,16 @@ ERRORS = {
 }  # fmt: skip
 ASSUMED = {
     "nothing": (arm(), "acceleration limits that reach full speed"),
-    "no limits": (arm().replace(LIMIT, ""), "turns without end for all joints"),
-    "no range": (with_limit("<limit/>"), "turns without end for j3"),
+    "no limits": (arm().replace(LIMIT, ""), "unlimited rotation for all joints"),
+    "no range": (with_limit("<limit/>"), "unlimited rotation for j3"),
     "continuous": (with_limit("").replace('"j3" type="revolute"', '"j3" type="continuous"'),
-                   "turns without end for j3"),
+                   "unlimited rotation for j3"),
     "no speed": (with_limit('<limit velocity="0" effort="200"/>'), "a speed limit of .* for j3"),
     "no strength": (with_limit('<limit velocity="3" effort="0"/>'), "no torque limit for j3"),
     "only an upper limit": (with_limit('<limit upper="2" velocity="3" effort="200"/>'),
-                            "^a range of one turn from the only limit for j3"),
+                            "^a range of 360 degrees from the only limit for j3"),
     "only a lower limit": (with_limit('<limit lower="-2" velocity="3" effort="200"/>'),
-                           "^a range of one turn from the only limit for j3"),
+                           "^a range of 360 degrees from the only limit for j3"),
     "limits in degrees": (with_limit('<limit lower="-170" upper="170"/>'),
                           "limits in rad, though more than 25.13 apart, for j3"),
     "massless": (arm(l3=link("l3", "")), "no inertia of l3; a rotor inertia of 0.219 kg m.2,"
@@ -338,7 +338,7 @@ def test_rounded_inertia_is_preserved(tmp_path):
     ("change", "expected"),
     [
         ({"sensor_frame": "nose"}, "arm.urdf: no frames are named 'nose'; name one of l0, l1"),
-        ({"sensor_frame": "l0"}, "sensor_frame: no moving joint"),
+        ({"sensor_frame": "l0"}, "sensor_frame: no joint moves"),
         ({"home": [], "position": [3.0, 0.0, 0.4]}, "slave.position: the arm cannot reach"),
         ({"home": [3.0, *HOME[1:]]}, "home: joint j1 at 3 is outside its limits, -2.5 to 2.5"),
         ({"home": HOME[:5]}, "slave.home: has 5 numbers, but the arm has 6 joints"),

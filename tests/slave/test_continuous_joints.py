@@ -184,13 +184,13 @@ LIMIT = 'lower="-2.2" upper="2.2"'
     ("kind", "limit", "expected", "words"),
     [
         ("revolute", 'lower="-1.5" upper="2"', (-1.5, 2.0), ""),
-        ("revolute", "", (-np.inf, np.inf), "turns without end for"),
-        ("revolute", 'lower="0" upper="0"', (-np.inf, np.inf), "turns without end for"),
-        ("revolute", 'lower="-1e16" upper="1e16"', (-np.inf, np.inf), "turns without end for"),
+        ("revolute", "", (-np.inf, np.inf), "unlimited rotation for"),
+        ("revolute", 'lower="0" upper="0"', (-np.inf, np.inf), "unlimited rotation for"),
+        ("revolute", 'lower="-1e16" upper="1e16"', (-np.inf, np.inf), "unlimited rotation for"),
         ("revolute", 'lower="-1e3" upper="1e3"', (-1e3, 1e3), "limits in rad, though"),
-        ("revolute", 'lower="-1"', (-1.0, 2 * np.pi - 1), "one turn from the only"),
-        ("revolute", 'upper="1"', (1 - 2 * np.pi, 1.0), "one turn from the only"),
-        ("continuous", "", (-np.inf, np.inf), "turns without end for"),
+        ("revolute", 'lower="-1"', (-1.0, 2 * np.pi - 1), "360 degrees from the only"),
+        ("revolute", 'upper="1"', (1 - 2 * np.pi, 1.0), "360 degrees from the only"),
+        ("continuous", "", (-np.inf, np.inf), "unlimited rotation for"),
         ("prismatic", "", (-1.0, 1.0), "a range of +-1 m for j2"),
         ("prismatic", 'lower="0" upper="0"', (-1.0, 1.0), "a range of +-1 m for j2"),
         ("prismatic", 'lower="0.2"', (0.2, 2.2), "a range of 2 m"),
@@ -285,7 +285,7 @@ def test_summary_of_a_run_and_frame_of_a_page_are_plain_json(tmp_path):
     run = run_scenario(setup, progress=False)
     summary = summarise(run)
     json.dumps(summary, allow_nan=False)
-    assert "turns without end for j1, j3, j5, j7" in summary["assumed"]
+    assert "unlimited rotation for j1, j3, j5, j7" in summary["assumed"]
     rows = {name: run.result[name] for name in run.result.signals} | {"t": run.result.t}
     json.dumps(
         PageValueCalculator(setup).page_values(rows, Inputs.from_scenario(setup)), allow_nan=False

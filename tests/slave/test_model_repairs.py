@@ -166,7 +166,7 @@ def test_massless_frame_at_the_last_link_carries_what_the_link_carries(tmp_path,
     path = written(tmp_path, arm(beyond=PALM_AND_FINGER + frames_on_last_link(*origins)))
     _, on_link, _ = read(path)
     plant, on_frame, said = read(path, "tool")
-    assert "robot's side" not in said
+    assert "not part of the load" not in said
     names = {body.name() for body in bodies_carried_by(plant, plant.GetBodyByName("tool"))}
     assert names == {"palm", "finger"}
     np.testing.assert_allclose(on_frame.table[:-1], on_link.table[:-1], atol=1e-12)
@@ -183,7 +183,7 @@ def test_bodies_beside_a_frame_elsewhere_on_the_link_are_stated(tmp_path, offset
     frame = frames_on_last_link(f'xyz="0 {offset} 0"')
     _, model, said = read(written(tmp_path, arm(beyond=PALM_AND_FINGER + frame)), "tool")
     assert model.phi_load[0] == 0.0
-    expected = "on the robot's side of tool: palm of the model, 4 kg (beyond the sensor with"
+    expected = "not part of the load at tool: palm of the model, 4 kg (part of the load with"
     assert f"{expected} sensor_frame l6)" in said
 
 

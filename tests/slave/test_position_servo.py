@@ -143,7 +143,7 @@ def test_scenario_overrides_single_interface_fields():
     found = ScenarioFromData(data, "x").joint_control.position_interface
     assert found == dataclasses.replace(POSITION_INTERFACES["franka_position"], dead_time=0.01)
     scenario = replace(Scenario(), joint_control__interface=UR)
-    with pytest.raises(DrakeTeleopError, match="leave it out"):
+    with pytest.raises(DrakeTeleopError, match="remove this field"):
         scenario.check()
 
 

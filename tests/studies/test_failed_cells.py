@@ -111,7 +111,10 @@ def test_pictures_hatch_empty_cells_with_a_legend():
         assert sum(patch.get_hatch() == "////" for patch in patches) == hatched
         assert [text.get_text() for text in figure.legends[0].get_texts()] == [NO_SUCCESS]
     words = [axes.get_title(loc="right") for axes in main.axes]
-    assert words == ["over 2 of 5 combinations of the rest", "over 1 of 4 combinations of the rest"]
+    assert words == [
+        "over 2 of 5 combinations of the other factors",
+        "over 1 of 4 combinations of the other factors",
+    ]
     # Only cells with runs have colours.
     assert pairs.axes[0].images[0].get_clim() == pytest.approx((1.9, effort(1.0, 0.25) + 0.9))
 

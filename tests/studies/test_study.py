@@ -237,7 +237,7 @@ def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
         return work(self, values, seed)
 
     monkeypatch.setattr(studies.StationRunFunction, "__call__", stopping)
-    with pytest.raises(KeyboardInterrupt, match="keeps 5 of 12 runs"):
+    with pytest.raises(KeyboardInterrupt, match="contains 5 of 12 runs"):
         study_command(files / "study.yaml", out, jobs=1, quiet=True)
     assert study_command(files / "study.yaml", out, jobs=1, quiet=True) == serial[0]
     assert parts(out) == parts(serial[1])
@@ -359,7 +359,7 @@ def test_interrupt_reports_stored_runs(tmp_path):
         return {}
 
     study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0, 4.0])])
-    with pytest.raises(KeyboardInterrupt, match="keeps 2 of 4 runs"):
+    with pytest.raises(KeyboardInterrupt, match="contains 2 of 4 runs"):
         run_study(study, tmp_path, work, {}, jobs=1)
     assert run_study(study, tmp_path, work, {}, jobs=1).height == 4
     assert len(calls) == 5  # the third run again
@@ -702,7 +702,7 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     path.write_text(MANY.replace("LEVELS", "501"))
     with pytest.raises(
         DrakeTeleopError,
-        match=r"many\.yaml: 100,200 runs need a confirmation; confirm them by --yes",
+        match=r"many\.yaml: 100,200 runs require a confirmation; confirm them by --yes",
     ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):
@@ -810,6 +810,6 @@ def test_first_rows_of_a_large_study_are_stored_one_by_one(tmp_path):
         sizes.append(len(list((tmp_path / "runs.parquet").iterdir())))
         return {"hand_work_J": values["a.b"]}
 
-    with pytest.raises(KeyboardInterrupt, match="keeps 20 of 5000 runs"):
+    with pytest.raises(KeyboardInterrupt, match="contains 20 of 5000 runs"):
         run_study(study, tmp_path, work, {}, jobs=1)
     assert sizes == list(range(20))

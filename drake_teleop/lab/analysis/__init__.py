@@ -1,1 +1,1 @@
-"""Stability and transparency of a station, from closed forms and the linearised Diagram."""
+"""Stability and transparency of a station, from formulas and the linearised Drake Diagram."""

@@ -1,4 +1,4 @@
-"""Stability of a station with any passive hand and environment, or with those in given ranges.
+"""Stability criteria of a station for any passive hand and environment, or for given ranges.
 
 H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega [rad/s].
 """
@@ -17,13 +17,13 @@ from drake_teleop.lab.analysis.two_port import matrix_entries, two_port_matrix
 
 BooleanArray = NDArray[np.bool_]
 
-_RELATIVE_ROUNDING_ERROR = 1e-12  # relative to the terms that cancel in a criterion
+_RELATIVE_ROUNDING_TOLERANCE = 1e-12  # relative to the terms that cancel in a criterion
 
 
 def llewellyn_criterion(H: Complex) -> Array:
-    """Return 2 Re h11 Re h22 - Re h12 h21 - |h12 h21| (Llewellyn, Proc. IRE 40, 1952; T54).
+    """Return Llewellyn's criterion of hybrid matrices H; negative: not absolutely stable.
 
-    Negative: not absolutely stable.
+    2 Re h11 Re h22 - Re(h12 h21) - |h12 h21| (Llewellyn, Proc. IRE 40, 1952; T54).
     """
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
@@ -31,57 +31,57 @@ def llewellyn_criterion(H: Complex) -> Array:
 
 
 def llewellyn_parameter(H: Complex) -> Array:
-    """Return Llewellyn's parameter; absolute stability requires at least 1."""
+    """Return `llewellyn_criterion` / |h12 h21| + 1; absolute stability requires at least 1."""
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return 1.0 + llewellyn_criterion(H) / product
 
 
 def is_absolutely_stable(H: Complex) -> BooleanArray:
-    """Return, for each frequency, whether any passive hand and environment are stable."""
+    """Return whether the station is stable with every passive load, for each frequency of H."""
     h11, h12, h21, h22 = matrix_entries(H)
     return _is_criterion_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
 
 
 def _is_criterion_met(H: Complex, criterion: Array, criterion_size: Array) -> BooleanArray:
-    met = criterion >= -_RELATIVE_ROUNDING_ERROR * criterion_size
+    met = criterion >= -_RELATIVE_ROUNDING_TOLERANCE * criterion_size
     for port in (H[..., 0, 0], H[..., 1, 1]):
-        met &= port.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(port)
+        met &= port.real >= -_RELATIVE_ROUNDING_TOLERANCE * np.abs(port)
     return met
 
 
 def required_damping(H: Complex) -> Array:
-    """Return the lacking device damping [N s/m] for absolute stability; negative: a reserve.
+    """Return the device damping [N s/m] to add for absolute stability, for each frequency of H.
 
-    inf: no damping makes the station absolutely stable.
+    Negative: surplus damping. inf: no damping is sufficient.
     """
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
-    loss = np.where(loss <= _RELATIVE_ROUNDING_ERROR * np.abs(product), 0.0, loss)
+    loss = np.where(loss <= _RELATIVE_ROUNDING_TOLERANCE * np.abs(product), 0.0, loss)
     with np.errstate(divide="ignore", invalid="ignore"):
         through = np.where(loss > 0, loss / (2 * h22.real), 0.0)
     return np.where(h22.real < 0, np.inf, through) - h11.real
 
 
 def raisbeck_criterion(H: Complex) -> Array:
-    """Return 4 Re h11 Re h22 - |h12 + h21*|^2 (Raisbeck, J. Appl. Phys. 25, 1954; T55).
+    """Return Raisbeck's criterion of hybrid matrices H; negative: not passive.
 
-    Negative: not passive.
+    4 Re h11 Re h22 - |h12 + h21*|^2 (Raisbeck, J. Appl. Phys. 25, 1954; T55).
     """
     h11, h12, h21, h22 = matrix_entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
 
 def is_passive(H: Complex) -> BooleanArray:
-    """Return, for each frequency of H, whether the station absorbs power for every input."""
+    """Return whether the station is passive (absorbs power), for each frequency of H."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return _is_criterion_met(H, raisbeck_criterion(H), size)
 
 
 def scattering_norm(S: Complex) -> Array:
-    """Return the largest singular value of a scattering matrix; passive if at most 1."""
+    """Return the largest singular value of each scattering matrix S; passive if at most 1."""
     return _largest_singular_value(*matrix_entries(S))
 
 
@@ -90,7 +90,8 @@ def structured_singular_value(
 ) -> Array:
     """Return the structured singular value mu of the scattering matrix S (T56).
 
-    The largest reflection factors are 1 for any passive load; then mu <= 1 means absolutely stable.
+    The loads' wave reflection factors are bounded. With bounds of 1 (any passive load), mu <= 1
+    means absolutely stable.
     """
     s11, s12, s21, s22 = matrix_entries(S)
     r1, r2 = np.asarray(max_hand_reflection), np.asarray(max_environment_reflection)
@@ -116,7 +117,7 @@ def _squared_abs(z: Complex) -> Array:
 
 @dataclass(frozen=True)
 class ImpedanceRange:
-    """Range of hand or environment impedances m s + b + k / s; fields are (smallest, largest)."""
+    """Range of hand or environment impedances m s + b + k / s; each field: (smallest, largest)."""
 
     mass: tuple[float, float]  #: kg
     damping: tuple[float, float]  #: N s/m
@@ -126,14 +127,14 @@ class ImpedanceRange:
         for name in ("mass", "damping", "stiffness"):
             low, high = getattr(self, name)
             if not -np.inf < low <= high < np.inf:
-                what = f"{low} to {high} is no range (both ends must be finite)"
-                remedy = "give (smallest, largest)"
+                what = f"{low} to {high} is no range (finite, smallest first)"
+                remedy = "give (smallest, largest), which may be equal"
                 raise DrakeTeleopError(what, where=f"ImpedanceRange.{name}", remedy=remedy)
 
     def corners(self, omega: Array) -> Complex:
-        """Return the corners (..., 4) of the impedances at `omega` [rad/s] in the complex plane.
+        """Return the corners (..., 4) of the rectangle of impedances [N s/m] at `omega` [rad/s].
 
-        Unit N s/m; counter-clockwise from the lower left.
+        In the complex plane, counter-clockwise from the lower left.
         """
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
@@ -156,8 +157,8 @@ def impedance_range_of_grips() -> ImpedanceRange:
 def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     """Return, for each omega, the softest wall [N/m] that oscillates with a hand in range (T57).
 
-    0: already in free motion. If all values on a dense grid are infinite, all hands are stable or
-    all are unstable.
+    0: oscillates in free motion; inf: with no wall. If a dense grid contains only inf, all hands
+    are stable or all are unstable.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
@@ -179,16 +180,23 @@ def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
 def singular_value_in_ranges(
     H: Complex, omega: Array, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Array:
-    """Return mu; below 1, no hand and environment in the ranges can oscillate at omega [rad/s]."""
+    """Return the structured singular value mu at `omega` [rad/s] for ranges of both loads.
+
+    Below 1: no hand and environment in these ranges oscillate at `omega`.
+    """
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     reduction = 1 / (1 + h22 * e)
-    felt = z + h11 - h12 * h21 * e * reduction
-    through = h12 * h21 * reduction**2 / felt
+    displayed = z + h11 - h12 * h21 * e * reduction
+    through = h12 * h21 * reduction**2 / displayed
     # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
     # with this diagonal and this product of the other two.
-    first, second, product = r1 / felt, r2 * (h22 * reduction - through), -r1 * r2 * through / felt
+    first, second, product = (
+        r1 / displayed,
+        r2 * (h22 * reduction - through),
+        -r1 * r2 * through / displayed,
+    )
     mu = structured_singular_value(two_port_matrix(first, product, 1.0, second))
     return np.min(mu, axis=(-2, -1))
 

@@ -31,12 +31,13 @@ from drake_teleop.station.slave.plant import NominalSlave
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 #: N/m, walls of the table of margins, in addition to the scenario's own.
 WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
-COMPARISON_BAND_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
+MAX_COMPARED_OMEGA_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
+#: Frequencies of the analysis [rad/s].
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
 _MAX_FITTED_OMEGA_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
 _POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
-_MEASUREMENT_MOTION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
+_MEASURING_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def analyze_command(
@@ -66,7 +67,7 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | StartStage = True
 ) -> tuple[dict[str, Any], report.ReportCurves]:
-    """Analyse a scenario without its passivity method; return summary and curves of the report."""
+    """Return summary and report curves of a scenario, analysed without its passivity method."""
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze_in_stages(scenario, direction, stage)
 
@@ -145,11 +146,10 @@ def _analyze_in_stages(
     return summary, report.ReportCurves(contact, OMEGA, H, nyquist, maps)
 
 
-def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
-    """Return the source of the analysed wall stiffness as text."""
+def describe_wall_source(scenario: Scenario, is_wall_known: bool) -> str:
     if scenario.first_sheet_spring is not None:
         return "the leaf"
-    if is_known:
+    if is_wall_known:
         return "the wall, in series with the tool"
     parts = () if scenario.surroundings is None else scenario.surroundings.parts
     names = " and ".join(type(part).__name__.lower() for part in parts)
@@ -163,7 +163,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 
 def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in B, that commands the tip 5 mm into the leaf."""
+    """Return the master's displacement [m], in its base B, for a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -182,9 +182,9 @@ def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
 def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the model with all loops closed, except the loop of the hand along `along`.
+    """Return the model with all loops closed, except the hand's loop in the task direction.
 
-    If `along` is parallel to no axis of B, the hand's loop remains open in all directions.
+    If that direction is parallel to no axis of the master's base B, the hand's loop remains open.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
@@ -204,9 +204,9 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def summarise_diagram_stability(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability, decay rate and frequency of linearised Diagram and one-axis model.
+    """Return stability and slowest mode of the linearised Diagram and of the one-axis model.
 
-    Decay and frequency are those of the largest multiplier.
+    The slowest mode is that of the largest multiplier.
     """
     loop = cut_loop.cut_loop(axis, sampling)
     stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
@@ -232,26 +232,25 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
 
 
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest deviations of H from the one-axis models up to 30 Hz.
+    """Return the largest deviation of each entry of H from the one-axis models up to 30 Hz.
 
-    They are relative to the largest magnitude of each entry. `H` (N, 2, 2) is the linearised
-    Diagram's at `OMEGA`, with the hand's mass.
+    The deviations are relative to the entry's largest magnitude. H includes the hand's mass.
     """
-    compared = OMEGA <= COMPARISON_BAND_RAD_S
+    compared = OMEGA <= MAX_COMPARED_OMEGA_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
-    def greatest_deviations(other: Complex) -> dict[str, float]:
+    def largest_deviations_from(other: Complex) -> dict[str, float]:
         found = np.abs(H[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     closed_form = two_port.hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])
     sampled = sampled_two_port(with_hand_mass, sampling, OMEGA[compared])
     models = {"closed_form": closed_form, "sampled": sampled}
-    return {name: greatest_deviations(model) for name, model in models.items()}
+    return {name: largest_deviations_from(model) for name, model in models.items()}
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Return stability margins for each grip and wall; `own_wall`: another stiffness [N/m]."""
+    """Return stability margins for each grip and standard wall, and for `own_wall` [N/m]."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     walls = sorted({*WALL_STIFFNESSES_N_M, own_wall})
@@ -277,7 +276,6 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return stability criteria for any passive hand and environment."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled, S = two_port.power_scaled_matrices(H, axis)
@@ -292,7 +290,7 @@ def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
 
 
 def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the stiffest stable wall [N/m]: for any hand between light and firm, and per grip."""
+    """Return the stiffest stable wall [N/m] for all hands from light to firm, and for each grip."""
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
@@ -311,18 +309,17 @@ def _find_stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str, Any]:
-    """Return displayed and ideal impedances, and the tracking bandwidth."""
     fitted = OMEGA <= _MAX_FITTED_OMEGA_RAD_S
     figures: dict[str, Any] = {}
     for name, one in (("free", axis), ("wall", contact)):
         environment = environment_impedance(one, S_AT_OMEGA)
-        felt = two_port.transmitted_impedance(H, environment)
+        displayed = two_port.transmitted_impedance(H, environment)
         ideal = two_port.ideal_impedance(axis, S_AT_OMEGA, environment)
-        noticed = two_port.is_difference_noticed(felt, ideal)
+        noticed = two_port.is_difference_noticed(displayed, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
             which: two_port.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
-            for which, impedance in (("felt", felt), ("ideal", ideal))
+            for which, impedance in (("felt", displayed), ("ideal", ideal))
         }
         figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
     tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
@@ -361,26 +358,26 @@ def virtual_wall_limits(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measure_free_impedance(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Return the impedance displayed in free motion, from a simulation without Coulomb friction.
+    """Return the displayed impedance in free motion, simulated without Coulomb friction.
 
-    The errors are those of the linear model `system`.
+    The returned errors are relative to the linear model `system`.
     """
     frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
     smooth = replace(scenario.without_environment(), master=frictionless, slave__friction=[])
     estimate = true_load(scenario)
     if not scenario.wrist_sensor.ideal:
         estimate[:6] = scenario.wrist_sensor.offset
-    found = measure_frequency_response(smooth, along, _MEASUREMENT_MOTION, load_estimate=estimate)
+    found = measure_frequency_response(smooth, along, _MEASURING_MULTI_SINE, load_estimate=estimate)
     # Held force: its component at the frequency itself, as in the two-port.
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
     # The hand's mass moves with the stylus and belongs to the hand.
-    felt = held - 1j * found.omega * along.axis.hand_mass
+    displayed = held - 1j * found.omega * along.axis.hand_mass
     ratio = held / two_port_along(system, found.omega, along.hand, along.tool)[:, 0, 0]
     return {
         "frequency_Hz": found.omega / (2 * np.pi),
-        "felt_re": felt.real,
-        "felt_im": felt.imag,
+        "felt_re": displayed.real,
+        "felt_im": displayed.imag,
         "coherence": found.coherence("hand_velocity", "hand_force"),
         "greatest_error": np.abs(np.abs(ratio) - 1).max(),
         "greatest_error_deg": np.abs(np.angle(ratio, deg=True)).max(),

@@ -1,7 +1,7 @@
 """Feedback loop of the sampled one-axis model, cut at the displayed force (T60).
 
-The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are eigenvalues of
-the map over a period.
+The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are the eigenvalues of
+the model over one hand period.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis import period_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 
-# Frequencies of the search, as angles of z: five decades up to half the hand's rate.
+# Frequencies of the search as angles of z: five decades up to half the hand's rate.
 _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
-_ANGLE_OFFSETS_NEAR_POLES = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
+# More angles near a pole, as multiples of its distance from the unit circle.
+_POLE_ANGLE_OFFSET_FACTORS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_GAIN_CROSSINGS = 32
-_DISTANCE_OF_MULTIPLIER_FROM_ONE = 1e-9  # distance from 1 at which a multiplier counts as 1
+_UNIT_CIRCLE_TOLERANCE = 1e-9  # distance up to which a multiplier counts as on the circle
 
 
 @dataclass(frozen=True)
 class CutLoop:
-    """Transfer function L(z) of the loop cut at the displayed force, without the channel."""
+    """Transfer function L(z) of the one-axis loop, cut at the displayed force, without delay."""
 
     open_multipliers: Complex  #: (..., n) multipliers of the cut loop
     closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
@@ -41,10 +42,10 @@ class CutLoop:
     def from_multipliers(
         cls, open_multipliers: Complex, closed_multipliers: Complex, period_s: ArrayLike
     ) -> CutLoop:
-        """Return the loop with these multipliers (..., n) and the crossings of |L| = 1."""
+        """Return the loop with these multipliers (..., n); find the crossings of |L| = 1."""
         shape, n = open_multipliers.shape[:-1], open_multipliers.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
-        _gain_crossings_into(
+        _find_gain_crossings_into(
             open_multipliers.reshape(-1, n),
             closed_multipliers.reshape(-1, n),
             _SEARCH_ANGLES_RAD,
@@ -54,7 +55,6 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
-    """Return the loop without delay, cut at the displayed force."""
     M = period_map.period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
@@ -65,7 +65,7 @@ def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 0.0) -> Complex:
-    """Return the response L (N, ...) with delay at `omega` (N,) [rad/s]; stability limit: 1."""
+    """Return the loop response L (N, ...) at `omega` (N,) [rad/s]; L = 1 is the stability limit."""
     dimensions = max(loop.period_s.ndim, np.ndim(one_way_delay_s))
     w = np.atleast_1d(np.asarray(omega, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period_s)[..., None]
@@ -75,7 +75,7 @@ def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 
 
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
-    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf.
+    """Return gain margin (a factor) and phase margin [rad] of a stable loop; inf: unlimited.
 
     `response` (N,) is from `loop_response`, at increasing frequencies.
     """
@@ -83,11 +83,11 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
     crossings = _zero_crossing_fractions(log_gain)
-    lag = np.mod(_interpolate_in_steps(np.unwrap(angle), crossings), 2 * np.pi)
+    lag = np.mod(_interpolate_at_fractions(np.unwrap(angle), crossings), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
     fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
-    factor = np.exp(-_interpolate_in_steps(log_gain, fraction))
+    factor = np.exp(-_interpolate_at_fractions(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
@@ -97,23 +97,23 @@ def _zero_crossing_fractions(value: Array) -> Array:
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _interpolate_in_steps(value: Array, fraction: Array) -> Array:
+def _interpolate_at_fractions(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
 def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDArray[np.int64]:
-    """Return the number of multipliers outside the unit circle of the loop closed with delay."""
+    """Return the number of unstable multipliers (magnitude above 1) of the closed loop."""
     D = (2 * np.asarray(one_way_delay_s) / loop.period_s)[..., None]
     angles = loop.gain_crossing_angles
     turns = (loop.gain_crossing_phases - D * angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
     around = np.where(angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
-    outside = (np.abs(loop.open_multipliers) > 1 + _DISTANCE_OF_MULTIPLIER_FROM_ONE).sum(axis=-1)
+    outside = (np.abs(loop.open_multipliers) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
     return outside - (loop.gain_crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
-    """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
+    """Return the shortest round-trip delay [s] that makes the loop unstable; inf: none does."""
     angles = loop.gain_crossing_angles
     inside = (angles > 0) & (angles < np.pi) & (loop.gain_crossing_signs != 0)
     steps = np.mod(loop.gain_crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
@@ -131,18 +131,18 @@ def _response_at(closed, opened, angle, radius):
 
 
 @njit(cache=True)
-def _gain_crossings_into(opened, closed, angles, found):
+def _find_gain_crossings_into(opened, closed, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, count = opened[n], closed[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _response_at(zeros, poles, 0.0, 1.0 + _DISTANCE_OF_MULTIPLIER_FROM_ONE)
+        value = _response_at(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
         more = _add_pole_angles(angles, poles)
-        at, values = _angles_with_gain_extremes_and_responses(more, poles, zeros)
+        at, values = _add_gain_extremes_and_get_responses(more, poles, zeros)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
@@ -168,13 +168,13 @@ def _gain_crossings_into(opened, closed, angles, found):
 @njit(cache=True)
 def _add_pole_angles(angles, poles):
     pole_angles, offsets = np.abs(np.angle(poles)), np.abs(1.0 - np.abs(poles))
-    more = (pole_angles + _ANGLE_OFFSETS_NEAR_POLES.reshape(-1, 1) * offsets).ravel()
+    more = (pole_angles + _POLE_ANGLE_OFFSET_FACTORS.reshape(-1, 1) * offsets).ravel()
     inside = (more > angles[0]) & (more < math.pi)
     return np.sort(np.concatenate((angles, more[inside])))
 
 
 @njit(cache=True)
-def _angles_with_gain_extremes_and_responses(angles, poles, zeros):
+def _add_gain_extremes_and_get_responses(angles, poles, zeros):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
         values[i] = _response_at(zeros, poles, angles[i], 1.0)

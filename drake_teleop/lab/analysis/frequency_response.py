@@ -36,13 +36,16 @@ class MultiSine:
     seed: int = 0  #: seed of the random phases
 
     def odd_multiples_of_base_rate(self) -> NDArray[np.int64]:
-        """Return the frequencies of the motion as odd multiples (n,) of 1 / period."""
+        """Return odd integers (n,); the motion's frequencies are these multiples of 1 / period."""
         spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
     def sines_along(self, direction: Array, start: float) -> list[Sine]:
-        """Return one `Sine` per frequency, along `direction` (6,) in base B, from `start` [s]."""
+        """Return one `Sine` per frequency along `direction` (6,) in the master's base B.
+
+        `direction`: translation, rotation. The sines begin at `start` [s].
+        """
         frequencies = self.odd_multiples_of_base_rate() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         phases = self._phases_with_lowest_peak()
@@ -85,24 +88,24 @@ class StationResponse:
         return self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
 
     def coherence(self, output: str, input_: str) -> Array:
-        """Return the fraction (n,) of the output's power that is linear in the input."""
+        """Return the coherence (n,): fraction of the output's power that is linear in the input."""
         y, x = self.spectra[output], self.spectra[input_]
         cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
         power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
         return cross / power
 
     def apparent_mass(self) -> float:
-        """Return the displayed tool mass at the slave's scale [kg], for delays far below 0.1 s."""
+        """Return the displayed tool mass over the force scale [kg], for delays far below 0.1 s."""
         low = self.omega <= 2 * np.pi * 10.0
         if (count := np.count_nonzero(low)) < 3:
             what = f"{count} frequencies are below 10 Hz (the fit of a mass needs 3)"
-            remedy = "lower `lowest` or lengthen `period`"
+            remedy = "lower `lowest` or lengthen `period` of the MultiSine"
             raise DrakeTeleopError(what, where="MultiSine", remedy=remedy)
         omega = self.omega[low]
-        felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
+        displayed = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
         # The force noise is about equal at all lines, so that the weights are the accelerations.
         acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
-        mass = (felt / (1j * omega)).real
+        mass = (displayed / (1j * omega)).real
         return float(np.polyfit((omega / omega[-1]) ** 2, mass, 1, w=acceleration)[1])
 
 

@@ -1,4 +1,4 @@
-"""Linear model of a station over one period, with delayed feedback loops."""
+"""Linear model of a station over one hand period, with delayed feedback loops."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Linearization:
     def close_loop(
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
-        """Return the model with feedback of outputs to inputs, u += z^-periods y."""
+        """Return the model with the feedback u += z^-periods y of outputs y to inputs u."""
         rows = self._component_indices(outputs, self.outputs)
         columns = self._component_indices(inputs, self.inputs)
         if periods > 0:
@@ -50,7 +50,7 @@ class Linearization:
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return the response (n, outputs, inputs) at omega (n,) [rad/s], with closed loops."""
+        """Return the response (n, outputs, inputs) at `omega` (n,) [rad/s], with closed loops."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
         # Solve for each frequency: a chain of delays has no basis of eigenvectors.
@@ -65,20 +65,20 @@ class Linearization:
 
     @property
     def multipliers(self) -> Complex:
-        """Eigenvalues over one period, largest first; stable if all magnitudes are below 1.
+        """Eigenvalues over one period, by falling magnitude; stable if all magnitudes are below 1.
 
-        Above 800 states only those near the unit circle, up to 100 Hz, are returned.
+        With more than 800 states only those near the unit circle, up to 100 Hz.
         """
         A, size = self._state_matrix_with_delays(), self.num_states
         if size <= _MAX_STATES_FOR_DENSE_EIGENVALUES:
             values = np.linalg.eigvals(A.toarray())
         elif size > MAX_STATES:
-            what = f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})"
+            what = f"this delay requires {size} states (maximum {MAX_STATES})"
             remedy = "shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)"
             raise DrakeTeleopError(what, where="channel.delay", remedy=remedy)
         else:
-            highest = 2 * np.pi * 100.0 * self.dt
-            values = _find_eigenvalues_near_circle(A.astype(complex).tocsc(), highest)
+            max_angle_rad = 2 * np.pi * 100.0 * self.dt
+            values = _find_eigenvalues_near_unit_circle(A.astype(complex).tocsc(), max_angle_rad)
         return values[np.argsort(-np.abs(values))].astype(complex)
 
     @property
@@ -143,12 +143,12 @@ def _bracketed_port_name(name: str) -> str:
     return f"{port}[{part}]" if dot else name
 
 
-def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
+def _find_eigenvalues_near_unit_circle(A: Any, max_angle_rad: float) -> Complex:
     from scipy.sparse.linalg import eigs
 
     start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
     found, angle = np.zeros(0, dtype=complex), 0.0
-    while angle < highest:
+    while angle < max_angle_rad:
         # Beside the circle, so that no shift is an eigenvalue.
         shift = 1.0005 * np.exp(1j * angle)
         values = eigs(A, _EIGENVALUES_PER_SHIFT, sigma=shift, v0=start, return_eigenvectors=False)

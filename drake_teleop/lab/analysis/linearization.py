@@ -46,13 +46,13 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 _INPUT_PORTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
 _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
 
-# Displacements for differences: errors grow with their square, and with rounding over them.
+# Difference steps: truncation error grows with their square, rounding error with their inverse.
 _ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 = 20.0  # of a joint: within the motors' torque
 _JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
-_MAX_MOTION_PER_PERIOD_AT_REST = 1e-6  # relative to the displacements
-_MAX_EQUILIBRIUM_NEWTON_STEPS = 8  # of Newton's method
+_MAX_CHANGE_TO_STEP_RATIO_AT_REST = 1e-6  # change in one period over difference step
+_MAX_EQUILIBRIUM_NEWTON_STEPS = 8
 _TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = 0.3, 0.1  # motion, then rest
 
 
@@ -62,10 +62,10 @@ def linearize(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """Return the scenario's Diagram, linearised at rest with its loops cut.
+    """Return the linear model of the scenario's Diagram at rest, with all its loops cut.
 
     Intended motion, network and passivity method have no effect. `displacement` of the master [m]
-    is in its base frame B.
+    from its start is in its base frame B.
     """
     check_scenario(scenario)
     if load_estimate is not None:
@@ -89,7 +89,7 @@ def linearize_station(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """Return the linearised Diagram with all loops closed over the scenario's constant delays."""
+    """Return the linear model of the Diagram at rest, with loops closed over constant delays."""
     check_scenario(scenario)
     if scenario.passivity.method != "none":
         what = f"'{scenario.passivity.method}' cannot be linearised"
@@ -106,7 +106,7 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 
 def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
-    """Return the network delays of pose and wrench in whole hand periods; 0: no network."""
+    """Return the delays of pose and wrench in the network, in hand periods; 0: no network."""
     if scenario.has_no_network_or_passivity:
         return 0, 0
     rate, lines = scenario.rates.hand_hz, scenario.channel.networks_of_directions()
@@ -115,10 +115,10 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
 
 
 def two_port_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
-    """Return the hybrid matrix H (n, 2, 2) along one direction at omega (n,) [rad/s], not zero.
+    """Return the hybrid matrix H (n, 2, 2) along one direction at nonzero `omega` (n,) [rad/s].
 
-    In `system` the hand's loop is cut in this direction. H includes the hand's mass. `hand` and
-    `tool` are those of `TaskDirection`.
+    `system` has the hand's loop open in this direction. H includes the hand's mass. `hand` and
+    `tool` (6,) are the vectors of `TaskDirection`.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
@@ -151,7 +151,7 @@ class _StateGroup:
     system_name: str
     discrete_group: int | None
     indices: slice | NDArray[np.intp]
-    difference_steps: Array  # displacements for the differences
+    difference_steps: Array
 
 
 class _PeriodSimulator:
@@ -159,7 +159,7 @@ class _PeriodSimulator:
         _check_rate_multiples(scenario)
         hand_hz = scenario.rates.hand_hz
         if own_period := scenario.master.sampling_period_if_slower_than_hand(hand_hz):
-            what = f"is above the device's own rate of {1 / own_period:g} Hz (must be equal)"
+            what = f"{hand_hz:g} Hz is above the device's own {1 / own_period:g} Hz (must be equal)"
             remedy = f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0"
             raise DrakeTeleopError(what, where="rates.hand_hz", remedy=remedy)
         self.dt = 1 / hand_hz
@@ -338,7 +338,7 @@ class _PeriodSimulator:
             free = slave & _states_affecting_outputs(A, C)
             self._set_state(x)
             moved = self._run_one_period() - x
-            if (np.abs(moved) < _MAX_MOTION_PER_PERIOD_AT_REST * self._sizes)[free].all():
+            if (np.abs(moved) < _MAX_CHANGE_TO_STEP_RATIO_AT_REST * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
@@ -354,7 +354,7 @@ class _PeriodSimulator:
             return np.concatenate([outputs, self._run_one_period()])
 
         self._apply_input_changes(np.zeros(24))
-        C, A = np.split(_central_differences(outputs_and_end_state, self._steps), [30])
+        C, A = np.split(_central_difference_jacobian(outputs_and_end_state, self._steps), [30])
         return A, C
 
     def differentiate_by_input(self, x: Array) -> Array:
@@ -365,11 +365,10 @@ class _PeriodSimulator:
 
         pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
         steps = np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
-        return _central_differences(end_state, steps)
+        return _central_difference_jacobian(end_state, steps)
 
 
-def _central_differences(function: Callable[[Array], Array], steps: Array) -> Array:
-    """Return the Jacobian of a function at 0, by displacements of these sizes."""
+def _central_difference_jacobian(function: Callable[[Array], Array], steps: Array) -> Array:
     columns = [function(step) - function(-step) for step in np.diag(steps)]
     return np.stack(columns, axis=1) / (2 * steps)
 
@@ -409,7 +408,7 @@ def _check_linear_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
         what = f"this environment cannot be linearised: {beyond}"
-        remedy = "use only a leaf, a slot, walls and boxes, or none"
+        remedy = "use only a sheet spring, a slot, walls and boxes, or no environment"
         raise DrakeTeleopError(what, where="environment", remedy=remedy)
 
 

@@ -1,4 +1,4 @@
-"""Maps of stability and force distortion of the sampled loop over two parameters."""
+"""Maps of stability and force distortion of the sampled one-axis loop over two parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DISTORTION_FREQUENCIES_RAD_S = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Stability and force distortion at the hand, over two parameters."""
+    """Stability and force distortion at the hand on a grid of two parameters."""
 
     x_name: str
     y_name: str
@@ -34,7 +34,7 @@ class StabilityMap:
     y: Array  #: (ny,) values of the second parameter
     num_unstable_multipliers: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
     distortion: Array  #: (ny, nx) `force_distortion`, valid only where the loop is stable
-    boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
+    boundary: Array  #: (n, 2) points (x, y) of the stability limit, to 1/1000 of the grid's step
 
     @property
     def stable(self) -> NDArray[np.bool_]:
@@ -44,18 +44,18 @@ class StabilityMap:
 def stability_map(
     axis: OneAxis, sampling: Sampling, x_name: str, x: ArrayLike, y_name: str, y: ArrayLike
 ) -> StabilityMap:
-    """Return stability and distortion over increasing values of two parameters.
+    """Return the map over increasing values of the parameters `x_name` and `y_name`.
 
-    Parameters: fields of `OneAxis`, "low_pass_hz", or "rate" (all rates in proportion).
+    Names: fields of `OneAxis`, "low_pass_hz", or "rate" (of the hand [Hz], others in proportion).
     """
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
     def evaluate(x: Array, y: Array) -> tuple[OneAxis, CutLoop, NDArray[np.int64]]:
-        moved, loop = _axis_and_loop_with_values(axis, sampling, {x_name: x, y_name: y})
-        return moved, loop, cut_loop.count_unstable_multipliers(loop, moved.delay)
+        changed_axis, loop = _axis_and_loop_with_values(axis, sampling, {x_name: x, y_name: y})
+        return changed_axis, loop, cut_loop.count_unstable_multipliers(loop, changed_axis.delay)
 
     points = np.stack(np.meshgrid(xs, ys), axis=-1)
-    moved, loop, unstable = evaluate(xs, ys[:, None])
+    changed_axis, loop, unstable = evaluate(xs, ys[:, None])
     unstable = np.broadcast_to(unstable, points.shape[:2])
     stable = unstable == 0
     # Neighbours in a row, then neighbours in a column.
@@ -67,14 +67,14 @@ def stability_map(
         middle = 0.5 * (low + high)
         as_low = ((evaluate(*middle.T)[2] == 0) == stable_at_low)[:, None]
         low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)
-    felt = np.broadcast_to(force_distortion(moved, loop), stable.shape)
-    return StabilityMap(x_name, y_name, xs, ys, unstable, felt, 0.5 * (low + high))
+    distortion = np.broadcast_to(force_distortion(changed_axis, loop), stable.shape)
+    return StabilityMap(x_name, y_name, xs, ys, unstable, distortion, 0.5 * (low + high))
 
 
 def force_distortion(
     axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_FREQUENCIES_RAD_S
 ) -> Array:
-    """Return the largest relative error of the operator's force to an ideal station's.
+    """Return the largest relative error of the operator's force, compared with an ideal station.
 
     The maximum is over `frequency` (N,) [rad/s].
     """
@@ -94,8 +94,9 @@ def _check_parameter_values(name: str, values: ArrayLike) -> Array:
         remedy = f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}"
         raise DrakeTeleopError(what, where="stability_map", remedy=remedy)
     array = np.asarray(values, dtype=float)
-    if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
-        what = f"the values (shape {array.shape}) do not increase"
+    finite = array.ndim == 1 and array.size > 0 and np.isfinite(array).all()
+    if not finite or (np.diff(array) <= 0).any():
+        what = f"the values (shape {array.shape}) are no list of finite numbers, or do not increase"
         remedy = "give at least one number, each above the one before"
         raise DrakeTeleopError(what, where=f"stability_map:{name}", remedy=remedy)
     return array

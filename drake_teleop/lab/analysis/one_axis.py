@@ -22,7 +22,7 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, kw_only=True)
 class AxisParameters:
-    """Parameters of all models of one direction; default: the paper's station with medium grip.
+    """Parameters common to all models of one direction; default: paper's station, medium grip.
 
     sigma and gamma are the displayed shares of the tool's inertial force and of the contact force.
     """
@@ -52,9 +52,9 @@ class AxisParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(AxisParameters):
-    """Parameters with damping of device and wall, mass error, motion scale and delay.
+    """One-axis parameters with damping of device and wall, mass error, motion scale and delay.
 
-    Arrays broadcast.
+    Fields may be arrays, which broadcast.
     """
 
     device_damping: float = 0.5  #: N s/m
@@ -65,7 +65,7 @@ class OneAxis(AxisParameters):
 
     @property
     def displayed_tool_mass(self) -> float:
-        """Tool mass [kg] displayed after elimination with the estimated mass."""
+        """Tool mass [kg] in the displayed force after compensation of the estimated mass."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 
 
@@ -82,7 +82,7 @@ def environment_impedance(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_response(axis: OneAxis, s: Complex) -> Complex:
-    """Return slave position over command, C / (Z_s + C)."""
+    """Return the slave's position over its commanded position, C / (Z_s + C)."""
     if axis.ideal_servo:
         return np.ones_like(s)
     gain = axis.velocity_gain * axis.position_gain
@@ -90,7 +90,7 @@ def servo_response(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_admittance(axis: OneAxis, s: Complex) -> Complex:
-    """Return slave velocity over contact force, 1 / (Z_s + C) [m/(N s)]."""
+    """Return the slave's velocity over the contact force, 1 / (Z_s + C) [m/(N s)]."""
     if axis.ideal_servo:
         return np.zeros_like(s)
     kv, kp = axis.velocity_gain, axis.position_gain

@@ -29,7 +29,7 @@ _MAX_RATE_RATIO = 1000  # over the hand's rate
 
 @dataclass(frozen=True)
 class Sampling:
-    """Sample rates of the station; defaults: the shipped scenarios with the ideal sensor."""
+    """Sample rates of the station; defaults: shipped scenarios with the ideal sensor."""
 
     hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0
@@ -38,15 +38,15 @@ class Sampling:
 
 
 def one_way_delay_in_hand_periods(axis: OneAxis, sampling: Sampling) -> int:
-    """Return the one-way delay in whole hand periods, at least 1 for a positive delay."""
+    """Return the one-way delay in hand periods, rounded; at least 1 for a positive delay."""
     steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
     return max(steps, 1) if axis.delay > 0 else 0
 
 
 def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the model's matrix over one hand period, with the loop cut at the received force.
+    """Return the one-axis model's transition matrix over one hand period, with its loop cut.
 
-    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
+    The matrix (..., n + 3, n + 3) maps n states, two held forces and the received force.
     """
     if axis.ideal_servo:
         what = "the sampled model does not include an ideal servo"
@@ -83,7 +83,7 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
 
 
 def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
-    """Return the model with its loop cut at the received force, without delay."""
+    """Return the linear one-axis model, cut at the received force, without delay."""
     M = period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     return Linearization(
@@ -99,7 +99,7 @@ def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
 
 
 def closed_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
-    """Return the model with its loop closed over the round-trip delay."""
+    """Return the linear one-axis model with its loop closed over the round-trip delay."""
     periods = 2 * one_way_delay_in_hand_periods(axis, sampling)
     cut = cut_axis_model(axis, sampling)
     return cut.close_loop(["displayed_force"], ["received_force"], periods)
@@ -117,13 +117,13 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     delay_factor = np.exp(-1j * w * model.dt * one_way_delay_in_hand_periods(axis, sampling))
     # Responses without delay to a force on the device, and to one of the environment.
     response = model.frequency_response(w)[:, :, :2]
-    (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
+    (v_m, _), (v_s, yielding), (displayed, displayed_e) = np.moveaxis(response, 0, 2)
     hold = -np.expm1(-1j * w * model.dt) / (1j * w * model.dt)
     return two_port_matrix(
-        hold * (1 + delay_factor**2 * felt) / v_m,
-        delay_factor * felt_e,
+        hold * (1 + delay_factor**2 * displayed) / v_m,
+        delay_factor * displayed_e,
         -delay_factor * v_s / v_m,
-        -give / hold,
+        -yielding / hold,
     )
 
 
@@ -134,8 +134,8 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     fits = (np.abs(ratios - count) <= 1e-9 * count) & (1 <= count <= _MAX_RATE_RATIO)
     if not fits.all():
         wrong = float(ratios[~fits].flat[0])
-        what = f"is {wrong:.10g} times hand_hz (must be one whole multiple)"
-        remedy = f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as often as the hand"
+        what = f"is {wrong:.10g} times hand_hz (must be one whole multiple for all values)"
+        remedy = f"choose hand_hz times a whole number from 1 to {_MAX_RATE_RATIO}"
         raise DrakeTeleopError(what, where=f"sampling.{name}", remedy=remedy)
     return count
 
@@ -172,13 +172,13 @@ def _servo_row(zeros: Array, axis: OneAxis) -> Array:
 
 
 def _sensor_rows(zeros: Array, axis: OneAxis, sections: Array) -> Array:
-    rows, felt_mass = zeros.copy(), axis.displayed_tool_mass
-    scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
+    rows, displayed_mass = zeros.copy(), axis.displayed_tool_mass
+    scale = axis.force_scale * (axis.gamma - displayed_mass / axis.slave_mass)
     value = rows[..., 0, :]
     value[..., SLAVE_X] = scale * axis.wall_stiffness
     value[..., SLAVE_V] = scale * axis.wall_damping
     value[..., _HELD_ENVIRONMENT_FORCE] = scale
-    value[..., SERVO_A] = axis.force_scale * felt_mass
+    value[..., SERVO_A] = axis.force_scale * displayed_mass
     for k in range(sections.shape[-2]):
         b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
         first, raw = 1 + 2 * k, value.copy()
@@ -202,7 +202,10 @@ def _slave_rows(zeros: Array, axis: OneAxis, time: Array) -> Array:
 def mass_spring_responses_to_unit_x_v_u(
     stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike
 ) -> Array:
-    """Return (x, x') after `time` of x'' = u - b x' - k x: columns of x = 1, x' = 1, and u = 1."""
+    """Return (x, x') after `time` [s] with x'' = u - b x' - k x, as an array (..., 2, 3).
+
+    Columns: responses to x = 1 or x' = 1 at the start, and to constant u = 1.
+    """
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t

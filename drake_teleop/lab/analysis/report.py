@@ -37,7 +37,7 @@ class ReportCurves:
     axis: OneAxis  #: in contact with the wall
     omega: Array  #: (n,) [rad/s]
     H: Complex  #: (n, 2, 2) two-port of the Diagram, without the hand's mass
-    nyquist: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
+    nyquist: dict[str, Complex]  #: grip -> (n,) response -L; stability limit: -1
     maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
 
 
@@ -61,7 +61,6 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
 
 
 def axis_parameter_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the parameters of the one-axis model as rows (name, value with unit)."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
     hand = f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m"
     loops = (f"{which} loop {axis[f'{which}_gain']:.4g} 1/s" for which in ("position", "velocity"))
@@ -76,15 +75,14 @@ def axis_parameter_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
-    """Return a row of the margin table as text; `delay` is one way [s]."""
+def margin_cells(row: Mapping[str, Any], one_way_delay_s: float) -> tuple[str, ...]:
     wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
     if not row["stable"]:
         return (row["grip"], wall, "no", "", "", "")
     trip = row["round_trip_s"]
     gain = "any" if row["gain"] is None else f"{row['gain']:.3g}"
     phase = "any" if row["phase_deg"] is None else f"{row['phase_deg']:.0f}°"
-    reserve = "any" if trip is None else f"{1e3 * (trip - 2 * delay):.1f}"
+    reserve = "any" if trip is None else f"{1e3 * (trip - 2 * one_way_delay_s):.1f}"
     return (row["grip"], wall, "yes", gain, phase, reserve)
 
 
@@ -97,9 +95,9 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
         figure = Picture(figsize=(9.0, 5.4))
         grid = figure.subplots(2, 2, sharex=True, sharey="row")
 
-        def draw(column: int, hertz: Array, felt: Complex, label: str, **style: Any) -> None:
-            grid[0, column].loglog(hertz, np.abs(felt), label=label, **style)
-            phase = np.degrees(np.unwrap(np.angle(felt)))
+        def draw(column: int, hertz: Array, displayed: Complex, label: str, **style: Any) -> None:
+            grid[0, column].loglog(hertz, np.abs(displayed), label=label, **style)
+            phase = np.degrees(np.unwrap(np.angle(displayed)))
             grid[1, column].semilogx(hertz, phase, **style)
 
         for column, (name, environment) in enumerate(environments.items()):
@@ -112,9 +110,9 @@ def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | 
             grid[0, column].set_title(name)
             grid[1, column].set_xlabel("frequency [Hz]")
         if measured is not None:
-            felt = np.array(measured["felt_re"]) + 1j * np.array(measured["felt_im"])
+            displayed = np.array(measured["felt_re"]) + 1j * np.array(measured["felt_im"])
             dots: dict[str, Any] = {"color": VERMILION, "linestyle": "", "marker": "o", "ms": 3.5}
-            draw(0, measured["frequency_Hz"], felt, "Diagram, simulated", **dots)
+            draw(0, measured["frequency_Hz"], displayed, "Diagram, simulated", **dots)
         grid[0, 0].set_ylabel("|Z| displayed [N s/m]")
         grid[1, 0].set_ylabel("phase [deg]")
         grid[0, 0].legend()
@@ -139,7 +137,6 @@ def draw_nyquist(curves: ReportCurves) -> Figure:
 
 
 def draw_absolute_stability(curves: ReportCurves) -> Figure:
-    """Draw Llewellyn's parameter, the scattering norm, and structured singular values mu."""
     hertz, stiffest = curves.omega / (2 * np.pi), curves.axis.wall_stiffness
     _, S = two_port.power_scaled_matrices(curves.H, curves.axis)
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, stiffest))
@@ -194,7 +191,6 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
 
 
 def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
-    """Draw the stability maps; the distortion is that of `grip`."""
     with plot_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))
@@ -248,7 +244,7 @@ def verdict_sentences(figures: dict[str, Any]) -> list[str]:
     worst = max(figures["two_port"]["sampled"].values())
     if worst > 0.1:
         sentences += [
-            f"Along {figures['direction']} it is not one axis: contact rotates hand and tool.",
+            f"Along {figures['direction']} the station is not one axis: contact rotates the tool.",
             f"Its two-port differs from one axis by up to {100 * worst:.2g} % below 30 Hz.",
             "Margins and maps assume one axis and are approximate here.",
         ]
@@ -259,22 +255,23 @@ def _stability_sentence(point: dict[str, Any], grip: str) -> str:
     decay, hertz = point["decay_1_per_s"], point["frequency_Hz"]
     if decay is None:
         stable = "stable" if point["stable"] else "unstable"
-        return f"In the state '{point['point']}' one axis of the station is {stable}."
-    state = f"In the state '{point['point']}', {grip} grip, it is"
+        return f"In the state '{point['point']}' the one-axis model of the station is {stable}."
+    state = f"In '{point['point']}', {grip} grip, the station is"
     motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
     if point["stable"]:
         return f"{state} stable: motion halves every {1e3 * np.log(2) / decay:.3g} ms, {motion}."
-    return f"{state} unstable: it doubles every {-1e3 * np.log(2) / decay:.3g} ms, {motion}."
+    return f"{state} unstable: motion doubles every {-1e3 * np.log(2) / decay:.3g} ms, {motion}."
 
 
-def _margin_sentences(row: dict[str, Any], delay: float) -> list[str]:
-    wall = f"a wall of {_stiffness_text(row['wall_N_per_m'])}"
+def _margin_sentences(row: dict[str, Any], one_way_delay_s: float) -> list[str]:
+    wall = f"wall of {_stiffness_text(row['wall_N_per_m'])}"
     if not row["stable"]:
-        return [f"At {wall} it is unstable with this grip."]
-    reserve = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
-    longest = "any round trip" if reserve is None else f"{1e3 * reserve:.3g} ms more round trip"
-    more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times its gain"
-    return [f"At {wall} it stays stable with {longest}, or with {more}."]
+        return [f"At a {wall} the station is unstable with this grip."]
+    trip, longest = row["round_trip_s"], "any round trip"
+    if trip is not None:
+        longest = f"{1e3 * (trip - 2 * one_way_delay_s):.3g} ms more round trip"
+    more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times the loop gain"
+    return [f"A {wall} is stable up to {longest}, or up to {more}."]
 
 
 def _wall_sentences(figures: dict[str, Any]) -> list[str]:
@@ -283,18 +280,18 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
     every = _stiffness_text(bounded["grips"])
     sentences = [
         f"The stiffest stable wall depends on the grip: {each}.",
-        f"For all hands between the lightest and the firmest grip it is {every}.",
+        f"For all hands between the lightest and the firmest grip this wall is {every}.",
         "These limits exclude Coulomb friction, which dissipates energy.",
     ]
     if absolute["absolutely_stable"]:
-        stable = "It is absolutely stable: no passive hand and environment make it oscillate."
+        stable = "The station is absolutely stable: no passive hand and wall make it oscillate."
         return [*sentences, stable]
     lacking = absolute["lacking_damping_Ns_per_m"]
     remedy = "No damping" if lacking is None else f"{lacking:.3g} N s/m more damping"
     return [
         *sentences,
-        "It is not absolutely stable: with some passive hand and environment it would oscillate.",
-        f"{remedy} of the device would prevent that.",
+        "The station is not absolutely stable: some passive hand and wall make it oscillate.",
+        f"{remedy} of the device would make it absolutely stable.",
         "Position-force stations with a servo are rarely absolutely stable.",
         "For realistic hands and walls, the limits above apply.",
     ]
@@ -302,14 +299,14 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
 
 def _transparency_sentences(figures: dict[str, Any]) -> list[str]:
     free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
-    felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
+    rendered, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
     sigma = f"σ = {figures['axis']['sigma']:g}"
     return [
         f"In free motion the displayed mass is {1e3 * free['felt']['mass']:.3g} g.",
-        f"The ideal for device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
-        f"At the wall the displayed stiffness is {felt:.3g} N/m; the ideal is {ideal:.3g} N/m.",
+        f"The ideal mass for this device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
+        f"At the wall the displayed stiffness is {rendered:.3g} N/m; the ideal is {ideal:.3g} N/m.",
         f"A human cannot distinguish it from the ideal up to {wall['unnoticed_to_Hz']:.2g} Hz.",
-        f"The slave follows up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
+        f"The slave tracks up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
     ]
 
 

@@ -19,7 +19,7 @@ _NUM_STIFFNESS_BISECTIONS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
-    """Return the largest stiffness [N/m] of a passive virtual wall; 0: none is passive (T62)."""
+    """Return the largest stiffness [N/m] of a passive virtual wall; 0: no wall is passive (T62)."""
     b = positive_array("device_damping", device_damping, *np.shape(device_damping))
     positive_array("period", period)
     return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
@@ -35,8 +35,7 @@ def stable_stiffness(
 ) -> Array:
     """Return the largest stiffness [N/m] of a stable virtual wall with `wall_damping` [N s/m].
 
-    0: none is stable. Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device
-    and hand together.
+    0: no wall is stable. Mass [kg] and damping [N s/m] are those of device and hand together.
     """
     device = mass, damping, hand_stiffness
     push = _sampled_device_responses_to_unit_x_v_f(*device, period)[..., 2]
@@ -59,7 +58,7 @@ def sampled_poles(
     wall_damping: ArrayLike,
     period: float,
 ) -> Complex:
-    """Return the eigenvalues (..., 3) of device, hand and wall over one period."""
+    """Return the eigenvalues (..., 3) of device, hand and virtual wall over one sampling period."""
     K, B = np.broadcast_arrays(wall_stiffness, wall_damping)
     responses = _sampled_device_responses_to_unit_x_v_f(mass, damping, hand_stiffness, period)
     # States: position, velocity, last sampled position

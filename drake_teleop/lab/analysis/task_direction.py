@@ -1,6 +1,6 @@
 """Parameters of the one-axis model along a task direction.
 
-One axis represents the station if a contact force causes no rotation, as along the tool.
+One axis represents the station if a contact force causes no rotation (along the tool).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, SlaveP
 
 @dataclass(frozen=True, eq=False)
 class TaskDirection:
-    """Direction of the task, and the one-axis parameters at a state of rest."""
+    """Task direction at a state of rest, with one-axis parameters and directions at both ends."""
 
     axis: OneAxis
     hand: Array  #: (6,) direction of the hand's force and velocity at E, in B
@@ -40,7 +40,7 @@ class TaskDirection:
 
 
 def OneAxisFromScenario(scenario: Scenario, direction: Sequence[float]) -> OneAxis:
-    """Return the one-axis parameters of a scenario along a direction (3,) in W."""
+    """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W."""
     return task_direction(scenario, direction).axis
 
 
@@ -51,18 +51,18 @@ def task_direction(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> TaskDirection:
-    """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
+    """Return a `TaskDirection` of a scenario for a direction (3,) of slave motion, in W.
 
-    `displacement` of the master [m] is in its base frame B. Without `load_estimate` (16,) the
-    tool mass has no error.
+    `displacement` of the master [m] from its start is in its base frame B. Without `load_estimate`
+    (16,) the tool mass has no error.
     """
     check_scenario(scenario)
     n_W = finite_array("direction", direction, 3)
     if not np.linalg.norm(n_W) > 0.0:
-        raise DrakeTeleopError("has length zero", where="direction", remedy="give a vector in W")
+        raise DrakeTeleopError("has length zero", where="direction", remedy="give another vector")
     sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
-        what = f"sets sigma {sigma:g} of gripper and {sigma_object:g} of object (must be equal)"
+        what = f"sets sigma {sigma:g} for gripper, {sigma_object:g} for object (must be equal)"
         raise DrakeTeleopError(what, where="force_scaling.eta", remedy="set eta: null")
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand

@@ -21,7 +21,6 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 
 
 def two_port_matrix(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
-    """Return matrices (..., 2, 2) of four entries that broadcast."""
     entries = np.broadcast_arrays(h11, h12, h21, h22)
     stacked = np.stack(entries, axis=-1).astype(complex, copy=False)
     return stacked.reshape(*stacked.shape[:-1], 2, 2)
@@ -36,7 +35,7 @@ def hybrid_matrix(
 ) -> Complex:
     """Return the hybrid matrix H (..., 2, 2) of the position-force station at s [rad/s] (T51).
 
-    `servo` replaces the axis' servo response and admittance.
+    `servo` = (response, admittance) replaces those of `axis`.
     """
     servo = servo or (one_axis.servo_response(axis, s), one_axis.servo_admittance(axis, s))
     response, slave_admittance = servo
@@ -67,7 +66,7 @@ def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0,
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return the reference impedances b [N s/m] of both ports for `scattering_matrix`."""
+    """Return both ports' reference impedances [N s/m]: the hand's damping, in each port's scale."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         name = "force_scale" if axis.force_scale == 0 else "position_scale"
@@ -77,29 +76,29 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
 
 
 def power_ratio(axis: OneAxis) -> float:
-    """Return hand power over slave power: force scale times gamma over motion scale."""
+    """Return the hand's power over the slave's: force scale times gamma over motion scale."""
     return axis.force_scale * axis.gamma / axis.position_scale
 
 
 def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
-    """Return H with the slave's power multiplied by `ratio` > 0."""
+    """Return H with the power at the slave's port multiplied by `ratio` > 0."""
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
-        what = f"{np.min(ratio):g}, slave power over master power, is not positive"
+        what = f"{np.min(ratio):g}, a factor of the slave's power, is not positive"
         raise DrakeTeleopError(what, where="ratio", remedy="give values above 0")
     h11, h12, h21, h22 = matrix_entries(H)
     return two_port_matrix(h11, h12 / root, h21 * root, h22)
 
 
 def power_scaled_matrices(H: Complex, axis: OneAxis) -> tuple[Complex, Complex]:
-    """Return H and its scattering matrix S, with the slave's power at the hand's scale."""
+    """Return H and its scattering matrix S, with the slave's power scaled by `power_ratio`."""
     ratio = power_ratio(axis)
     scaled = scale_slave_power(H, ratio) if ratio > 0 else H
     return scaled, scattering_matrix(scaled, reference_impedances(axis))
 
 
 def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
-    """Return H that includes parallel impedances [N s/m] of the hand and of the environment."""
+    """Return H with impedances [N s/m] of hand and environment included."""
     h11, h12, h21, h22 = matrix_entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)
@@ -108,12 +107,12 @@ def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike 
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
-    """Return the impedance displayed to the hand with this impedance of the environment [N s/m]."""
+    """Return the impedance [N s/m] displayed to the hand for this impedance of the environment."""
     return absorb_impedances(H, environment=environment)[..., 0, 0]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the ideal displayed impedance, set by the scales of force and motion (T52)."""
+    """Return the displayed impedance [N s/m] of an ideal station with the axis' scales (T52)."""
     rendered = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * rendered
 
@@ -127,7 +126,7 @@ class ApparentImpedance(NamedTuple):
 
 
 def fit_apparent_impedance(impedance: Complex, omega: Array) -> ApparentImpedance:
-    """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
+    """Return the best-fitting mass, damping, stiffness of an impedance (n, ...) at `omega` (n,)."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = impedance.imag.reshape(len(omega), -1)
     # Normalised columns: from 0.1 to 1000 rad/s they differ by eight orders of magnitude.
@@ -150,7 +149,6 @@ class ZWidth(NamedTuple):
 
 
 def transmitted_z_width(H: Complex) -> ZWidth:
-    """Return the impedances displayed in free motion and at a rigid wall."""
     h11, h12, h21, h22 = matrix_entries(H)
     with np.errstate(divide="ignore", invalid="ignore"):
         rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)
@@ -163,12 +161,12 @@ WEBER_FRACTION = 0.23
 
 
 def is_difference_noticed(rendered: Complex, ideal: Complex) -> NDArray[np.bool_]:
-    """Return, for each frequency, whether a human notices the difference of the impedances."""
+    """Return, for each frequency, whether a human distinguishes rendered from ideal impedance."""
     return np.abs(rendered / ideal - 1) > WEBER_FRACTION
 
 
 def smallest_stiffness_change(H: Complex, omega: Array, stiffness: ArrayLike) -> Array:
-    """Return the smallest increase [N/m] of a wall's stiffness that a human detects, or inf."""
+    """Return the smallest increase [N/m] of wall stiffness that a human detects, or inf."""
     _, h12, h21, h22 = matrix_entries(H)
     s = 1j * omega
     environment = np.asarray(stiffness) / s

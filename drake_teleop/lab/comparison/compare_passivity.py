@@ -1,7 +1,7 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies: the whole station presses on sheet springs (`whole_station`), a hand lets go and
-taps, and the longest stable round trip (`one_dof`).
+Three studies: the whole station presses on sheet springs (`whole_station`); a hand releases the
+device and taps a wall, and the longest stable round trip is found (both `one_dof`).
 """
 
 from __future__ import annotations
@@ -43,10 +43,8 @@ JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 SIGMAS = (0.0, 1.0)
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
 _SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
-#: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
-_RATES_OF_EVERY_RUN = Rates(
-    sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0
-)
+#: Rates of every run: a quarter (sensor) or half of those of the shipped scenarios.
+_COMPARISON_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_SIMULATION_STEP_S = 2e-3
 
@@ -62,7 +60,7 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compare the given methods, or all; write summary, runs, report and pictures into `out`.
+    """Compare passivity methods (None: all); write summary, runs, report and pictures into `out`.
 
     Rates, integrator and environment of the scenario are not used. Return the content of
     summary.json (docs/delay-figures.md).
@@ -72,6 +70,9 @@ def compare_command(
         what = f"there is no network '{unknown[0]}'"
         raise DrakeTeleopError(what, where="networks", remedy=remedy)
     methods = tuple(METHODS) if methods is None else methods
+    for where, chosen in (("networks", networks), ("methods", methods)):
+        if not chosen:
+            raise DrakeTeleopError("is empty", where=where, remedy="give one name or more")
     for name in methods:
         METHODS.check(name, "methods")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
@@ -101,7 +102,7 @@ def compare_command(
             "method": method,
             "network": network,
             "verdict": cell.verdict,
-            "felt_N": [felt for felt, _ in cell.force_pairs],
+            "felt_N": [displayed for displayed, _ in cell.force_pairs],
             "pressed_N": [pressed for _, pressed in cell.force_pairs],
             "leaked_J": cell.leaked_J,
         }
@@ -121,7 +122,7 @@ def longest_round_trip(
 ) -> float:
     """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
 
-    `jitter` and `loss` are those of `NetworkConfig`; without both, only the first seed runs.
+    `jitter` and `loss` are those of `NetworkConfig`. If both are 0, only the first seed runs.
     """
     longest = 0.0
     for round_trip in ROUND_TRIPS_S:
@@ -135,11 +136,11 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment and detection, with the comparison's rates."""
+    """Return the scenario without environment and contact detection, at the comparison's rates."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
-        rates=_RATES_OF_EVERY_RUN,
+        rates=_COMPARISON_RATES,
         contact_detection=None,
     )
 
@@ -147,7 +148,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
 def simulate_press(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: Array
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Simulate a press on a sheet spring; return its table row and time series."""
+    """Simulate a press on a sheet spring; return its measures (table row) and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
@@ -193,13 +194,13 @@ def _run_while_stable(
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Measures after the hand lets go (release) and while it taps, all >= 0."""
+    """Measures after the hand releases the device, and while it taps a wall, all >= 0."""
 
-    release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
+    release_force: float  #: mean magnitude of the force on the hand, 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]
     release_way: float  #: largest displacement of the device in these 2 s [m]
     tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `TAP_RATES_HZ`
-    leaked: float  #: largest energy out between hand and actual motion, beyond the stores' [J]
+    leaked: float  #: largest energy output to hand and slave beyond input and start energy [J]
 
 
 def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
@@ -252,8 +253,8 @@ def _tap_impulse_share(
     first = int(np.argmax(run.wall_force < 0.0))
     second = first + round(0.75 / rate / PERIOD_S)  # between first and second contact
     pressed = scale * run.wall_force[second:].sum()
-    felt = run.hand_force[second + round(one_way_delay_s / PERIOD_S) :].sum()
-    return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0
+    displayed = run.hand_force[second + round(one_way_delay_s / PERIOD_S) :].sum()
+    return float(max(displayed / pressed, 0.0)) if pressed < 0.0 else 0.0
 
 
 def _run_one_dof_study(
@@ -286,7 +287,7 @@ def _run_release_study(
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
     runs = [(method, network, seed) for network, method in cases]
-    found = _run_in_processes(simulate_release_and_taps, runs, jobs, stage("Let go, and taps"))
+    found = _run_in_processes(simulate_release_and_taps, runs, jobs, stage("Release, and taps"))
     return [
         {"method": method, "network": network, **vars(one), "tap_shares": list(one.tap_shares)}
         for (network, method), one in zip(cases, found, strict=True)

@@ -1,4 +1,4 @@
-"""One degree of freedom of the station: plant, task and measures.
+"""Model of the station with one degree of freedom: plant, task and measures.
 
 The station's own `step_channel` connects hand and slave along x at 1 kHz, with held forces.
 """
@@ -45,7 +45,7 @@ _REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest positio
 
 @dataclass(frozen=True)
 class Task:
-    """Times of the operator's task [s]: swing, rest, press, hold, retreat, rest."""
+    """Start and end times [s] of the operator's task: swing, rest, press, hold, retreat, rest."""
 
     swing_start: float = 0.5
     swing_end: float = 3.0
@@ -57,15 +57,15 @@ class Task:
     rest_window: float = 1.9  #: length of the windows in which rest is required
 
     def is_held(self, t: Array) -> NDArray[np.bool_]:
-        """Return whether times (N,) [s] are in the window of rest during the hold."""
+        """Return whether times (N,) [s] are in the rest window, the last part of the hold."""
         return (t >= self.release_start - self.rest_window) & (t < self.release_start)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OneDof(AxisParameters):
-    """Parameters with Coulomb friction, motor lag, encoders, noise, errors; no device damping.
+    """One-axis parameters with Coulomb friction, motor lag, encoders, noise; no device damping.
 
-    The equations of motion are::
+    The equations of motion, with intended motion x_i, displayed force f, command x_cmd::
 
         (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
         m_s a_s = K (x_cmd - x_s) - D v_s + f_w          slave, K = D k_p, D = m_s k_v
@@ -99,14 +99,13 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 class OneDofRun:
     """Time series (N,) of a run.
 
-    `accounts` (N, 4) is the energy [J] that entered the station so far at four places, at the
-    master's scale. In a passive station, AT_HAND plus any other place never falls below
-    -start_energy::
+    `accounts` (N, 4) contains the energy [J] that entered the station so far at four places, at the
+    master's scale. In a passive station, AT_HAND plus any other is at least -start_energy::
 
-        AT_HAND     -sum f_(k-1) (x_k - x_(k-1))   held force
-        AT_COMMAND   sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port
-        AT_MOTOR    -integral k_f gamma f_m dx_s   servo's force
-        AT_SLAVE   integral k_f gamma f_w dx_s   wall's force
+        AT_HAND     -sum f_(k-1) (x_k - x_(k-1))   f: displayed force, held
+        AT_COMMAND   sum w_k (c_k - c_(k-1))       w: sent wrench; c: command; no physical port
+        AT_MOTOR    -integral k_f gamma f_m dx_s   f_m: servo's force
+        AT_SLAVE     integral k_f gamma f_w dx_s   f_w: wall's force
     """
 
     t: Array  #: s
@@ -121,9 +120,9 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
-        """Return the least sum over time of start energy and `accounts` at AT_HAND and `place` [J].
+        """Return the minimum over time [J] of start energy plus `accounts` at AT_HAND and `place`.
 
-        A negative sum means that the station is active.
+        Negative: the station is active.
         """
         other = 0.0 if place == AT_HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, AT_HAND] + other))
@@ -139,15 +138,15 @@ class RunMeasures:
     turning: float  #: largest peak-to-peak rotation in hold and end [rad]
     felt_force: float  #: mean force on the hand in the hold [N]
     chatter: float  #: standard deviation of the force on the hand in the hold [N]
-    force_error: float  #: relative error of felt_force to the scaled contact force
-    drift: float  #: slave minus master, 2 s after contact [m]
+    force_error: float  #: relative error of felt_force, compared with the scaled contact force
+    drift: float  #: position of slave minus master, 2 s after contact [m]
     free_force: float  #: rms force on the hand in free motion [N]
-    rise_delay: float  #: from contact force to felt force at half the steady felt force [s], or NaN
-    least_energy: float  #: least energy from both ends into the channel [J]; negative: active
+    rise_delay: float  #: from contact to displayed force, at half its steady value [s], or NaN
+    least_energy: float  #: minimum of the energy put in so far [J]; negative: active
 
     @property
     def rendered_share(self) -> float:
-        """Rendered share of the scaled contact force, or NaN."""
+        """Displayed force over scaled contact force in the hold, at least 0, or NaN."""
         return max(1.0 + self.force_error, 0.0)
 
 
@@ -164,14 +163,15 @@ def run_one_dof(
     wall: Array | None = None,
     delays: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
 ) -> OneDofRun:
-    """Simulate one run in one degree of freedom.
+    """Simulate one run of the model with a passivity method and a network.
 
     Args:
+        backward: network from slave to master; default: `forward`.
         timeout: time without packets before both ends come to rest [s].
-        intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
-        grip: (N, 3) mass, damping and stiffness of the hand, zeros after it let go.
-        wall: (N, 2) position [m] and stiffness [N/m]; default: the model's.
-        delays: forward and backward, periods of travel of each packet, -1 if lost.
+        intent: (N, 2) intended position [m] and velocity [m/s]; default: those of `Task()`.
+        grip: (N, 3) mass, damping and stiffness of the hand, zeros after release.
+        wall: (N, 2) position [m] and stiffness [N/m]; default: 0 m and the model's.
+        delays: (forward, backward) travel times of each packet in periods, -1 if lost.
     """
     scale = model.force_scale
     passivity = dataclasses.replace(
@@ -215,13 +215,13 @@ def run_one_dof(
         *states, ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD_S
-    master, slave, command, felt, pushed = rows.T[:5]
+    master, slave, command, displayed, pushed = rows.T[:5]
     rest = rows[:, 5:7], rows[:, 7:9], rows[:, 9:], stored
-    return OneDofRun(t, master, slave, command, felt, pushed, *rest)
+    return OneDofRun(t, master, slave, command, displayed, pushed, *rest)
 
 
 def operator_intent(task: Task = Task()) -> Array:
-    """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
+    """Return the operator's intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD_S), dtype=np.float64) * PERIOD_S
     x = np.full_like(t, _REST_POSITION_M)
     fading_out = _smooth_ramp(t, task.swing_end - 0.5, 0.5)
@@ -239,7 +239,6 @@ def _smooth_ramp(t: Array, start: float, length: float) -> Array:
 
 
 def measures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
-    """Return the measures of a run with the intended motion of `task`."""
     return measures_of_traces(
         t=run.t,
         master=run.master_position,
@@ -266,8 +265,8 @@ def measures_of_traces(
 
     Args:
         master, slave: positions in the direction of pressing [m].
-        hand_force, pressed: forces on the hand and of the environment, at the hand's scale [N].
-        energy: from both ends into the channel [J].
+        hand_force, pressed: displayed force and scaled contact force, both on the hand's side [N].
+        energy: energy put into the channel or the station so far [J].
         turned: (N, 3) rotation vector of the slave's tool [rad], if it can rotate.
     """
     dt = float(t[1] - t[0])
@@ -279,8 +278,8 @@ def measures_of_traces(
     rest = window_slice(task.end - task.rest_window, task.end)
     swing = window_slice(task.swing_start, task.swing_end)
     parts, angles = (hold, rest), () if turned is None else turned.T
-    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in parts)
-    turning = max((_range_about_parabola(x[part]) for x in angles for part in parts), default=0.0)
+    hunting = max(_detrended_range(x[part]) for x in (master, slave) for part in parts)
+    turning = max((_detrended_range(x[part]) for x in angles for part in parts), default=0.0)
     steady, goal = float(hand_force[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -319,7 +318,7 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     return np.asarray(displayed.real)
 
 
-def _range_about_parabola(x: Array) -> float:
+def _detrended_range(x: Array) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -347,8 +346,8 @@ def _simulate_steps(
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
-    felt, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
-    # Columns: master, slave, command, felt, wall, energy (2), silent (2), accounts (4).
+    displayed, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
+    # Columns: master, slave, command, displayed, wall, energy (2), silent (2), accounts (4).
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
@@ -365,15 +364,16 @@ def _simulate_steps(
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
         hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
         pose_m[4], pose_s[4] = _quantise(x, master_resolution), _quantise(x_s, slave_resolution)
-        accounts[AT_HAND] -= felt[0] * (x - x_before)
+        accounts[AT_HAND] -= displayed[0] * (x - x_before)
         before, x_before = received[4], x
         # A literal False would compile the whole channel once more.
         step_channel(
             steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S, timeout,
-            frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
+            frame, p, forward_line, backward_line, forward, backward, ends, received, ports,
+            displayed,
         )  # fmt: skip
         command, accounts[AT_COMMAND] = received[4], ports[6]
-        copy_into(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
+        copy_into(rows[k], 0, (x, x_s, command, displayed[0], wall, ports[0], ports[2]), 0, 7)
         copy_into(rows[k], 7, ports, 4, 2)
         copy_into(rows[k], 9, accounts, 0, 4)
         servo_force = K * (command - x_s) - D * v_s
@@ -381,7 +381,7 @@ def _simulate_steps(
             share = (i + 0.5) / _SUBSTEPS_PER_CHANNEL_PERIOD
             x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
             v_i = course[k, 1] + share * (course[following, 1] - course[k, 1])
-            force = stiffness * (x_i - x) + damping * (v_i - v) + felt[0]
+            force = stiffness * (x_i - x) + damping * (v_i - v) + displayed[0]
             v += dt / mass * (force - friction * np.tanh(v / _DEVICE_FRICTION_SPEED_M_S))
             x += dt * v
             x_then, v_then = x_s, v_s
@@ -400,7 +400,7 @@ def _simulate_steps(
                 x_s += dt * v_s
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * PERIOD_S * v_w)
             push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
-            work = -_mean_of_positive_part(push_then, push) * (x_s - x_then)
+            work = -_mean_of_positive_part_of_ramp(push_then, push) * (x_s - x_then)
             accounts[AT_SLAVE] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
@@ -424,7 +424,7 @@ def _wall_force(stiffness, damping, depth, speed):
 
 
 @njit(cache=True)
-def _mean_of_positive_part(a, b):
+def _mean_of_positive_part_of_ramp(a, b):
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

@@ -1,4 +1,4 @@
-"""Report of `drake-teleop compare-passivity`: verdicts of docs/delay.md, tables and pictures."""
+"""Report of `drake-teleop compare-passivity`: verdicts (docs/delay.md), tables, pictures."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "decision": draw_decision_table(summary),
         "hands": draw_release_and_taps(summary),
         "runs": draw_force_traces(summary, traces),
-        "energy": draw_energy(summary, traces),
+        "energy": draw_injected_energy(summary, traces),
         "limits": draw_round_trip_limits(summary["one_dof"]),
     }
     write_report_page_and_pictures(
@@ -78,7 +78,7 @@ def run_cells(row: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Result of one method over one network."""
+    """Verdict and figures of one passivity method over one network."""
 
     verdict: str
     #: For each leaf, means in the hold of the force on the hand and the scaled contact force [N].
@@ -95,13 +95,13 @@ class MethodResult:
 
     @property
     def least_displayed_share_text(self) -> str:
-        """Least displayed over scaled contact force of all sheet springs [%]; "" if unstable."""
-        shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
+        """Smallest displayed share [%] of the scaled contact force, all springs; "" if unstable."""
+        shares = [displayed / pressed for displayed, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
 def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
-    """Return the result of each (method, network) in a summary."""
+    """Return the result for each (method, network) of a summary."""
     table = {}
     for row in summary["hands"]:
         key = row["method"], row["network"]
@@ -149,7 +149,7 @@ def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
             x, y = networks.index(network), methods.index(method)
             mark, colour, text_colour = VERDICT_STYLES[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
-            lines = [f"displays {felt:.1f} of {true:.1f} N" for felt, true in cell.force_pairs]
+            lines = [f"displays {force:.1f} of {true:.1f} N" for force, true in cell.force_pairs]
             lines += cell.motion_texts
             style: dict[str, Any] = {"color": text_colour, "ha": "center", "va": "center"}
             y -= 0.12 * len(lines)
@@ -172,7 +172,7 @@ def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     shares = [f"displayed share of taps at {rate:g} Hz [%]" for rate in TAP_RATES_HZ]
     panels = (
-        ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
+        ("speed after release [m/s]", "log", lambda row: row["release_speed"]),
         (shares[0], "linear", lambda row: 100 * row["tap_shares"][0]),
         (shares[1], "linear", lambda row: 100 * row["tap_shares"][1]),
     )
@@ -208,9 +208,7 @@ def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
     return figure
 
 
-def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw the energy that hand and environment have put in, for each method and network."""
-
+def draw_injected_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
     def draw_run_energy(axes: Any, shown: Mapping[str, Array]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)

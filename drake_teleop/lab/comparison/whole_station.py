@@ -1,7 +1,7 @@
 """The whole station: task (swing, press on a sheet spring, rest), measures and energy balances.
 
 The balances are those of `one_dof.OneDofRun.accounts`, at the master's scale, positive inwards [J],
-by translation and rotation. AT_MOTOR is from the motor torque minus weight, as a wrench at So.
+for translation and rotation. AT_MOTOR is computed from motor torque minus gravity torque.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> one_dof.Task:
-    """Return the times of the task; longer round trips [s] have longer waits."""
+    """Return the task's times; longer round trips [s] lengthen its waits."""
     return one_dof.Task(
         swing_start=0.3,
         swing_end=1.8,
@@ -61,7 +61,7 @@ def press_scenario(
     task: one_dof.Task | None = None,
     depth: float = _PRESS_DEPTH_M,
 ) -> tuple[Scenario, one_dof.Task]:
-    """Return the scenario with this task and the task's times.
+    """Return the scenario of a press on a sheet spring, and the task's times.
 
     `leaf` is a key of `LEAF_THICKNESSES_M` or a stiffness [N/m]; `depth` [m] is the hand's intended
     displacement beyond the contact.
@@ -113,7 +113,6 @@ def leaf_thickness(stiffness: float) -> float:
 def measures_of_press(
     result: SimulationResult, scenario: Scenario, task: one_dof.Task
 ) -> one_dof.RunMeasures:
-    """Return the measures of a station's run of the task, along z of the world."""
     traces = force_and_energy_traces(result, scenario)
     traces |= {"master": result["pose_command"][:, 6]}
     traces["slave"], traces["turned"] = _slave_height_and_rotation(result, scenario)
@@ -121,7 +120,7 @@ def measures_of_press(
 
 
 def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
-    """Return a run's t [s], vertical forces at the master's scale [N] and `injected_energy` [J].
+    """Return "t" [s], vertical forces at the master's scale [N] and injected "energy" [J].
 
     "hand_force" is the displayed force, "pressed" the scaled true contact force.
     """
@@ -135,7 +134,7 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
 
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
+    """Return the energy (N,) [J] that hand and environment put in so far, plus `start_energy`."""
     accounts = station_energies(result, scenario)[:, [AT_HAND, AT_SLAVE]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
         accounts += work_of_displayed_load_wrench(result, scenario)
@@ -152,9 +151,9 @@ def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> 
 
 
 def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energies (N, 4, 2) [J] at `AT_HAND` to `AT_SLAVE`, for translation and rotation.
+    """Return the energies (N, 4, 2) [J] put in so far at four places, by translation and rotation.
 
-    `AT_MOTOR` is NaN if the log is slower than the joint control.
+    Places: AT_HAND to AT_SLAVE. AT_MOTOR is NaN if the log is slower than the joint control.
     """
     needed = ("ports", "slave_state", "joint_torque")
     if missing := [name for name in needed if name not in result]:
@@ -186,7 +185,7 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the cumulative work (N, 2) [J] of the load's displayed wrench on the hand.
+    """Return the work (N, 2) [J] so far of the load's displayed wrench, at the master's scale.
 
     Columns: translation, rotation.
     """
@@ -215,7 +214,10 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the energy (2,) stored at both ends at the start [J], by translation and rotation."""
+    """Return the energy (2,) [J] that the passivity method stores at both ends at the start.
+
+    Columns: translation, rotation.
+    """
     scales = _kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))

@@ -22,10 +22,10 @@ _DIFFERENCE_STEP_S = 1e-4
 
 @dataclass(frozen=True)
 class LimitUse:
-    """Largest use of one limit by a motion.
+    """Largest use of one limit by a motion, and where and when it occurs.
 
     Attributes:
-        used_share: largest |value| over the limit; above 1 violates the limit.
+        used_share: largest |value| over the limit; violated above 1.
         time_s: time of this value [s].
         where: joint, axis or pair of shapes with this value.
     """
@@ -45,7 +45,7 @@ def check_trajectory(
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit in one period of a trajectory, largest first."""
+    """Return the use of every limit over one period of a trajectory, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * CHECK_RATE_HZ) + 1)
     before, q, after = (
         trajectory.evaluate(t + step)[0] for step in (-_DIFFERENCE_STEP_S, 0.0, _DIFFERENCE_STEP_S)
@@ -63,7 +63,7 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit by q, qd, qdd (T, n) at times t (T,) [s], largest first."""
+    """Return, largest first, the use of every limit by joint motion q, qd, qdd (T, n) at t (T,)."""
     names, limits = robot.arm.joint_names, robot.limits
     quantities = _evaluate_limited_quantities(robot, q, qd, qdd, progress)
     torque, sensor, workspace, clearance, nearest = quantities
@@ -145,7 +145,7 @@ def _force_and_motion_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: 
 def _nearest_shapes(scene: CollisionScene, query: QueryObject, reach: float) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
-        return reach, "all shapes are farther"
+        return reach, "all shapes are farther apart"
     pair = min(found, key=lambda pair: pair.distance)
     inspector = scene.scene_graph.model_inspector()
     frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))

@@ -95,8 +95,8 @@ _NUM_COAXIALITY_POSTURES = 20
 # postures that capsules may block.
 _NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.02, 0.05), 0.25, 0.1
 _MIN_POSTURES_NEAR_CONTACT = 5  # for a correction
-# Share of postures below which near capsules count although their shapes were never near.
-_MAX_SHARE_OF_RARE_CAPSULE_CONTACT = 0.05
+# Pairs whose capsules are near in fewer postures count although their shapes were never near.
+_MAX_POSTURE_SHARE_OF_RARE_CONTACT = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
@@ -111,10 +111,10 @@ ParseArm = Callable[[MultibodyPlant], tuple[tree.ModelInstanceIndex, tree.Frame]
 
 
 class CollisionScene:
-    """Plant and scene graph of the arm with its heaviest load.
+    """Drake plant and scene graph of an arm with its heaviest load and a table at z = 0.
 
     Args:
-        extra_phi: (10,) parameters phi of an additional load on the sensor.
+        extra_phi: (10,) parameters phi of an additional load at the sensor, about So.
         visuals_collide: whether visual shapes also collide.
     """
 
@@ -140,9 +140,10 @@ class CollisionScene:
     def find_collision_candidates_and_touching(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_ShapePair, Array], list[str]]:
-        """Return pairs of shapes that may collide, and names of bodies that touch at the start.
+        """Return distances (T,) [m] of pairs that may collide, and names of pairs in contact.
 
-        Pairs on one link, always near, at constant distance, or in contact at `start` are excluded.
+        Excluded pairs are on one link, almost always near, at constant distance, or in contact at
+        `start`.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -186,7 +187,7 @@ class CollisionScene:
     def bounding_capsules_and_pairs(
         self, candidates: dict[_ShapePair, Array], postures: Array
     ) -> dict[str, NDArray[Any]]:
-        """Return the fields of `Limits` that describe capsules around the shapes."""
+        """Return the `Limits` fields of the shapes' bounding capsules and their candidate pairs."""
         inspector = self.scene_graph.model_inspector()
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
@@ -206,7 +207,7 @@ class CollisionScene:
             capsules[shape] = row, bounding_capsule(inspector.GetShape(shape)).transformed(X_LG)
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
-        outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
+        outer = {shape: _find_largest_enclosing_shape(shape, capsules) for shape in capsules}
         outer_shapes = sorted(set(outer.values()), key=geometry.GeometryId.get_value)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
@@ -231,7 +232,7 @@ class CollisionScene:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
                 near_share = np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M)
-                useful = near.any() or 0 < near_share < _MAX_SHARE_OF_RARE_CAPSULE_CONTACT
+                useful = near.any() or 0 < near_share < _MAX_POSTURE_SHARE_OF_RARE_CONTACT
             if useful:
                 used.append(k)
                 distances.append(distance)
@@ -268,7 +269,7 @@ def _exclude_pair(
     manager.Apply(exclude(geometry.GeometrySet(a), geometry.GeometrySet(b)))
 
 
-def _shape_with_enclosing_capsule(
+def _find_largest_enclosing_shape(
     shape: geometry.GeometryId, capsules: dict[geometry.GeometryId, tuple[int, Capsule]]
 ) -> geometry.GeometryId:
     row, capsule = capsules[shape]
@@ -314,7 +315,7 @@ def _complete_and_check_shapes(
             size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
             if not size <= _MAX_SHAPE_SIZE_M:
                 limit = f"(at most {_MAX_SHAPE_SIZE_M:g} m)"
-                what = f"{body.name()} has a shape of {size:.3g} m {limit}"
+                what = f"body '{body.name()}' has a shape of {size:.3g} m {limit}"
                 raise DrakeTeleopError(what, where=where, remedy="give all lengths in metres")
 
 

@@ -28,11 +28,11 @@ _MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
 _MAX_COM_ERROR_M = 1e-3
 _MAX_OFFSET_ERRORS = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
-_MIN_RATIO_OF_EXCITED_EIGENVALUES = 1e-13
+_MIN_EIGENVALUE_RATIO = 1e-13
 
 
 class CriterionScales(NamedTuple):
-    """Noise, length and load that scale the criteria.
+    """Noise, length and load that make the criteria dimensionless.
 
     Attributes:
         wrench_noise: standard deviations (sigma_f [N], sigma_tau [N m]), white at 1 kHz.
@@ -46,12 +46,12 @@ class CriterionScales(NamedTuple):
 
 
 def limited_gyration_radius(phi: Array) -> float:
-    """Return the load's radius of gyration about So [m], at most 0.1."""
+    """Return the load's radius of gyration about So [m], limited to 0.1 m."""
     return float(min(0.1, np.sqrt((phi[4] + phi[7] + phi[9]) / (2 * phi[0]))))
 
 
 class Criterion:
-    """Criterion `name` in `CRITERIA`, exact and as a smooth function; smaller is better."""
+    """Criterion named in `CRITERIA`: exact value and smooth approximation; smaller is better."""
 
     def __init__(self, name: str, scales: CriterionScales) -> None:
         if name not in CRITERIA:
@@ -71,7 +71,7 @@ class Criterion:
         self._columns = columns
 
     def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Return the scaled regressor (6 T, c) and the information matrix (c, c) per sample."""
+        """Return the scaled regressor (6 T, c) and its information matrix (c, c), a mean over T."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
@@ -79,10 +79,10 @@ class Criterion:
         return rows, rows.T @ rows / len(V)
 
     def value(self, s: Array, omega: Array, alpha: Array, duration: float) -> float:
-        """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
+        """Return the exact criterion of motion samples over `duration` [s]; inf if singular."""
         _, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        if eigenvalues[0] <= _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1]:
+        if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
@@ -92,13 +92,13 @@ class Criterion:
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10).
+        """Return the logarithm of the smooth criterion and its gradient by the regressor V.
 
-        The duration's factor is omitted.
+        The constant factor of the duration is omitted.
         """
         rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        eigenvalues = np.maximum(eigenvalues, _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1])
+        eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
         g_gram = weights if self.name == "A16" else (vectors * weights) @ vectors.T
         g_rows = (2 / len(s)) * (rows @ g_gram).reshape(len(s), 6, -1)
@@ -124,7 +124,7 @@ class Criterion:
 
 @njit(cache=True)
 def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
-    """Write gradients (3,) of a scalar by s, omega, alpha, from that by the regressor V (6, 10)."""
+    """Write a scalar's gradients (3,) by s, omega, alpha, given g_V, that by the regressor V."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]

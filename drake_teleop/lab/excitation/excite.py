@@ -36,11 +36,9 @@ class Excitation:
     """Trajectory that passed the check.
 
     Attributes:
-        values: value of every criterion.
         deviations: (16,) predicted standard deviations of offsets and phi with the heaviest load.
         limit_uses: use of every limit, largest first.
         criterion_history: (K, 2) number of evaluations, best criterion so far.
-        design_cpu_time_s: thread CPU time of the design [s].
     """
 
     robot: Robot
@@ -64,7 +62,7 @@ def excite(
     seconds: float | None = None,
     progress: bool | StartStage = True,
 ) -> Excitation:
-    """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
+    """Design an excitation trajectory, a Fourier series of `harmonics` harmonics, and check it.
 
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
@@ -121,7 +119,7 @@ def find_best_within_limits(
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
     """Return the best trajectory that passes the check, and its uses of the limits.
 
-    If none of `iterates` passes, `fallback_trajectories` are checked in their order.
+    If no iterate of the optimiser passes, `fallback_trajectories` are checked in their order.
     """
     worst: LimitUse | None = None
     candidates = islice(_feasible_candidates(iterates, robot), _MAX_CHECKED_CANDIDATES)
@@ -140,7 +138,6 @@ def find_best_within_limits(
 
 
 def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
-    """Return the value of every criterion by name, from samples at 1 kHz over one period."""
     motion = trajectory_sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.criterion_scales).value(*motion, trajectory.period)

@@ -1,4 +1,4 @@
-"""Limits of arm, sensor and workspace, and their use by a motion, with gradients (T47)."""
+"""Limits of arm, sensor and workspace, and their use by a motion with gradients (T47)."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "work
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
 ZERO_USE_CLEARANCE_MARGIN_M = 0.1
-_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7  # in the gradient of a smooth maximum
-_DISTANCE_OF_FAR_CAPSULES_M = 1.0  # replaces all distances above clearance plus scale [m]
+_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7  # smaller weights in a smooth maximum's gradient are skipped
+_DISTANCE_OF_FAR_CAPSULES_M = 1.0  # replaces distances with zero clearance use [m]
 
 
 class Limits(NamedTuple):
-    """Limits of an excitation; a use of 1 reaches a limit.
+    """Limits of an excitation; a use (value over limit) of 1 reaches the limit.
 
     Attributes:
         q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
@@ -68,13 +68,13 @@ class Limits(NamedTuple):
 
 
 def finite_half_ranges(q_half: Array) -> Array:
-    """Return the half ranges (n,) for random postures [rad]: pi without limits."""
+    """Return half ranges (n,) [rad] for random postures: pi for unlimited joints."""
     return np.where(np.isfinite(q_half), q_half, np.pi)
 
 
 @njit(cache=True)
 def link_motion_series(table, q, qd, qdd):
-    """Return all links' motions (T, n+1, 21) at T samples q, qd, qdd (T, n)."""
+    """Return the motions [s, omega, alpha, p, R] in W of all links at T samples (T, n+1, 21)."""
     motions = np.empty((len(q), q.shape[1] + 1, SENSOR_MOTION_SIZE))
     for t in range(len(q)):
         link_motions(table, q[t], qd[t], qdd[t], motions[t])
@@ -83,7 +83,7 @@ def link_motion_series(table, q, qd, qdd):
 
 @njit(cache=True)
 def sensor_motion_series(motions):
-    """Return specific force, omega, alpha (3, T, 3) of the sensor, in S."""
+    """Return specific force, omega and alpha of the sensor, in S, as one array (3, T, 3)."""
     out = np.empty((3, len(motions), 3))
     for t in range(len(motions)):
         for k in range(3):
@@ -94,7 +94,7 @@ def sensor_motion_series(motions):
 
 @njit(cache=True)
 def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
-    """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), from that by V (T, 6, 10)."""
+    """Add a scalar's gradient by q, qd, qdd to `gradient`, given g_V, that by the regressor V."""
     work, g = _allocate_seeds(motions), np.empty((3, 3))
     seed = work[0][-1]
     for t in range(len(motions)):
@@ -110,9 +110,9 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
 
 @njit(cache=True)
 def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient):
-    """Return the largest use of each of `LIMIT_NAMES` over all samples, smooth and exact (7,), T47.
+    """Return the largest use of each of `LIMIT_NAMES` over all samples: smooth (7,), exact (7,).
 
-    Write the gradient (7, 3, T, n) of the smooth one by joint positions, velocities, accelerations.
+    Write the gradient (7, 3, T, n) of the smooth uses by q, qd, qdd (T47).
     """
     gradient[:] = 0.0
     smooth, largest = np.empty(7), np.empty(7)
@@ -282,7 +282,7 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
 def capsule_distances(motions, capsule_links, capsule_ends, capsule_radius, capsule_pairs):
     """Return the distances (T, K) of K capsule pairs [m], negative for overlaps.
 
-    `motions` are from `link_motion_series`, others of `Limits`.
+    `motions` are from `link_motion_series`, the other arguments from `Limits`.
     """
     distances = np.empty((len(motions), len(capsule_pairs)))
     placed = np.empty(capsule_ends.shape)

@@ -1,7 +1,7 @@
 """Gradients of functions of a serial arm's link motions, by the adjoint recursion (T48, T49).
 
-A seed contains the derivatives of a scalar J by a link's motion ``[s, omega, alpha, p, R]`` in W;
-for R it is g of ``dJ = g . dtheta``.
+A seed contains the derivatives of a scalar J by a link's motion ``[s, omega, alpha, p, R]`` in W
+(specific force to rotation matrix). The derivative by R is g of ``dJ = g . dtheta``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def rotate_to_link(motion, vector_W):
 
 @njit(cache=True)
 def add_vector_to_seed(motion, offset, gradient, seed):
-    """Add to a link's `seed` a derivative by s, omega or alpha (`offset` 0, 3, 6), in its frame."""
+    """Add a `gradient` by s, omega or alpha (`offset` 0, 3, 6), in link frame, to the `seed`."""
     g = rotate_to_world(motion, gradient)
     add_vector_into(seed, offset, g)
     add_vector_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, offset)))
@@ -51,14 +51,14 @@ def add_vector_to_seed(motion, offset, gradient, seed):
 
 @njit(cache=True)
 def add_point_to_seed(motion, point, gradient, seed):
-    """Add to a link's `seed` a derivative, in W, by the position of a point (3,) fixed to it."""
+    """Add a `gradient` in W, by the position of a link-fixed point (3,), to the link's `seed`."""
     add_vector_into(seed, _P_IN_SEED, gradient)
     add_vector_into(seed, _THETA_IN_SEED, cross(rotate_to_world(motion, point), gradient))
 
 
 @njit(cache=True)
 def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
-    """Add to a link's `seed` (21,) derivatives by the wrench of its load phi, both in its frame."""
+    """Add gradients by the wrench of load phi, in link frame, to `seed`; return s and omega."""
     s = rotate_to_link(motion, vector_at(motion, _S_IN_SEED))
     w = rotate_to_link(motion, vector_at(motion, _OMEGA_IN_SEED))
     h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
@@ -77,9 +77,9 @@ def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
 
 @njit(cache=True)
 def add_torque_to_seeds(table, motions, c, virtual_velocities, seeds):
-    """Add to `seeds` the gradients of c . tau; torques tau exclude rotor inertia and damping.
+    """Add the gradients of c . tau to `seeds`; torques tau exclude rotor inertia and damping.
 
-    Write the link velocities for joint velocities c into `virtual_velocities` (n+1, 6).
+    Write the links' velocities for joint velocities c (n,) into `virtual_velocities` (n+1, 6).
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
@@ -108,7 +108,7 @@ def add_torque_to_seeds(table, motions, c, virtual_velocities, seeds):
 
 @njit(cache=True)
 def pull_back_seeds(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, g_qd, g_qdd):
-    """Add to `g_q`, `g_qd`, `g_qdd` (n,) the gradients that follow from the seeds of all links.
+    """Add the gradients by q, qd, qdd to `g_q`, `g_qd`, `g_qdd` (n,), from the seeds of all links.
 
     `c` and `virtual_velocities` are those of `add_torque_to_seeds`, or zeros.
     """

@@ -34,7 +34,7 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
     motion = trajectory_sensor_motion(robot, trajectory)
     force = np.linalg.norm(non_contact_wrench(*motion, robot.limits.heaviest_phi)[:, :3], axis=1)
     samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
-    film = replay_file.ReplayFile(
+    replay = replay_file.ReplayFile(
         f"Excitation of {robot.name}",
         times,
         slow_motion,
@@ -58,7 +58,7 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
 
         return show
 
-    film.write(path, make_scene)
+    replay.write(path, make_scene)
 
 
 def _link_poses(

@@ -22,7 +22,7 @@ Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 
 _SAMPLES_PER_PERIOD_AND_HARMONIC = 24
-_RANDOM_MOTION_LIMIT_SHARE = 0.35  # size of random motions over speed and acceleration limits
+_RANDOM_MOTION_LIMIT_SHARE = 0.35  # random motions' share of speed and acceleration limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,9 @@ class Evaluation:
 
 
 class DesignProblem:
-    """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.rest_to_rest`.
+    """Trajectory optimisation in x = [q0, sine, cosine] of `FourierTrajectory.rest_to_rest`.
 
-    Args:
-        robot: arm, whose home posture is the centre of half of the candidates.
-        period_s: duration of the trajectory [s].
-        num_harmonics: number N of harmonics in Eq. (9), at least 2.
+    `num_harmonics` of the Fourier series is at least 2.
     """
 
     def __init__(
@@ -69,7 +66,7 @@ class DesignProblem:
         return FourierTrajectory.rest_to_rest(x[:n], sine, cosine, 1 / self._period_s)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion, near or far from the home posture."""
+        """Return the unknowns of a random motion, about the home posture or any posture."""
         bounds, harmonics = self._limits, self._num_harmonics
         rate = 2 * np.pi / self._period_s * np.sqrt(harmonics)
         size = np.minimum(bounds.velocity / rate, bounds.acceleration / rate**2)
@@ -82,7 +79,7 @@ class DesignProblem:
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:
-        """Return the bounds of the unknowns; None: unbounded."""
+        """Return the bounds of the unknowns; None: no unknown is bounded."""
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
@@ -115,7 +112,7 @@ class DesignProblem:
         return smooth, float(largest.max())
 
     def value(self) -> float:
-        """Return the exact criterion of the last evaluated point."""
+        """Return the exact (not smooth) criterion of the last evaluated point."""
         s, omega, alpha = self._vectors
         return self._criterion.value(s, omega, alpha, self._period_s)
 
@@ -148,7 +145,7 @@ _MAX_CRITERION_RATIO_FOR_REPEAT = 0.995
 
 @dataclass(frozen=True)
 class FeasibleIterate:
-    """Feasible trajectory, found after `cpu_time_s` of thread CPU time."""
+    """Trajectory within the limits, found after `cpu_time_s` of thread CPU time."""
 
     cpu_time_s: float
     num_evaluations: int
@@ -167,7 +164,7 @@ def minimise_criterion(
 ) -> list[FeasibleIterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `seconds` of thread CPU time replace `starts`, but make results irreproducible.
+    `starts` is the number of descents. `seconds` of CPU time replace it; results then vary.
     """
     search = _DescentSearch(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):

@@ -1,4 +1,4 @@
-"""Predicted standard deviations of offsets and load after an excitation (T46).
+"""Predicted standard deviations of identified offsets and load after an excitation (T46).
 
 Gain errors, delay, thermal drift and rounding of encoders are not included.
 """
@@ -21,7 +21,7 @@ class SensorNoise(NamedTuple):
     """Noise of the 12 channels [f, tau, s, alpha] and its filters.
 
     Attributes:
-        assumed_wrench_std: (6,) deviations by which the estimator divides the wrench [N, N m].
+        assumed_wrench_std: (6,) deviations that weight the wrench in the estimator [N, N m].
         white_noise_densities: (12,) two-sided spectral densities of white noise [unit^2 s].
         random_walk_variances: (12,) random walks: variance per second [unit^2 / s].
         p_SoAo_S: (3,) position of the accelerometer [m].
@@ -37,20 +37,19 @@ class SensorNoise(NamedTuple):
 
 
 def sensor_noise(
-    sensor: WristSensorConfig, estimation: MotionEstimationConfig, num_joints: int, period: float
+    sensor: WristSensorConfig, estimation: MotionEstimationConfig, num_joints: int, period_s: float
 ) -> SensorNoise:
-    """Return the specified noise of a sensor with sample period `period` [s]."""
     std = np.concatenate([sensor.wrench_std(), sensor.motion_std()[[0, 1, 2, 6, 7, 8]]])
     walk = np.zeros(12) if sensor.ideal else sensor.random_walk()
     filters = None
     if estimation.source == "accelerometer":
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
-        angular, linear = fusion_gains(estimation, sensor, num_joints, period)
+        angular, linear = fusion_gains(estimation, sensor, num_joints, period_s)
         polynomials = _motion_error_polynomials
-        filters = polynomials(linear, period), polynomials(angular, period)
+        filters = polynomials(linear, period_s), polynomials(angular, period_s)
     place = sensor.accelerometer_pose()[0]
-    return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
+    return SensorNoise(sensor.wrench_std(), std**2 * period_s, walk**2, place, filters)
 
 
 def predicted_deviations(
@@ -62,9 +61,9 @@ def predicted_deviations(
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3).
+    """Return the covariance (16, 16) of identified offsets and phi after s, omega, alpha (T, 3).
 
-    `step` is the sample period [s], `phi` the load (10,).
+    `step` is the sample period [s], `phi` the true load (10,).
     """
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.assumed_wrench_std[:, np.newaxis] ** 2
@@ -107,6 +106,6 @@ def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: fl
 
 
 def spatial_inertia_matrix(phi: Array) -> Array:
-    """Return the matrix (6, 6) from [s, alpha] of the sensor to the wrench of a load phi."""
+    """Return the matrix (6, 6) that maps [s, alpha] of the sensor to the wrench of load phi."""
     moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])

@@ -1,4 +1,4 @@
-"""Arm with surroundings and limits, for the design of trajectories."""
+"""Arm with surroundings and limits, for which trajectories are designed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Robot:
     Attributes:
         scene: Drake's plant, with the heaviest load.
         home_posture: (n,) start posture of the search [rad].
-        assumptions: assumed values that the model lacks.
+        assumptions: sentences on values that the model lacks.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """Return the station's slave with surroundings and a table at z = 0."""
+    """Return the scenario's slave as `Robot`, with surroundings and a table at z = 0."""
     check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
@@ -107,7 +107,7 @@ def RobotFromModel(
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
 ) -> Robot:
-    """Return a serial arm from a model; free bases are welded, joints beyond the sensor locked.
+    """Return a serial arm from a model file; weld free bases, lock joints beyond the sensor.
 
     Acceleration limits [rad/s^2] and payload [kg] are used where the model has none.
     """
@@ -166,7 +166,7 @@ def _make_robot(
     candidates, touching = scene.find_collision_candidates_and_touching(postures, start)
     if touching:
         names = ", ".join(touching)
-        assumptions.append(f"no clearance required, as they touch in the start posture: {names}")
+        assumptions.append(f"no clearance required, as these bodies touch at the start: {names}")
     phi, std = arm.phi_load, sensor.wrench_std()
     wrench_noise = float(std[0]), float(std[3])
     force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)

@@ -38,20 +38,20 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 _MAX_STEP_OF_PERIOD_LOGARITHM = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
-_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005  # after a round that missed the tolerance
+_TOLERANCE_MARGIN_FACTOR_AFTER_MISS = 1.005  # after a round that missed the tolerance
 _MAX_ROUNDS_WITHOUT_MOTION = 3  # before the search fails
-# Largest misfit of a motion that later rounds vary, and number of such starts.
+# Largest error over tolerance of a motion that later rounds vary; number of such starts.
 _MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 _SEED_STEP_BETWEEN_ROUNDS = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
 _MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
-_TOLERANCE_SHARPNESS_RATIO = 4.0  # sharpness over tolerances to that over eigenvalues
+_TOLERANCE_SHARPNESS_RATIO = 4.0  # sharpness of the tolerances' maximum over the criterion's
 _INFORMATION_REGULARISATION = 1e-11  # of balanced information, which is singular without motion
 
 
 @dataclass(frozen=True, eq=False)
 class ShortestMotion:
-    """Checked motion; `errors_over_tolerances` (k,) are predicted errors, at most 1."""
+    """Checked motion; `errors_over_tolerances` (k,) are predicted and at most 1."""
 
     excitation: excite.Excitation
     errors_over_tolerances: Array
@@ -69,12 +69,12 @@ def design_shortest_motion(
     """Design and check the shortest motion that reaches a tolerance.
 
     Raises:
-        DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
+        DrakeTeleopError: if no motion of at most 20 s reaches the tolerance.
     """
     errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi)
     errors = errors * sidak_factor(len(tolerance.required_entry_names))
     factor = np.ones(len(errors))
-    worst, around, vain_rounds, empty_rounds = np.inf, None, 0, 0
+    worst, around, rounds_without_progress, rounds_without_motion = np.inf, None, 0, 0
     best: ShortestMotion | None = None
     for k in range(_MAX_DESIGN_ROUNDS):
         problem = ShortestMotionProblem(robot, harmonics, errors * factor[:, np.newaxis], around)
@@ -84,7 +84,7 @@ def design_shortest_motion(
         )
         found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
         if not found:
-            if (empty_rounds := empty_rounds + 1) == _MAX_ROUNDS_WITHOUT_MOTION:
+            if (rounds_without_motion := rounds_without_motion + 1) == _MAX_ROUNDS_WITHOUT_MOTION:
                 break
             around = None
             continue
@@ -98,17 +98,17 @@ def design_shortest_motion(
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
             progressed = trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
-            vain_rounds = 0 if progressed else vain_rounds + 1
+            rounds_without_progress = 0 if progressed else rounds_without_progress + 1
             if trajectory.period < shortest_period:
                 excitation = excite.assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
-            if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
+            if rounds_without_progress == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
         last_factor, factor = factor, factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         if worst > 1.0 and k > 0:
-            factor = _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(factor, last_factor)
+            factor = _TOLERANCE_MARGIN_FACTOR_AFTER_MISS * np.maximum(factor, last_factor)
     if best is not None:
         return best
     what = "no motion within the limits reaches the tolerance"
@@ -119,16 +119,16 @@ def design_shortest_motion(
 
 
 def sidak_factor(count: int) -> float:
-    """Return z; `count` numbers are within z deviations together with 95 % probability (Sidak)."""
+    """Return z: with 95 % probability `count` errors are all within z deviations (Sidak)."""
     return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / count)))
 
 
 class ShortestMotionProblem(optimizer.DesignProblem):
-    """Design problem with the unknowns x = [q0, sine, cosine, log T].
+    """Optimisation of the period T in the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        errors: (k, 16) combinations of offsets and phi, scaled to required deviations of 1.
-        around: unknowns of an earlier motion, if any.
+        errors: (k, 16) linear combinations of offsets and phi; their deviations must be below 1.
+        around: unknowns of an earlier motion that candidates vary, if any.
 
     Attributes:
         best: unknowns of the shortest period passed to `value`.
@@ -149,7 +149,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion; `near_home`: near `around` (None: home)."""
+        """Return the unknowns of a random motion; `near_home`: near `around`, else near home."""
         if self._around is not None and near_home:
             other = _MAX_COEFFICIENT_VARIATION * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
@@ -162,7 +162,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> optimizer.Bounds:
-        """Return bounds of the unknowns; only log T is bounded, near that of x."""
+        """Return the bounds of the unknowns; only log T is bounded, about its value in x."""
         ends = x[-1] + np.array([-_MAX_STEP_OF_PERIOD_LOGARITHM, _MAX_STEP_OF_PERIOD_LOGARITHM])
         low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
@@ -170,7 +170,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
     def evaluate(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float
     ) -> optimizer.Evaluation:
-        """Evaluate log T and eight limits: the tolerance, then those of the arm."""
+        """Evaluate the objective log T and eight uses: of the tolerance, then of the limits."""
         self._at = x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
@@ -191,13 +191,13 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         )
 
     def value(self) -> float:
-        """Return the period of the last evaluated point [s]."""
+        """Return the period of the last evaluated point [s]; update `best`."""
         if self._period < self._least:
             self._least, self.best = self._period, self._at
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """Return the predicted deviations (k,) with white noise, over the required ones."""
+        """Return predicted over required deviations (k,) of `errors`, for white noise only."""
         rows = self._weighted_regressor_rows(*motion)
         return np.sqrt(self._variances_of_estimates(rows, period)[0])
 
@@ -234,7 +234,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
 
 def white_noise_densities_over_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
-    """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
+    """Return the density matrix (6, 6) of wrench and motion noise over wrench noise alone."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)

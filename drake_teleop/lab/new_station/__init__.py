@@ -1,6 +1,6 @@
 """`drake-teleop new DIR --arm FILE --sensor-frame NAME`: creation of a station with a custom arm.
 
-It chooses start and scales, writes a commented scenario and a picture, and runs the scenario.
+The command chooses start and scales, writes a commented scenario and a picture, and runs it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def new_command(
     sensor: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Write `station.yaml` and `start.png` into a folder, run it into `first_run`.
+    """Write `station.yaml` and `start.png` into `folder`; run the station into `first_run` there.
 
     Args:
         tool: model file of the tool; None: the bodies beyond the sensor, or a placeholder.
@@ -100,7 +100,7 @@ def new_command(
 def scenario_text(
     plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
-    """Return the commented scenario; `slave` contains model, packages and sensor frame.
+    """Return the commented scenario as YAML; `slave` has its model, packages and sensor frame.
 
     Args:
         tool: path of the tool's file, if given.
@@ -129,7 +129,7 @@ def scenario_text(
     else:
         slave["tool"] = {"mass": plan.stand_in_tool.mass, "com": plan.stand_in_tool.com}
         slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(plan.stand_in_tool.shapes[0])]}
-        comments["slave.tool"] = "a stand-in: put model file or numbers of your tool here"
+        comments["slave.tool"] = "a stand-in: write the model file or the numbers of your tool here"
     if plan.weak_joints:
         slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
     if plan.tip_S:
@@ -168,7 +168,7 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"A station: {scenario}", title_justify="left", show_header=False)
+    table = Table(title=f"New station: {scenario}", title_justify="left", show_header=False)
     tool = "of the model" if plan.has_own_tool else "on the sensor"
     joint_names = plan.posture_shapes.arm.joint_names
     position = round_to_four_significant_digits(plan.place.position)
@@ -176,7 +176,7 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
         ("Joints", f"{len(joint_names)}: {', '.join(joint_names)}"),
         ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
         ("Start", f"sensor at {position} m, {plan.what_points_down} down"),
-        ("Reachable around it", plan.place.reachable_text),
+        ("Reachable from there", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)

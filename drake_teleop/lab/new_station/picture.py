@@ -26,18 +26,18 @@ _NUM_WALL_DIVISIONS = 8  # divisions of the wall in the picture
 _HULL_SPIRAL_INDICES = np.arange(0.5, 250.0)
 _HULL_SPIRAL_HEIGHTS = 1.0 - _HULL_SPIRAL_INDICES / 125.0
 _HULL_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _HULL_SPIRAL_INDICES
-_HULL_SPIRAL_CIRCLE = np.array([np.cos(_HULL_SPIRAL_ANGLES_RAD), np.sin(_HULL_SPIRAL_ANGLES_RAD)])
+_HULL_SPIRAL_UNIT_XY = np.array([np.cos(_HULL_SPIRAL_ANGLES_RAD), np.sin(_HULL_SPIRAL_ANGLES_RAD)])
 _HULL_SAMPLE_DIRECTIONS = np.column_stack(
-    [*(np.sqrt(1.0 - _HULL_SPIRAL_HEIGHTS**2) * _HULL_SPIRAL_CIRCLE), _HULL_SPIRAL_HEIGHTS]
+    [*(np.sqrt(1.0 - _HULL_SPIRAL_HEIGHTS**2) * _HULL_SPIRAL_UNIT_XY), _HULL_SPIRAL_HEIGHTS]
 )
 
 
 def draw_start(plan: StationPlan, title: str) -> Figure:
-    """Draw the shapes in the start posture; meshes as convex hulls."""
+    """Draw the station in its start posture, meshes as convex hulls."""
     shapes, wall = plan.posture_shapes, plan.wall
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
-    triangles, colours = [*triangles, faces], [*colours, _shade_triangles(faces, _WALL_COLOUR)]
+    triangles, colours = [*triangles, faces], [*colours, _shaded_colours(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
     at_start = postures_at(shapes.arm, plan.place.q[np.newaxis])
     chain = np.vstack([at_start.origins[0], at_start.p_WS])
@@ -79,7 +79,7 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
         for points in hulls:
             faces = _hull_triangles(points)
             triangles.append(faces)
-            colours.append(_shade_triangles(faces, colour))
+            colours.append(_shaded_colours(faces, colour))
     return triangles, colours
 
 
@@ -107,7 +107,7 @@ def _box_triangles(top: Array, size: Array) -> Array:
     return top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
 
 
-def _shade_triangles(triangles: Array, colour: tuple[float, float, float]) -> Array:
+def _shaded_colours(triangles: Array, colour: tuple[float, float, float]) -> Array:
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     bright = 0.72 + 0.28 * (normals @ (_LIGHT_DIRECTION / np.linalg.norm(_LIGHT_DIRECTION)))

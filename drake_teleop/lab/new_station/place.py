@@ -1,7 +1,7 @@
 """Start of an arm whose tool points down, chosen among random postures.
 
-Among the best postures (`posture_scores`), the one with the largest reachable cube is the start.
-The tool is along an axis of S, the z axis of frame A; S and A are the same for tools along z_S.
+The start is the posture with the largest reachable cube among those with the best
+`posture_scores`. Frame A is S, rotated so that z_A is the axis of S along the tool.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _CUBE_HALF_EDGES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of t
 _NUM_SOLVED_POSTURES, _NUM_BEST_STARTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
 _MAX_SCORE_LOSS_FOR_LARGER_CUBE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
-_MAX_ERROR_OVER_DISPLACEMENT = 0.1  # error of an arm with few joints, over displacement
+_MAX_ERROR_OVER_DISPLACEMENT = 0.1  # position error over displacement, below six dof
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
 _MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
@@ -71,7 +71,7 @@ MIN_LOAD_SHARE_HELD_BY_MOTORS = 0.05  #: Share of the load that weak motors must
 _SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_JOINT_MOVE_TO_CORNER = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
-_MAX_HEIGHT_ABOVE_LOWEST_M = 1e-4  # lowest points within this height share the contact [m]
+_LOWEST_POINT_TOLERANCE_M = 1e-4  # points within this height of the lowest share the contact
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
 _MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
@@ -84,13 +84,13 @@ class StartPlace(NamedTuple):
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
-        is_set_by_position: True if the position specifies the pose.
-        q: (n,) joint positions at the start [rad].
+        is_set_by_position: True if `slave.position` alone defines this start.
+        q: (n,) joint positions at the start [rad, m].
         cube_half_m: half edge of the reachable cube around the start [m].
         joint_margin: smallest distance of a joint to its limit, over half the joint's range.
-        posture_score: merit of the posture, see `posture_scores`, without the cost of overlaps.
+        posture_score: score of the posture (`posture_scores`) minus the costs of overlaps and wall.
         wall_edge_m: edge of the wall that fits below the tool [m].
-        moves_only_vertically: True if the arm can only move up and down by `cube_half_m`.
+        moves_only_vertically: True if only motion up and down by `cube_half_m` is reachable.
     """
 
     pose: Array
@@ -116,19 +116,18 @@ class StartPlace(NamedTuple):
 
     @property
     def home(self) -> list[float]:
-        """Joint positions for `slave.home`; empty if the position is sufficient."""
+        """Joint positions for `slave.home`; empty if `slave.position` is sufficient."""
         return [] if self.is_set_by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 class TrialWalls(Environment):
-    """Walls of each size in `WALL_EDGES_M` that can be moved below the tool."""
+    """Floating walls, one of each size in `WALL_EDGES_M`, to be tried below the tool."""
 
     @property
     def slip_speed(self) -> float:
         return 1e-3
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add one floating body for each wall."""
         for edge, name in _TRIAL_WALL_NAMES.items():
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
@@ -146,7 +145,7 @@ def find_start_place(
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
         plane: height of the base plane, below which the arm has no joints [m].
-        axis: axis of S along the tool, one of `TOOL_AXES`.
+        axis: axis of S that points down, one of `TOOL_AXES`.
     """
     table, rotation = arm.table.copy(), slice(ROTATION_COLUMN, TRANSLATION_COLUMN)
     table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ TOOL_AXES[axis].matrix()).ravel()
@@ -291,19 +290,19 @@ def _with_largest_wall(
 
 
 def lowest_tool_point(shapes: PostureShapes) -> Array:
-    """Return the tool's lowest point p_W (3,) [m]; without shapes its centre of mass."""
+    """Return the tool's lowest point p_W (3,) [m]; of a tool without shapes, its centre of mass."""
     points = shapes.points_on_bodies(shapes.tool_bodies)
     if not len(points):
         phi = shapes.arm.phi_load
         points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
-    lowest = points[points[:, 2] < points[:, 2].min() + _MAX_HEIGHT_ABOVE_LOWEST_M]
+    lowest = points[points[:, 2] < points[:, 2].min() + _LOWEST_POINT_TOLERANCE_M]
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
 def coordinates_along_axis(
     shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str
 ) -> Array:
-    """Return the coordinate (k,) of each point on bodies along an axis of S, from So [m]."""
+    """Return the coordinate (k,) along an axis of S, from So [m], of each point of the bodies."""
     points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
     along: Array = TOOL_AXES[axis].matrix()[:, 2] @ points
     return along
@@ -350,14 +349,14 @@ def _can_reach_corner(
 
 _MIN_COSINE_TOOL_TO_AXIS = 0.75  # smallest cosine of the angle between tool and axis
 _ROUNDING_TOLERANCE_M = 1e-9
-_MIN_DIRECTED_COM_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
+_MIN_NORM_OF_DIRECTION_M = 0.02  # below, the offset of a centre of mass has no direction
 
 
 def nearest_sensor_axis(direction: Array) -> str:
-    """Return the axis of S nearest to a direction (3,) in S; empty if none is near."""
+    """Return the axis of S nearest to a vector (3,) [m]; "" if it is short or between axes."""
     size = np.linalg.norm(direction)
     k = int(np.argmax(np.abs(direction)))
-    if size < _MIN_DIRECTED_COM_OFFSET_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
+    if size < _MIN_NORM_OF_DIRECTION_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
         return ""
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 
@@ -365,10 +364,9 @@ def nearest_sensor_axis(direction: Array) -> str:
 def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
     """Return the axis of S along the tool, with the sign away from the arm.
 
-    It is the axis nearest to the tool's centre of mass (3,) [m], or else to the last joint's axis.
-    The sign is that of the displacement from the arm to this centre; zeros: to So. The arm's point
-    is on the last joint's axis, level with the joint before: the joint's own origin is arbitrary
-    along its axis.
+    It is the axis nearest to `p_SScm_S` [m], the tool's centre of mass, else to the last joint's
+    axis. The sign is that of the displacement from the arm to this centre, or to So if it is zero.
+    The arm's point is that of the last joint's axis nearest to the joint before.
     """
     R = arm.table[-2:, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(2, 3, 3)
     p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]
@@ -380,14 +378,13 @@ def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
 
 
 def opposite_axis(axis: str) -> str:
-    """Return the axis of `TOOL_AXES` with the other sign."""
     return axis[1:] if axis.startswith("-") else f"-{axis}"
 
 
 def tool_frame_advice(
     model: Path, sensor_frame: str, axis: str, *, is_along_tool: bool = True
 ) -> str:
-    """Return advice on a sensor frame whose z axis is `axis`; empty: not needed."""
+    """Return how to add a sensor frame with z along `axis`, as a text; "" for axis "z"."""
     if axis == "z":
         return ""
     R_SA, name = TOOL_AXES[axis], f"{sensor_frame}_z_to_tool"
@@ -410,6 +407,6 @@ def tool_frame_advice(
     what = f"the tool points along {axis}_S" if is_along_tool else f"{axis}_S points down"
     return (
         f"{what}, so the start is in slave.home and the contact point in"
-        f" slave.tip; to use position, or another direction, add{place}"
+        f" slave.tip; to use slave.position, or another direction of the tool, add{place}"
         f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame {name}"
     )

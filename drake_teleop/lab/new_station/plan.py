@@ -42,15 +42,14 @@ class StationPlan:
     """Start, scales and motions of a new station.
 
     Args:
-        tool_mass_kg: mass beyond the sensor [kg].
         swing_amplitude_m: amplitude of the slave in free motion [m].
-        base_plane_height: height of the base plane [m].
+        base_plane_height: height z_W of the base plane [m].
         lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
         wall: horizontal wall, 1.5 swing amplitudes below this point.
-        tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
-        tool_axis_advice: advice if the axis that points down at the start is not z_S.
-        what_points_down: the tool, or an axis of S if the tool cannot point down.
-        weak_joints: joints whose torque limits cannot hold the arm.
+        tip_S: (3,) the same point in S [m]; empty if z_S points down.
+        tool_axis_advice: advice on the sensor frame if another axis than z_S points down, else "".
+        what_points_down: "tool", or an axis such as "x_S" if the tool cannot point down.
+        weak_joints: names of joints whose torque limits cannot hold the arm.
     """
 
     stand_in_tool: Tool | None
@@ -79,7 +78,6 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM_NAME,
 ) -> StationPlan:
-    """Choose start, scales and motions for an arm and a device."""
     stand_in = _stand_in_tool("z", _STAND_IN_LENGTH_M)
     slave = Slave(
         model=str(arm),
@@ -118,7 +116,7 @@ def plan_station(
     lowest = start.lowest_tool_point(shapes)
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
-    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_use(model, place, swing))
+    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _largest_speed_use_of_swing(model, place, swing))
     swing = _floor_to_two_significant_digits(swing)
     wall_position = lowest - [0.0, 0.0, 1.5 * swing]
     return StationPlan(
@@ -191,9 +189,9 @@ def _has_tool_beyond_sensor_link(shapes: PostureShapes, axis: str) -> bool:
 
 
 def find_base_plane_height(shapes: PostureShapes) -> float:
-    """Return the height of the base plane [m]: the lowest point of the shapes fixed to the world.
+    """Return the height z_W of the base plane [m]: the lowest point of shapes fixed to the world.
 
-    Without such shapes: the base, but not above the first joint.
+    Without such shapes it is 0, or the first joint's height if that is lower.
     """
     heights = shapes.points_on_bodies(shapes.anchored_bodies())[:, 2]
     return float(heights.min()) if len(heights) else min(float(shapes.arm.table[0, 11]), 0.0)
@@ -215,9 +213,9 @@ def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
 def _without_weak_torque_limits(
     arm: ArmModel, q: Array, load_share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
-    """Return the arm without torque limits that cannot hold it at q, their joints, and texts.
+    """Return the arm with infinite limits for weak joints, the names of these joints, and texts.
 
-    The arm must hold `load_share` of its load.
+    A weak joint's torque limit cannot hold the arm at q with `load_share` of its load.
     """
     torque = np.abs(holding_torque(arm.with_load(load_share * arm.phi_load), q))
     weak = torque > start.MAX_HOLDING_TORQUE_USE * arm.effort_limit
@@ -238,7 +236,7 @@ def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
     return mass
 
 
-def _swing_speed_use(arm: ArmModel, place: start.StartPlace, swing: float) -> float:
+def _largest_speed_use_of_swing(arm: ArmModel, place: start.StartPlace, swing: float) -> float:
     above = place.pose.copy()
     above[6] += swing
     displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)
@@ -251,5 +249,4 @@ def _floor_to_two_significant_digits(value: float) -> float:
 
 
 def round_to_four_significant_digits(values: Any) -> list[float]:
-    """Return numbers with four significant digits, for a file."""
     return [float(f"{value:.4g}") for value in values]

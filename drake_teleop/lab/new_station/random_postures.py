@@ -40,7 +40,7 @@ _SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE
 
 @dataclass(frozen=True, eq=False)
 class Postures:
-    """Joint positions and their frames, with a row for each posture.
+    """Joint positions of k postures, and the frames of the arm in each.
 
     Attributes:
         q: (k, n) joint positions [rad, m].
@@ -65,13 +65,13 @@ class StartRegion:
     """Region in which a start is searched.
 
     Attributes:
-        tool_length: distance of the tool's end from S [m].
+        tool_length: distance from So to the tool's end [m].
         first_joint_W: (3,) origin of the first joint, p_W [m].
-        plane_height: height of the base plane [m].
-        reach: radius that the arm reaches about its first joint [m].
-        is_joint_above_plane: (n,) True for joints above the base plane, not of a mobile base.
+        plane_height: height z_W of the base plane [m].
+        reach: horizontal distance that the arm reaches from its first joint [m].
+        is_joint_above_plane: (n,) True for joints that can be above the plane, except the first.
         side_direction_rad: direction of the region about z_W, from x_W [rad].
-        removed_counts: number of postures that each condition removed.
+        removed_counts: (condition, number of postures that it removed).
     """
 
     plane_height: float
@@ -84,7 +84,7 @@ class StartRegion:
 
     @property
     def preferred_position(self) -> Array:
-        """Position p_WS (3,) near which a start posture is best [m]: above the region's plane."""
+        """Position p_WS (3,) [m] near which a start posture has the best score."""
         r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane_height + self.tool_length
         height = max(
             height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
@@ -95,7 +95,6 @@ class StartRegion:
 
 
 def postures_at(arm: ArmModel, q: Array) -> Postures:
-    """Return the frames of an arm at joint positions q (k, n)."""
     R, p = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
     origins, axes = [], []
     for row, angle in zip(arm.table, [*q.T, np.zeros(len(q))], strict=True):
@@ -113,7 +112,6 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
 
 
 def random_postures(arm: ArmModel) -> Postures:
-    """Return `NUM_RANDOM_POSTURES` random postures."""
     lower, upper = joint_sampling_range(arm)
     random = np.random.default_rng(0)
     return postures_at(arm, random.uniform(lower, upper, (NUM_RANDOM_POSTURES, arm.num_joints)))
@@ -122,10 +120,10 @@ def random_postures(arm: ArmModel) -> Postures:
 def select_suitable_postures(
     postures: Postures, plane: float, tool_length: float
 ) -> tuple[Postures, StartRegion]:
-    """Return postures with the tool downwards, in reach and above `plane`, and their region.
+    """Return postures with the tool downwards, in reach and above the base plane, and their region.
 
-    Only those on the side of the first joint with most of them; `plane` is the height z_W of
-    the arm's base [m].
+    They are in one direction from the first joint, that with most postures. `plane` is the height
+    z_W of the base plane [m].
     """
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first
@@ -168,7 +166,7 @@ def _is_angle_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
 def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Array:
     """Return a score (k,) of each posture; the highest is the best.
 
-    It combines limits, singularities, elbow, base plane and preferred place.
+    It rates joint limits, singularities, elbow, base plane and distance to the preferred position.
     """
     margin = np.minimum(least_joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_weight_m(arm)
@@ -202,7 +200,7 @@ def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
 
 
 def sensor_degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
-    """Return the number of directions in which the sensor can move."""
+    """Return the degrees of freedom of the sensor: the largest rank of the Jacobian."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _jacobian_singular_values(arm, few)
     return int((values > _MAX_RATIO_OF_ZERO_SINGULAR_VALUE * values[:, :1]).sum(axis=1).max())
@@ -211,7 +209,7 @@ def sensor_degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
 def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     """Return the upward share (k,) of the elbow's offset from the line shoulder-wrist, -1 to 1.
 
-    The elbow is the joint that is farthest from the line of the first and last joint.
+    The elbow is the joint farthest from the line of the first and last joint. Small offsets give 1.
     """
     shoulder, wrist = postures.origins[:, 0], postures.origins[:, -1]
     along = wrist - shoulder

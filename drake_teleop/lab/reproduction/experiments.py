@@ -33,7 +33,7 @@ _CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
 
 @dataclass(frozen=True, eq=False)
 class MotionRun:
-    """Simulated movement, with the sensor's wrench for several shares of the load's wrench."""
+    """Simulated movement, with the scaled wrench for each of `SIGMAS`."""
 
     scenario: Scenario
     result: SimulationResult
@@ -44,7 +44,7 @@ class MotionRun:
 
 @dataclass(frozen=True, eq=False)
 class IdealSensorRun:
-    """Free movement with exact wrench and motion instead of sensor readings."""
+    """Free movement with the exact wrench and motion in place of sensor readings."""
 
     weld_reaction: Array  #: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So
     #: Specific force, angular velocity and angular acceleration of S, (N, 3) each.
@@ -61,12 +61,12 @@ class RunsWithAndWithoutContact:
 
     @property
     def in_contact(self) -> NDArray[np.bool_]:
-        """(N,) True in true contact."""
+        """(N,) True where the simulated tool touches."""
         return is_in_contact(self.touched.result)
 
     @property
     def response_span_s(self) -> tuple[float, float]:
-        """First contact, and end of the filters' response to the last; inf without contact [s]."""
+        """Times [s] of first contact and of the end of the last one's filter response, or inf."""
         times = self.touched.result.t[self.in_contact]
         return (times[0], times[-1] + FILTER_SETTLING_S) if len(times) else (np.inf, np.inf)
 
@@ -94,7 +94,7 @@ def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgres
 def simulate_contact(
     scenario: Scenario, estimate: Array, stage: StartStage
 ) -> RunsWithAndWithoutContact:
-    """Simulate the contact transition, and it without sheet spring and with the next seed."""
+    """Simulate the contact transition, then the same motion without sheet spring, with seed + 1."""
     seed = scenario.simulation.seed
     without = replace(scenario, sheet_spring=None, simulation__seed=seed + 1)
     touched = simulate_motion(scenario, estimate, stage("Fig. 8: contact transition"))
@@ -103,7 +103,7 @@ def simulate_contact(
 
 
 def simulate_ideal_motion(progress: UpdateProgress) -> IdealSensorRun:
-    """Simulate a movement along and about all axes."""
+    """Simulate a free movement along and about all axes with an ideal sensor."""
     move, turn = [0.02] * 3, [0.3, 0.4, 0.5]
     motion = Sine(duration=5.0, ramp=0.4, frequency=2.0, translation=move, rotation=turn)
     scenario = LoadScenario("ideal_sensor")
@@ -184,9 +184,9 @@ def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedV
 
 
 def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array:
-    """Return how far raw f_x, f_y, f_z, |f| (4,) leave their contact-free range in contact [N].
+    """Return by how much raw f_x, f_y, f_z, |f| (4,) leave their contact-free range in contact [N].
 
-    Negative: a value stays within, so that no threshold on it detects the contact.
+    For a negative number no threshold on this quantity detects the contact.
     """
     touched, free = (
         np.column_stack([force, np.linalg.norm(force, axis=1)])
@@ -200,14 +200,14 @@ def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array
 
 
 def time_of_largest_raw_force_after_contact(run: RunsWithAndWithoutContact) -> float | None:
-    """Return the time of the largest raw force after contact [s], or None."""
+    """Return the time [s] of the largest raw force after `response_span_s`, or None."""
     t, (_, end) = run.touched.result.t, run.response_span_s
     force = np.linalg.norm(run.touched.scaled_wrenches[1.0][t > end, :3], axis=1)
     return float(t[t > end][np.argmax(force)]) if len(force) else None
 
 
 def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> NamedValues:
-    """Return errors of the load estimate and the expected deviation of its mass, by name."""
+    """Return the errors of the load estimate and the standard deviation of its mass, by name."""
     truth = true_offsets_and_phi(scenario)
     error = load.estimate - truth
     mass, moment = load.estimate[6], load.estimate[7:10]
@@ -229,7 +229,7 @@ def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> Na
 
 
 def true_offsets_and_phi(scenario: Scenario) -> Array:
-    """Return the true sensor offsets and phi (16,) of Eq. (7)."""
+    """Return (16,) the true sensor offsets, then phi, of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 

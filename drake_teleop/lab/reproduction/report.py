@@ -71,7 +71,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Row of the identification table, in `unit`."""
+    """Row of the identification table; texts of numbers in `unit`."""
 
     symbol: str
     index: str
@@ -93,23 +93,23 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
                        s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
         _compare_range("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
                        s["free_force.half_ratio"], "", 0.48, 0.52),
-        _compare_range("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
+        _compare_range("found", "Fig. 6: largest residual force, σ = 0", "never above 5 N",
                        s["free_force.residual_max_N"], "N", 0, 5),
         _row_without_verdict("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
                       s["free_torque.peak_raw_Nm"], "N m"),
         _compare_range("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
                        s["free_torque.half_ratio"], "", 0.48, 0.52),
-        _row_without_verdict("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
+        _row_without_verdict("found", "Fig. 7: largest residual torque, σ = 0", "“very low”",
                       s["free_torque.residual_max_Nm"], "N m"),
-        _compare_range("found", "All axes, ideal sensor, true φ: force left", _NOT_REPORTED,
+        _compare_range("found", "All axes, ideal sensor, true φ: residual force", _NOT_REPORTED,
                        s["ideal.residual_max_N"], "N", 0, 1e-9),
-        _compare_range("found", "All axes, ideal sensor, true φ: torque left", _NOT_REPORTED,
+        _compare_range("found", "All axes, ideal sensor, true φ: residual torque", _NOT_REPORTED,
                        s["ideal.residual_max_Nm"], "N m", 0, 1e-9),
-        _compare_range("set", "Fig. 8: contact is made at", "about 220 ms",
+        _compare_range("set", "Fig. 8: time of contact", "about 220 ms",
                        1e3 * s["contact.true_s"], "ms", 205, 235),
-        _compare_range("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
+        _compare_range("found", "Fig. 8: detection delay in the contact force", "“clearly spotted”",
                        delay_ms, "ms", 0, 10),
-        _compare_yes_no("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
+        _compare_yes_no("Fig. 8: a threshold on the raw force detects contact", "“less obvious”",
                         s["contact.raw_detectable"], False),
         _compare_yes_no("Fig. 8: false alarm at about 600 ms", "no contact there",
                         s["contact.false_alarm_0_6_s"], False),
@@ -123,16 +123,16 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a text for each value outside its accepted range."""
+    """Return a text for each reproduced value that is outside its accepted range."""
     return [
-        f"{row.quantity}: {row.reproduced_value}, accepted {row.accepted_range}: {row.verdict}"
+        f"{row.quantity}: {row.reproduced_value} (accepted: {row.accepted_range}): {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
         if row.is_accepted is False
     ]
 
 
 def values_by_full_name(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return all values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
+    """Return all values in one dictionary, ``{"contact.true_s": 0.22, ...}``; None becomes NaN."""
     return {
         f"{part}.{name}": math.nan if value is None else value
         for part, figures in summary.items()
@@ -174,7 +174,7 @@ def figure_captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """Return the rows of the identification table from offsets and phi (16,), SI."""
+    """Return the rows of the identification table; arguments: offsets, then phi, (16,), in SI."""
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
     for (symbol, index, unit, scale), values in zip(PARAMETER_FORMATS, columns, strict=True):
@@ -218,7 +218,7 @@ def _summary_tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     left = f"{s['free_force.residual_max_N']:.2f} N, {s['free_torque.residual_max_Nm']:.2f}"
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),
-        (left, "N m", "at most left of force and torque after elimination"),
+        (left, "N m", "largest residual force and torque after elimination"),
         (f"{lag:.1f}", "ms", "from the touch to its detection"),
         (f"{s['identification.mass_error_percent']:.3f}", "%", "error of the identified mass"),
     ]
@@ -247,9 +247,9 @@ def _format_value(value: float, unit: str) -> str:
 
 
 def scaling_figure(run: experiments.MotionRun, component: int, symbol: str, unit: str) -> Figure:
-    """Draw Fig. 6 or 7: a wrench component at the slave for each sigma; right axes at the master.
+    """Draw Fig. 6 or 7: a wrench component for each sigma, at the slave (left) and master (right).
 
-    `symbol` is matplotlib text.
+    `symbol` is the component in Matplotlib's math text.
     """
     time, time_unit = _time_axis(run.result.t)
     traces = [wrench[:, component] for wrench in run.scaled_wrenches.values()]

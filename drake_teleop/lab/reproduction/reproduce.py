@@ -34,7 +34,7 @@ def reproduce_command(
 ) -> experiments.NamedValues:
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
-    Return the summary, and the measured speed, which differs between equal runs.
+    Return the summary and "speed", the measured simulation speed, in one dictionary.
     """
     seed = seed or 0
     files.make_folder(out)  # fail early for a bad path
@@ -93,7 +93,7 @@ def _measure_simulation_speed(progress: UpdateProgress) -> experiments.NamedValu
 
 
 def MakeBarePlantSimulator(scenario: Scenario, *, touching: bool = False) -> Simulator:
-    """Return a simulator of arm and tool under constant torque; `touching` adds the environment."""
+    """Return a simulator of the arm held by constant torques; `touching` adds the environment."""
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings if touching else None)
     step = 1 / scenario.rates.sensor_hz
@@ -108,7 +108,6 @@ def MakeBarePlantSimulator(scenario: Scenario, *, touching: bool = False) -> Sim
 
 
 def MakeSettledStationSimulator(scenario: Scenario) -> Simulator:
-    """Return a simulator of the station, advanced to the end of its settling time."""
     # The value of the estimate does not change the cost.
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
@@ -120,7 +119,7 @@ def MakeSettledStationSimulator(scenario: Scenario) -> Simulator:
 def cpu_time_per_simulated_second(
     simulators: Mapping[str, Simulator], *, progress: UpdateProgress = lambda done: None
 ) -> dict[str, float]:
-    """Return the least CPU time per simulated second of each simulator."""
+    """Return the CPU time [s] per simulated second of each simulator, the least of several."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
     for k in range(_NUM_TIMINGS):
         for name, simulator in simulators.items():

@@ -20,7 +20,7 @@ _LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e
 
 
 def propose_points(points: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
-    """Return the indices of the `count` candidates with the largest expected improvement.
+    """Return the indices of `count` candidates, chosen in turn by the largest expected improvement.
 
     `points` (n, d) and `candidates` (m, d) have coordinates from 0 to 1; `objective` (n,) is
     minimised; nan counts as the worst value.
@@ -47,7 +47,7 @@ def propose_points(points: Array, objective: ArrayLike, candidates: Array, count
 
 
 def _fit_kernel_lengths_and_noise(points: Array, y: Array) -> tuple[Array, float]:
-    def misfit(x: Array) -> float:
+    def log_loss(x: Array) -> float:
         K = _matern_kernel(points / np.exp(x[:-1]), points / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])
         factor = cho_factor(K, lower=True)
@@ -56,7 +56,7 @@ def _fit_kernel_lengths_and_noise(points: Array, y: Array) -> tuple[Array, float
 
     bounds = [_LOG_LENGTH_BOUNDS] * points.shape[1] + [_LOG_NOISE_BOUNDS]
     starts = (np.log([length] * points.shape[1] + [0.1]) for length in (0.3, 1.5))
-    found = [minimize(misfit, start, method="L-BFGS-B", bounds=bounds) for start in starts]
+    found = [minimize(log_loss, start, method="L-BFGS-B", bounds=bounds) for start in starts]
     x = min(found, key=lambda result: result.fun).x
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 

@@ -38,20 +38,20 @@ class Factor:
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def level_values(self) -> Sequence[FactorValue]:
-        """Return the listed values, or `levels` numbers from `low` to `high`."""
+        """Return the listed values, or `levels` evenly spaced numbers from `low` to `high`."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
 
     def value_at_share(self, share: float) -> FactorValue:
-        """Return the value at a share (0 to 1) from `low` to `high`, or of the list."""
+        """Return the value at a share (0 to 1) of the range `low` to `high`, or of the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.level_values()
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: FactorValue) -> list[float]:
-        """Return the share from `low` to `high`, or an indicator of each word, flag or vector."""
+        """Return [share of the range] of a number, or 0 or 1 for each listed other value."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
@@ -128,11 +128,11 @@ class Study:
             what = "is empty (a study varies at least one field)"
             raise DrakeTeleopError(what, where=f"{where}:factors", remedy="add a factor")
         if self.design == "sobol" and self.samples & (self.samples - 1):
-            what = f"{self.samples} Sobol points are not balanced (a power of two is)"
+            what = f"{self.samples} Sobol points are not balanced (only a power of two is)"
             raise DrakeTeleopError(what, where=f"{where}:samples", remedy="give a power of two")
         if (self.design == "adaptive") != (self.objective in self.measures):
             what = f"'{self.objective}' cannot be the objective of design '{self.design}'"
-            remedy = "give one of the measures for an adaptive design, none for others"
+            remedy = "give one of the measures for an adaptive design, no objective for others"
             raise DrakeTeleopError(what, where=f"{where}:objective", remedy=remedy)
 
     def num_points(self) -> int:
@@ -141,7 +141,7 @@ class Study:
         return self.samples
 
     def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Raise DrakeTeleopError above `MAX_RUNS` runs, or without consent if they take days.
+        """Raise DrakeTeleopError for too many runs, or without consent to runs that take days.
 
         `yes` is the consent, or a function from a question to the user's answer.
         """
@@ -154,10 +154,10 @@ class Study:
             return
         if yes is False or not yes(f"{where}: {count}. Begin?"):
             remedy = "confirm them by --yes (in Python: yes=True)"
-            raise DrakeTeleopError(f"{count} need a confirmation", where=where, remedy=remedy)
+            raise DrakeTeleopError(f"{count} require a confirmation", where=where, remedy=remedy)
 
     def points(self) -> list[FactorValues]:
-        """Return all points (field -> value); of an adaptive design, the first ones."""
+        """Return all points (field -> value), or the first points of an adaptive design."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
             combinations = itertools.product(*(factor.level_values() for factor in self.factors))
@@ -186,7 +186,7 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[FactorValues], first: int = 0) -> list[dict[str, Any]]:
-        """Return a table row (run, point, seed, values) for each run, from point `first`."""
+        """Return a row (run, point, repeat, seed, values) per run; points count from `first`."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values

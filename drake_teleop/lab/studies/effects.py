@@ -47,10 +47,10 @@ class FactorialModel:
     has_value: BooleanArray
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags of comparable levels of `factors` and of used combinations, and a matrix.
+        """Return flags of comparable levels of `factors` and of used combinations, and weights.
 
-        For two factors, a level is a pair of levels. The matrix (comparable levels, n) maps values
-        of points to means over the used combinations of the other factors' levels.
+        Combinations are those of the other factors' levels. With two `factors` a level is a pair.
+        The weights (comparable levels, n) map values of points to means over used combinations.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in factors]
         row, rows = self._combination_indices(factors)
@@ -69,7 +69,7 @@ class FactorialModel:
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        """Return the means over points, by `weights`, and over seeds, and their half widths."""
+        """Return the means `weights @ table` over seeds, and their half widths."""
         mean, half = means_and_half_widths_over_seeds(weights @ table)
         return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
 
@@ -126,7 +126,7 @@ def means_and_half_widths_over_seeds(table: Array) -> tuple[Array, Array]:
 
 
 def effect_half_widths_over_seeds(table: Array) -> Array:
-    """Return the half widths (n,) of the differences from the mean of all n levels."""
+    """Return the half widths (n,) of the differences from the mean of n levels (n, seeds)."""
     # Seeds without some level are excluded: they would shift all other levels.
     return means_and_half_widths_over_seeds(table - table.mean(axis=0))[1]
 
@@ -144,8 +144,8 @@ class MainEffect:
         num_runs: (n,) number of runs with the measure.
         mean, half_width: (n,) mean over other factors and seeds, and its half width.
         effect, effect_half_width: (n,) difference from the mean of all levels, and its half width.
-        missing_reasons: (n,) reason of a missing value.
-        num_used_combinations, num_unused_combinations: combinations of other factors' levels.
+        missing_reasons: (n,) why a value is missing, else "".
+        num_used_combinations, num_unused_combinations: of the other factors' levels.
         is_fitted: True if the values are from a regression.
     """
 
@@ -167,7 +167,7 @@ class PairMeans:
 
     Attributes:
         mean: (n, m) means over other factors and seeds; nan if not comparable.
-        missing_reasons: (n, m) reason of a missing value.
+        missing_reasons: (n, m) why a value is missing, else "".
         num_used_combinations, num_unused_combinations, is_fitted: see `MainEffect`.
     """
 
@@ -275,15 +275,15 @@ class _MeasureData:
         return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
     def _reasons_and_counts(
-        self, compared: BooleanArray, cell: NDArray[np.int64], over: BooleanArray, *factors: int
+        self, compared: BooleanArray, cell: NDArray[np.int64], used: BooleanArray, *factors: int
     ) -> tuple[list[str], int, int, bool]:
-        # The last four fields of `MainEffect`; `over` flags the used combinations.
+        # The last four fields of `MainEffect`; `used` flags combinations.
         points, runs = (np.bincount(cell, each, len(compared)) for each in (None, self.runs))
         why = missing_value_reasons(compared, points, runs)
         why = [TOO_FEW_POINTS] * len(compared) if self.model is None else why
         total = math.prod(len(f.names) for k, f in enumerate(self.levels) if k not in factors)
-        used = round(np.mean(over) * total)
-        return why, used, total - used, not isinstance(self.model, FactorialModel)
+        num_used = round(np.mean(used) * total)
+        return why, num_used, total - num_used, not isinstance(self.model, FactorialModel)
 
 
 def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array:
@@ -296,7 +296,7 @@ def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return mean, `_half` width, `complete`, `front` by point; None without `PARETO_MEASURES`."""
+    """Return means, half widths, `complete`, `front` of points; None without `PARETO_MEASURES`."""
     import polars as pl
 
     if not set(PARETO_MEASURES) <= set(study.measures) or rows.is_empty():
@@ -313,7 +313,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether each point is complete and not dominated; columns are minimised."""
+    """Return which points, rows of `values` to minimise, are complete and not dominated."""
     found = complete.copy()
     other = values[complete]
     for index in np.flatnonzero(complete):
@@ -327,7 +327,7 @@ def varied_factors(study: Study) -> list[Factor]:
 
 
 def measure_values(rows: pl.DataFrame, measure: str) -> Array:
-    """Return the values (N,) of a measure in all rows; nan where missing."""
+    """Return the values (N,) of a measure in all rows, nan where missing."""
     import polars as pl
 
     return rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()

@@ -38,13 +38,13 @@ def largest_complete_block(has_value: BooleanArray) -> tuple[BooleanArray, Boole
 
 
 def missing_value_reasons(
-    compared: BooleanArray, runs: NDArray[np.int64], successes: NDArray[np.int64]
+    compared: BooleanArray, points: NDArray[np.int64], successes: NDArray[np.int64]
 ) -> list[str]:
-    """Return for each level or cell why it has no value; "" where `compared` is True.
+    """Return why each level or cell has no value; "" where `compared` is True.
 
-    `runs` and `successes` count its points, and its runs with a value.
+    `points` and `successes` count its points, and its runs with a value.
     """
-    why = np.where(runs == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, NOT_COMPARABLE))
+    why = np.where(points == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
 
@@ -64,10 +64,10 @@ class Levels:
     Attributes:
         index: (n,) level of each point.
         names: labels of the levels with a point.
-        within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
-        centred_columns: (n, k) regression columns with zero mean: numbers, or indicators of all
+        within: (n,) position in the section of a range, -1/2 to 1/2; None for listed values.
+        centred_columns: (n, k) centred coordinates of the points: numbers, or indicators of all
             values but one.
-        middle_columns: (levels, k) these columns at the middle of each level.
+        middle_columns: (levels, k) the same coordinates at the middle of each level.
     """
 
     index: NDArray[np.int64]
@@ -103,9 +103,9 @@ class LevelModel:
     """Linear regression of a measure on the levels of all factors.
 
     Attributes:
-        codes: for each factor, the columns (levels, k) of its levels.
-        products: columns of X for each pair (i, j) of factors.
-        failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
+        codes: for each factor, the effect codes (levels, k) of its levels, columns of X.
+        products: columns of X with products of factors (i, j).
+        failed: True for excluded cells (levels, levels) of factors (i, j); (i, i): for levels.
         X: (n, p) design matrix; first column: the mean.
         pseudo_inverse: (p, n) pseudo-inverse of X.
     """
@@ -118,7 +118,7 @@ class LevelModel:
     pseudo_inverse: Array
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return the same as `FactorialModel`, but with a matrix from coefficients to means."""
+        """Return flags as `FactorialModel` does, and a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(factors))
         related = [*factors, *others]
         shape = [len(self.factors[factor].names) for factor in related]
@@ -176,11 +176,11 @@ class LevelModel:
     def _degrees_of_freedom(self) -> int:
         return self.X.shape[0] - self.X.shape[1]
 
-    def _residual_variance(self, table: Array, columns: int) -> float:
+    def _residual_variance(self, table: Array, num_columns: int) -> float:
         residuals = table - self.X @ (self.pseudo_inverse @ table)
         # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
-        return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
+        return max(float(np.sum(residuals**2)) / (num_columns * self._degrees_of_freedom), least)
 
     def _relative_std(self, terms: Array) -> Array:
         return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
@@ -208,10 +208,10 @@ def fit_level_model(
     *,
     by_chance: bool = True,
 ) -> LevelModel | None:
-    """Return the finest regression model that the points determine, or None.
+    """Return a regression model with as many terms as the points determine, or None.
 
-    `known` (n,): the measure has a value; `by_chance`: combinations without points are missing by
-    chance.
+    `known` (n,) flags points with a value. With `by_chance` combinations without points are
+    missing by chance, not by failure.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _RANGE_PARTS_AND_PRODUCTS:

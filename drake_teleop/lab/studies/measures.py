@@ -49,14 +49,13 @@ MEASURES = (*_MEASURES_OF_EVERY_RUN, *TASK_MEASURE_NAMES)
 
 
 def default_measures() -> list[str]:
-    """Return the names of the measures of every scenario, with or without a task."""
     return list(_MEASURES_OF_EVERY_RUN)
 
 
 def evaluate_measures(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
-    """Return the measures `names` of one run; `force_threshold` in N."""
+    """Return the measures `names` of one run, by name; `force_threshold` is in N."""
     if "force_to_master" not in result:
         what = "the run identifies the load without a hand, so it has no measures"
         remedy = "give the operator an intent or a task, or set load_estimator.enabled: false"

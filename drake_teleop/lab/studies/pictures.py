@@ -105,7 +105,7 @@ def _label_levels(axes: Axes, levels: list[str]) -> None:
 
 def _describe_used_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
     used, unused = found.num_used_combinations, found.num_unused_combinations
-    return f"over {used} of {used + unused} combinations of the rest" if unused else ""
+    return f"over {used} of {used + unused} combinations of the other factors" if unused else ""
 
 
 def _hatched_cell_without_value(why: str, corner: tuple[float, float]) -> Rectangle:
@@ -143,14 +143,14 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
-        words = ", fitted: levels of each, and products" if maps[0].is_fitted else ""
+        words = ", by regression on levels and products" if maps[0].is_fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
         _draw_hatch_legend(figure, set().union(*(found.missing_reasons.ravel() for found in maps)))
     return figure
 
 
 def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
-    """Draw effort over time and over force overshoot; return None without complete points."""
+    """Draw effort against task time and force overshoot; return None without complete points."""
     points = pareto_table(study, rows)
     if points is None or not points["complete"].any():
         return None
@@ -178,7 +178,7 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
                 lines.append(f"{place}: {', '.join(values)}")
             figure.text(1.0, 0.5, "\n".join(lines), fontsize=7.5, va="center")
         left = rows["point"].n_unique() - points.height
-        words = f"; points left out for failures: {left}" if left else ""
+        words = f"; without {left} points that have failed runs" if left else ""
         title = f"Pareto front of all three (red){_interval_caption(study, 'of the mean')}{words}"
         figure.suptitle(title, x=0.01, ha="left")
     return figure

@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
 If a run crashes its process, the runs of its chunk are repeated one by one; a run that crashes
-again gets an error. With one job, a crash ends the study.
+again gets an error text. With one job, a crash ends the study.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ PROCESS_ENDED_ERROR = "the run has ended its process"
 def open_executor(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
 ) -> Iterator[tuple[int, RunChunks]]:
-    """Start the processes; yield the number of parallel runs and a function that runs chunks.
+    """Start the processes; yield the number of parallel runs and a `RunChunks` function.
 
     `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
     """
     if executor is not None:
         if not isinstance(executor, Executor):
             what = f"has type {type(executor).__name__}, not concurrent.futures.Executor"
-            remedy = "pass a ProcessPoolExecutor, for instance"
+            remedy = "pass an Executor, such as ProcessPoolExecutor"
             raise DrakeTeleopError(what, where="executor", remedy=remedy)
         workers = getattr(executor, "_max_workers", max(jobs, 1))
         yield workers, lambda run, chunks: _run_on_executor(run, chunks, executor)

@@ -1,4 +1,4 @@
-"""Execution of a study: from the design through the processes into the store."""
+"""Execution of a study: runs its design in processes and stores the results."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def run_study(
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
-    `inputs` is JSON data of all other inputs of the rows. `shard` "K/N" restricts runs and rows to
+    `inputs` is JSON data of the inputs besides `study`. `shard` "K/N" restricts runs and rows to
     this shard; `merge` collects the rows of all shards and runs nothing.
     """
     import polars as pl
@@ -97,7 +97,7 @@ def run_study(
                     chunks = _group_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
-            remedy = f"{out} keeps {counter.done} of {counter.total} runs; repeat the command"
+            remedy = f"{out} contains {counter.done} of {counter.total} runs; repeat the command"
             if isinstance(error, CannotWrite):
                 raise DrakeTeleopError(str(error), remedy=remedy) from error
             raise KeyboardInterrupt(remedy) from error

@@ -60,7 +60,7 @@ class ScaleRating:
 def scaling_study_command(
     out: Path, *, quiet: bool = False, progress: bool = True, **options: Any
 ) -> dict[str, Any]:
-    """Run the missing runs of the scaling studies; write results; return answer.json's content.
+    """Run the missing runs of the scaling studies; write results; return those of answer.json.
 
     The other options are those of `study_command`.
     """
@@ -242,16 +242,16 @@ def draw_best_scales(
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
             axes.set_xlabel("$\\gamma$")
             axes.set_ylabel("$\\sigma$")
-            axes.set_title(f"counts: {selection}")
+            axes.set_title(f"criteria: {selection}")
             for i, j in np.ndindex(found.merit.shape):
                 dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
                 axes.text(j, i, _merit_cell_text(found, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
-        bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
+        bar = figure.colorbar(drawn, ax=grid, label="merit (1: that of sigma = gamma = 1)")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
         bar.minorticks_off()
-        words = "Merit, and how often a point is the best; grey: in some task too many runs fail"
+        words = "Merit, and share of draws in which a point is best; grey: too many failed runs"
         figure.suptitle(words, x=0.01, ha="left")
     return figure
 
@@ -267,7 +267,7 @@ def _print_best_scales(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("what counts", "sigma", "gamma", "merit", "95 %", "best in")
+    table = Table("criteria", "sigma", "gamma", "merit", "95 %", "best in draws")
     for selection, found in summary["choice"].items():
         if found is not None:
             low, high = found["interval"]

@@ -32,7 +32,7 @@ _MAX_SHARDS_IN_MESSAGE = 20
 
 @dataclass(frozen=True)
 class Store:
-    """Table of a study's rows: a folder with a file per chunk (runs of one process)."""
+    """Table of a study's rows: a folder with one part file per chunk of runs."""
 
     folder: Path
 
@@ -54,7 +54,7 @@ class Store:
         files.write_table(path, rows, temporary_base=self.folder)
 
     def add_part(self, part: Path) -> None:
-        """Link a part of another store, unless this store has this part."""
+        """Add a part file of another store by a link or copy, unless a part has its name."""
         path = self.folder / part.name
         if path.exists():
             return
@@ -133,7 +133,7 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             what = "is in use by another process"
-            raise DrakeTeleopError(what, where=str(out), remedy="wait for it, or stop it") from None
+            raise DrakeTeleopError(what, where=str(out), remedy="wait for it to end") from None
         write_or_check_identity(out, identity)
         yield
     finally:
@@ -141,7 +141,7 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
 
 
 def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:
-    """Write the inputs of the rows into a new folder; raise an error if an old one has others."""
+    """Write `identity` into a new folder `out`; raise an error if an old one has another."""
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():
@@ -173,7 +173,7 @@ def parse_shard(text: str) -> Shard:
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
     if not found or not 1 <= int(found[1]) <= int(found[2]):
         what = f"{text!r} is not K/N with 1 <= K <= N"
-        raise DrakeTeleopError(what, where="shard", remedy="give one, such as 3/8")
+        raise DrakeTeleopError(what, where="shard", remedy="give a shard such as 3/8")
     return Shard(int(found[1]), int(found[2]))
 
 

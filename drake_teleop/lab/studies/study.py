@@ -32,9 +32,9 @@ class StationRunFunction:
     """Picklable function that executes one run of the station for a study.
 
     Args:
-        scenario_data: content of the base scenario's file.
+        scenario_data: content of the scenario file.
         scenario_file: name of that file, for messages.
-        force_threshold_N: force [N] of time_above_force_s.
+        force_threshold_N: threshold [N] of the measure time_above_force_s.
     """
 
     scenario_data: Any
@@ -124,7 +124,7 @@ def study_command(
 
 
 def LoadStudy(path: str | Path) -> Study:
-    """Load a study file and check everything that does not depend on the scenario."""
+    """Return the study in a file or of a shipped name, checked without its scenario."""
     path = scenarios.find_shipped_file("study", path, studies_dir())
     study = scenarios.settings_without_range_check(Study, read_yaml(path), str(path))
     study.check(str(path))
@@ -174,6 +174,6 @@ def _print_summary(study: Study, summary: dict[str, Any], out: Path) -> None:
     console.print(table)
     console.print(f"{summary['runs']} runs, {summary['failed']} failed", highlight=False)
     if summary["failed"]:
-        console.print("[bold yellow]warning:[/] the first one:", highlight=False)
+        console.print("[bold yellow]warning:[/] first error:", highlight=False)
         console.print(summary["first_error"], highlight=False, markup=False)
     console.print(f"written to {out}", highlight=False, markup=False)

@@ -1,1 +1,1 @@
-"""Choice of passivity method and force scales for a station, hands, walls and a network."""
+"""Choice of passivity method and force scales for given hands, walls and network."""

@@ -37,7 +37,7 @@ from drake_teleop.station.station import MakeTeleopStation
 MAX_RENDERED_FORCE_ERROR = 0.1
 """Largest accepted error of the rendered force, as a share of the scaled contact force."""
 MAX_TUNED_FORCE_ERROR = 0.075
-"""The same for settings that `tune` chooses; the difference is for other seeds and walls."""
+"""Smaller limit for settings that `tune` chooses, as a margin for other seeds and walls."""
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
 _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window of rest; its length
@@ -56,7 +56,7 @@ GIVEN_SETTINGS_NAME = "as given"
 
 @dataclass(frozen=True)
 class TaskRequirements:
-    """Requirements of a task."""
+    """Stability margin and sensor bandwidth that a task requires."""
 
     loop_gain_margin: float  #: factor of the loop gain that must still be stable
     min_low_pass_hz: float  #: lowest bandwidth of the sensor; a lower one delays the contact force
@@ -67,12 +67,12 @@ REQUIREMENTS_OF_TASK = {
     "touch": TaskRequirements(1.1, 100.0),
     "insert": TaskRequirements(1.5, 50.0),
 }
-"""Tasks by name. A peg jams between two walls, which doubles the stiffness: a larger margin."""
+"""Requirements by task. A peg between two walls doubles the stiffness: a larger margin."""
 
 
 @dataclass(frozen=True)
 class OperatingRange:
-    """Hands, walls and task for which the settings must hold."""
+    """Hands, walls and task for which settings must meet the requirements."""
 
     hands: tuple[str, ...]  #: names of all grips from the softest to the firmest
     walls: tuple[float, float]  #: lowest and highest stiffness [N/m]
@@ -80,13 +80,13 @@ class OperatingRange:
 
     @property
     def corners(self) -> list[tuple[str, float]]:
-        """Softest and firmest grip at the softest and stiffest wall; the stiffest wall first."""
+        """Softest and firmest grip, each at the stiffest, then at the softest wall [N/m]."""
         hands = dict.fromkeys((self.hands[0], self.hands[-1]))
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
     def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
-        """Factor of gamma, grips, wall stiffnesses of each part of the tests, with its own seed.
+        """Parts of the test, each with its own seed: factor of gamma, grips, walls [N/m].
 
         The softest grip fails first: it is tested twice. The last part has no margin.
         """
@@ -102,11 +102,11 @@ class OperatingRange:
 
 
 def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str) -> OperatingRange:
-    """Return the set of these grips, walls [kN/m] and this task."""
+    """Return the operating range of these grips, walls [kN/m] and this task."""
     _check_names("hands", hands, tuple(GRIP_IMPEDANCES))
     _check_names("task", [task], tuple(REQUIREMENTS_OF_TASK))
     if not hands:
-        raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
+        raise DrakeTeleopError("no grip is given", where="hands", remedy="give one, such as light")
     if not walls:
         remedy = "give kN/m, such as 0.5,20"
         raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
@@ -129,7 +129,7 @@ def _check_names(where: str, names: Sequence[str], known: tuple[str, ...]) -> No
 
 
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
-    """Return the scenario with sigma 0, without environment, task and method.
+    """Return the scenario without environment, task, passivity method and displayed load.
 
     `network` is a preset; None keeps the scenario's network.
     """
@@ -164,7 +164,7 @@ class TunedSettings:
     low_pass_hz: float
 
     def passivity(self, stated: OperatingRange) -> PassivityConfig:
-        """Return the method's settings; `charged_tdpa` assumes the firmest stated hand."""
+        """Return the passivity settings; `charged_tdpa` assumes the range's firmest grip."""
         hand = GRIP_IMPEDANCES[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
@@ -192,7 +192,7 @@ def settings_from_values(values: FactorValues) -> TunedSettings:
 
 @dataclass(frozen=True)
 class StationPressTrial:
-    """Function that a study runs: one press on a wall, with the whole station."""
+    """Function that a study runs: simulate a press on a wall by the whole station."""
 
     user_scenario: Scenario  #: with the user's passivity and scales
     base_scenario: Scenario  #: the same without environment, task and passivity method
@@ -237,7 +237,7 @@ class StationPressTrial:
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Function that a study runs: the largest gamma that is stable in one axis at all corners."""
+    """Function that a study runs: find the largest gamma for all extremes, in one axis."""
 
     base_scenario: Scenario
     operating_range: OperatingRange
@@ -282,7 +282,7 @@ class OneAxisGammaSearch:
     def share_in_one_axis(
         self, axis: OneAxis, settings: TunedSettings, grip: str, wall: float, seed: int
     ) -> float:
-        """Return the rendered share of the contact force; 0: unstable or too noisy at rest."""
+        """Return the rendered share of contact force in a one-axis run; 0: unstable or noisy."""
         forward, backward = self.base_scenario.channel.networks_of_directions()
         held = axis_with_grip(axis, grip)
         shown = {f.name: getattr(held, f.name) for f in dataclasses.fields(AxisParameters)}
@@ -319,14 +319,14 @@ def short_press_task(round_trip: float) -> Task:
 
 
 def renderable_press_depth(base: Scenario, grip: str) -> float:
-    """Return the hand's displacement [m] into a wall that the device can render to the grip."""
+    """Return an intended depth [m] in a wall whose force the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
     return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
 def rms_above_5_hz(x: Array, period: float) -> float:
-    """Return the rms of x (N,) above 5 Hz, without parabola; inf for invalid x."""
+    """Return the rms above 5 Hz of x (N,), less a fitted parabola; inf if not finite."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

@@ -1,8 +1,8 @@
 """`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
 
-The search of settings that hold for all stated hands and walls (`OperatingRange`) has three stages:
-limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
-its softest and stiffest wall and between them, with several seeds.
+The settings must meet the requirements for all stated hands and walls (`OperatingRange`). Stages of
+the search: limit of the linear loop; simulation in one axis; the whole station with all grips at
+the softest to stiffest wall and several seeds.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
-"""Candidates; others are dominated by them or render too little force."""
+"""Candidate passivity methods; other methods are inferior or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
-"""Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
-STIFFEST_WALL_FACTORS = (1.2, 2.0)
-"""Factors of the stiffest wall, at which the limits of the settings are searched."""
-BEYOND_MARGIN_FACTOR = 1.2
-"""Factor of the margin of gamma, at which they are searched too."""
-_LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
-_MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
-_MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
-# Gamma fails and holds by this factor above and below that of accepted noise.
-_GAMMA_STEP_ABOUT_NOISE_LIMIT = 1.03
+"""Candidate sigma_inertia: a larger one helps the hand to hold a wall, and masks contact."""
+FAILURE_SEARCH_WALL_FACTORS = (1.2, 2.0)
+"""Factors of the stiffest wall at which the chosen settings are tested for failure."""
+FAILURE_SEARCH_GAMMA_FACTOR = 1.2
+"""Factor of gamma times margin at which the chosen settings are tested for failure."""
+_LOW_PASSES_HZ = (100.0, 50.0)  # Hz, candidates below the sensor's own bandwidth
+_MAX_GAMMA_REDUCTION_FACTOR = 16.0  # from the limit in one axis to that of the station
+_MAX_UNSTABLE_TO_STABLE_GAMMA_RATIO = 1.15  # at which the bisection ends
+# Gammas this factor above and below the limit of noise are assumed to fail and to hold.
+_NOISE_LIMIT_GAMMA_STEP_FACTOR = 1.03
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -65,8 +65,8 @@ def tune(
     Args:
         scenario: shipped name, YAML file, or scenario.
         out: folder of the results; the same call continues an interrupted one.
-        hands: grips; settings hold from the softest to the firmest.
-        walls: stiffnesses [kN/m]; settings hold from the lowest to the highest.
+        hands: grips; settings are for all from the softest to the firmest.
+        walls: stiffnesses [kN/m]; settings are for all from the lowest to the highest.
         network: preset; None: channel of the scenario.
         task: press, touch or insert.
         jobs: number of processes; -1: one for each core.
@@ -76,7 +76,7 @@ def tune(
         The content of summary.json (docs/choose.md).
 
     Raises:
-        DrakeTeleopError: for an invalid set, or if no settings are stable.
+        DrakeTeleopError: for invalid hands, walls or names, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), press_trial.make_operating_range(hands, walls, task)
@@ -117,19 +117,19 @@ def tune(
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of the search."""
+    """Result of `search_settings`."""
 
     settings: TunedSettings
     #: Tried settings in one axis, with the predicted `threshold_N` and `gamma`.
     searched_settings: list[Row]
     given_runs: list[Row]  #: runs of the user's settings at the stiffest wall
-    #: Runs in the stated set: gamma times margin, then gamma at the stiffest wall.
+    #: Runs in the operating range: gamma times margin, then gamma at the stiffest wall.
     inside_runs: list[Row]
     beyond_runs: list[Row]  #: runs with a larger gamma, then at stiffer walls
 
 
 def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
-    """Return the stable settings with which the operator detects the smallest force."""
+    """Return the stable settings with which the operator detects the smallest contact force."""
     base, stated = trial.base_scenario, trial.operating_range
     margin = stated.requirements.loop_gain_margin
     own = base.wrist_sensor.bandwidth_hz
@@ -161,7 +161,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _find_station_gamma(press_trial.settings_from_values(row), trial, execute)
+        gamma, inside = _max_station_gamma(press_trial.settings_from_values(row), trial, execute)
         if inside:
             chosen = dataclasses.replace(press_trial.settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
@@ -171,23 +171,21 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
         remedy = "give firmer --hands, softer --walls or a faster --network"
         raise DrakeTeleopError(what, where="tune", remedy=remedy)
     _, chosen, inside = found[0]
-    larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
+    larger = dataclasses.replace(chosen, gamma=FAILURE_SEARCH_GAMMA_FACTOR * margin * chosen.gamma)
     beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
-    walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
+    walls = [factor * stiffest for factor in FAILURE_SEARCH_WALL_FACTORS]
     beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
     return SearchResult(chosen, search, given, inside, beyond)
 
 
-def _find_station_gamma(
+def _max_station_gamma(
     settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
-
-    def holds(rows: list[Row]) -> bool:
+    def all_meet_requirements(rows: list[Row]) -> bool:
         return all(meets_requirements(row, press_trial.MAX_TUNED_FORCE_ERROR) for row in rows)
 
     gamma, stable, failed = settings.gamma, 0.0, np.inf
-    smallest = gamma / _MAX_GAMMA_REDUCTION
+    smallest = gamma / _MAX_GAMMA_REDUCTION_FACTOR
     inside: list[Row] = []
     while gamma >= smallest:
         rows: list[Row] = []
@@ -195,18 +193,18 @@ def _find_station_gamma(
             tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
             rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
-            if not holds(rows):
+            if not all_meet_requirements(rows):
                 break
         else:
             stable, inside = gamma, rows
         if stable < gamma:
             failed, smaller = gamma, gamma / 2
-            if holds([row | {"rest_force_N": 0.0} for row in rows]):
+            if all_meet_requirements([row | {"rest_force_N": 0.0} for row in rows]):
                 # Noise grows with gamma.
                 quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
-                smaller = max(smaller, quiet / _GAMMA_STEP_ABOUT_NOISE_LIMIT)
-                failed = min(failed, quiet * _GAMMA_STEP_ABOUT_NOISE_LIMIT)
-        if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
+                smaller = max(smaller, quiet / _NOISE_LIMIT_GAMMA_STEP_FACTOR)
+                failed = min(failed, quiet * _NOISE_LIMIT_GAMMA_STEP_FACTOR)
+        if failed == np.inf or failed <= _MAX_UNSTABLE_TO_STABLE_GAMMA_RATIO * stable:
             break
         gamma = float(np.sqrt(stable * failed)) if stable else smaller
     return stable, inside
@@ -215,13 +213,13 @@ def _find_station_gamma(
 def meets_requirements(
     row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
 ) -> bool:
-    """Return whether a run comes to rest, is quiet and renders the contact force."""
+    """Return whether a run comes to rest, is quiet and renders the contact force accurately."""
     exact = press_trial.is_share_accepted(row["share"], max_force_error)
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
-    """Return a function that runs a named study in a folder of `out`."""
+    """Return a function that runs a study in a folder of `out` with the study's name."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
@@ -311,11 +309,11 @@ def _tuning_result_sentences(
     low, high = (1e-3 * wall for wall in about["walls"])
     hands = " to ".join(dict.fromkeys((about["hands"][0], about["hands"][-1])))
     before = figures["given_threshold_N"]
-    instead = "the scenario's own settings fail in this set"
+    instead = "the scenario's own settings fail for these hands and walls"
     if before is not None:
         instead = f"with the scenario's own settings it is {before:.2f} N"
     lines = [
-        f"Take passivity.method {chosen.method}, gamma {chosen.gamma:.2f}, sigma_weight 0, "
+        f"Use passivity.method {chosen.method}, gamma {chosen.gamma:.2f}, sigma_weight 0, "
         f"sigma_inertia {chosen.sigma_inertia:g}, force_scale {scale:.4g}, and a low-pass of "
         f"{chosen.low_pass_hz:g} Hz.",
         f"The station is stable for a {hands} grip at walls of {low:g} to {high:g} kN/m over "
@@ -334,14 +332,13 @@ def _tuning_result_sentences(
     else:
         wall, factor = fails["wall_N_per_m"] / 1e3, fails["gamma_factor"]
         last = (
-            f"It fails with a {fails['hand']} grip at a wall of {wall:g} kN/m and gamma "
+            f"The station fails with a {fails['hand']} grip at a wall of {wall:g} kN/m and gamma "
             f"{factor:.2f} times as large."
         )
     return [*lines, last]
 
 
 def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
-    """Draw the detection threshold against the margin of gamma for each method."""
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
         axes = figure.subplots()

@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment import design
 from drake_teleop.live.experiment.procedure import IntervalResult
-from drake_teleop.live.inputs import AS_IN_SCENARIO, INPUT_RANGES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, INPUT_RANGES, Inputs
 from drake_teleop.live.scenarios import adapt_estimate, live_scenario, scenario_of_inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
@@ -32,10 +32,10 @@ def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task and condition.
+    """Station of a task under a condition; `base`: scenario of the task without the condition.
 
-    `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1,
-    `base` the scenario of the task.
+    `load_mass_at_hand` [kg] is the mass of the load (with `eta`, of the held object) that the hand
+    perceives at scale 1.
     """
 
     task: design.Task
@@ -46,9 +46,9 @@ class Apparatus:
     base: Scenario
 
     def stimulus_scales(self, level: float, contact_force: float) -> dict[str, int]:
-        """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
+        """Return the inputs sigma, sigma_object and gamma [%] that render a stimulus.
 
-        `level` is the rendered force [N] or mass [kg], `contact_force` the expected one [N].
+        `level`: rendered contact force [N] or added mass [kg]; `contact_force`: expected force [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -65,9 +65,9 @@ class Apparatus:
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval with the intended level `target` (0: no stimulus).
+        """Return the result of an interval from its log `rows` and its scales `inputs` [%].
 
-        `inputs` are its `stimulus_scales`.
+        `target`: intended level; 0: no stimulus.
         """
         force = rows.largest_mean_contact_force()
         if isinstance(self.task, design.PegInSlot):
@@ -88,9 +88,9 @@ def make_apparatus(
     changes: dict[str, object] = {}
     if condition.delay is not None:
         changes["channel"] = Channel(delay=condition.delay)
-    elif condition.network != AS_IN_SCENARIO:
+    elif condition.network != AS_IN_SCENARIO_NAME:
         changes["channel"] = Channel(network=condition.network)
-    if condition.method != AS_IN_SCENARIO:
+    if condition.method != AS_IN_SCENARIO_NAME:
         changes["passivity__method"] = condition.method
     setup = replace(setup, contact_detection=None, **changes)
     mass = NominalSlave(setup.slave).arm.phi_load[0]
@@ -150,7 +150,7 @@ class IntervalLog:
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def largest_rendered_force_change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N] after time `after` [s].
+        """Return the largest 20 ms mean of the rendered force's change [N], from `after` [s] on.
 
         The reference is the mean force of the 0.1 s before.
         """

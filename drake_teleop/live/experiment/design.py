@@ -7,7 +7,7 @@ from typing import NoReturn, TypeAlias
 from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORKS
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import (
@@ -34,12 +34,12 @@ class Condition:
         None, "1", 0.0, 1.0, "rendered share of a held object, with sigma = 0"
     )
     network: str = choice(
-        AS_IN_SCENARIO,
+        AS_IN_SCENARIO_NAME,
         tuple(name for name in NETWORKS if name != "custom"),
         "network between master and slave",
     )
     delay: float | None = quantity(None, "s", 0.0, 2.0, "delay of one way, in place of a network")
-    method: str = choice(AS_IN_SCENARIO, (AS_IN_SCENARIO,), "passivity method", METHODS)
+    method: str = choice(AS_IN_SCENARIO_NAME, (AS_IN_SCENARIO_NAME,), "passivity method", METHODS)
 
 
 @dataclass
@@ -54,7 +54,7 @@ class _TaskFields:
 @settings
 @dataclass
 class ContactDetection(_TaskFields):
-    """Task to name the one of two intervals with rendered contact; both have contact."""
+    """Task to identify the interval (of two) with rendered contact; the tool touches in both."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -67,7 +67,7 @@ class ContactDetection(_TaskFields):
 @settings
 @dataclass
 class ApparentMass(_TaskFields):
-    """Task to name the one of two intervals with a heavier tool; it moves in both."""
+    """Task to identify the interval (of two) with the heavier tool; the hand moves in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
@@ -77,7 +77,7 @@ class ApparentMass(_TaskFields):
 @settings
 @dataclass
 class PegInSlot(_TaskFields):
-    """Insertion of the tool into a slot, with completion time and largest contact force."""
+    """Task to insert the tool into a slot; measured: time and contact force."""
 
     scenario: str = plain("insert", "as for other tasks, with an operator's task !Insert")
     trials: int = quantity(8, "1", 1, 1000, "number of trials of each condition")
@@ -91,7 +91,7 @@ Task: TypeAlias = ContactDetection | ApparentMass | PegInSlot
 @settings
 @dataclass
 class SimulatedParticipant:
-    """Participant of `--simulated`, who compares changes of the rendered force."""
+    """Participant of `--simulated`, who compares rendered forces of two intervals."""
 
     noise: float = quantity(0.06, "N", 1e-4, 100.0, "standard deviation at rest, at the hand")
     weber: float = quantity(0.1, "1", 0.0, 1.0, "standard deviation as a share of the response")
@@ -145,13 +145,13 @@ class Experiment:
                 fail(f"{place}.name", what, "give each condition its own name")
             if condition.eta is not None and condition.sigma != 0.0:
                 fail(f"{place}.eta", "cannot be combined with sigma > 0", "set sigma: 0")
-            if condition.delay is not None and condition.network != AS_IN_SCENARIO:
+            if condition.delay is not None and condition.network != AS_IN_SCENARIO_NAME:
                 what = f"cannot be combined with network {condition.network!r}"
                 fail(f"{place}.delay", what, "remove delay or network")
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
-    """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
+    """Return the checked experiment of a file or shipped name, and the scenario of each task."""
     path = find_shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
     experiment = settings_without_range_check(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
@@ -170,5 +170,5 @@ def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
         raise DrakeTeleopError(f"{task.scenario} has no slot", where=place, remedy=remedy)
     if isinstance(task, ContactDetection) and scenario.surroundings is None:
         what = f"{task.scenario} has no object to touch"
-        raise DrakeTeleopError(what, where=place, remedy="use one such as touch")
+        raise DrakeTeleopError(what, where=place, remedy="use a scenario such as touch")
     return scenario

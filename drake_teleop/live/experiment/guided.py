@@ -35,14 +35,14 @@ _SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_BLANK_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
+_HIDDEN_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
 
 #: Names of the inputs that move the hand.
 PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 class GuidedExperiment:
-    """Event handler of an experiment, with the interface of `Live`; times `now` in s.
+    """Event handler of an experiment, with the interface of `Live`; `now`: clock time [s].
 
     Each interval is a recorded live session; the page receives only the rendered force.
     """
@@ -60,7 +60,7 @@ class GuidedExperiment:
         self._stations, self._link = stations, link
         self._drives = procedure.store.folder / "drives" / f"{procedure.participant:02}"
         self._driver: int | None = None
-        self._intervals, self._since, self._frame_due = 0, now, now
+        self._intervals, self._phase_start, self._frame_due = 0, now, now
         self._prepare_interval(now)
 
     def _prepare_interval(self, now: float) -> None:
@@ -151,13 +151,13 @@ class GuidedExperiment:
         before = procedure.phase, procedure.trial_number
         if "answer" in message:
             with self._catch_write_error():
-                procedure.store_answer(message["answer"], now - self._since)
+                procedure.store_answer(message["answer"], now - self._phase_start)
         elif "go" in message:
             procedure.advance_phase()
         if (procedure.phase, procedure.trial_number) == before:
             return
         self._prepare_interval_if_changed(now)
-        self._since = now
+        self._phase_start = now
         if procedure.phase == INTERVAL_PHASE:
             self._live.pace.restart(now)
 
@@ -172,7 +172,6 @@ class GuidedExperiment:
 
     @property
     def ms(self) -> int:
-        """Simulated time of the present interval [ms]."""
         return self._live.ms
 
     @property
@@ -183,7 +182,7 @@ class GuidedExperiment:
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP_PHASE and now - self._since >= _INTERVAL_PAUSE_S:
+        if self._procedure.phase == GAP_PHASE and now - self._phase_start >= _INTERVAL_PAUSE_S:
             self._procedure.start_second_interval()
             self._live.pace.restart(now)
         if self._is_interval_running:
@@ -205,7 +204,7 @@ class GuidedExperiment:
         level = self._procedure.current_level
         result = self._apparatus.interval_result(level, self._stimulus, self._rows)
         self._procedure.finish_interval(dataclasses.replace(result, lost_s=live.pace.lost_time_s))
-        self._since = self._frame_due = now
+        self._phase_start = self._frame_due = now
         self._prepare_interval_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
@@ -218,7 +217,7 @@ class GuidedExperiment:
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
-            **_BLANK_FRAME_VALUES,
+            **_HIDDEN_FRAME_VALUES,
             "f": [rendered] * 3,
             "scene": "own",
             "state": "stopped" if inner["stopped"] else "running",
@@ -236,7 +235,7 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests that participants may make, or None."""
+    """Return the valid requests of a message that participants may make, or None."""
     message = parse_message(text) or {}
     found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:
@@ -247,7 +246,7 @@ def parse_experiment_message(text: Any) -> dict[str, Any] | None:
 
 
 class ExperimentDrive(LiveDrive):
-    """Live session of one participant, with its server."""
+    """Live session and server of one participant."""
 
     def __init__(
         self, procedure: Procedure, scenarios: list[Scenario], port: int, device: str | None

@@ -19,7 +19,7 @@ FEEDBACK_PHASE, BREAK_PHASE, END_PHASE = "told", "break", "end"
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """Planned trial: indices of task and condition, interval (1, 2) of stimulus; 0: peg task."""
+    """Planned trial: indices of task and condition; interval with the stimulus, 0 in peg tasks."""
 
     task: int
     condition: int
@@ -32,9 +32,11 @@ class IntervalResult:
     """Result of one interval of a trial.
 
     Attributes:
-        level, force_N: measured stimulus [N or kg], 0 without stimulus; largest contact force.
-        valid: False if contact is missing.
-        done, time_s: True if the peg reached the slot's floor; time until then or the end.
+        level: measured stimulus [N or kg]; 0 without stimulus.
+        force_N: largest 20 ms mean of the contact force.
+        valid: False if a required contact is missing.
+        done: True if the peg reached the slot's floor.
+        time_s: time until then, otherwise the duration.
         lost_s: delay of the simulation behind real time.
     """
 
@@ -68,7 +70,7 @@ class Procedure:
 
     Attributes:
         level: intended level of the trial's stimulus [N or kg].
-        prepared_intervals: number of intervals, also repeated ones.
+        prepared_intervals: number of prepared intervals, with repetitions.
         is_answer_right: whether the last answer was right.
         is_repeated: whether the trial is repeated because the tool made no contact.
     """
@@ -83,7 +85,7 @@ class Procedure:
             if not isinstance(task, PegInSlot)
             for c in range(len(experiment.conditions))
         }
-        self._pressed: list[float] = []
+        self._contact_forces: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
             self._update_estimates(trial, row)
         self.phase, self.is_answer_right, self.is_repeated = CONSENT_PHASE, False, False
@@ -109,10 +111,10 @@ class Procedure:
 
     @property
     def expected_contact_force(self) -> float:
-        """Median of the participant's contact forces up to now [N]; at first `pressed`."""
+        """Median of the participant's contact forces [N]; without any, the task's `pressed`."""
         task = self.task
-        if self._pressed:
-            return float(np.median(self._pressed))
+        if self._contact_forces:
+            return float(np.median(self._contact_forces))
         return task.pressed if isinstance(task, ContactDetection) else 0.0
 
     def _prepare_trial(self) -> None:
@@ -134,7 +136,7 @@ class Procedure:
             self._start_next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
-        """End the present interval; repeat the trial if the result has no contact."""
+        """End the present interval; repeat the trial if its result is invalid."""
         self._results[self.interval - 1] = result
         if not result.valid:
             self._prepare_trial()
@@ -156,7 +158,7 @@ class Procedure:
             self.phase = READY_PHASE
 
     def store_answer(self, interval: int, time_s: float) -> None:
-        """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
+        """Store the answer (`interval` 1 or 2, given after `time_s`) if the phase expects one."""
         if self.phase == ANSWER_PHASE:
             self._finish_trial(interval, interval == self.trial.signal_interval, time_s)
 
@@ -188,7 +190,7 @@ class Procedure:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
-            self._pressed.append(row.force_N)
+            self._contact_forces.append(row.force_N)
         if not trial.practice:
             self._psi[trial.task, trial.condition].update_posterior(row.level, bool(row.correct))
 

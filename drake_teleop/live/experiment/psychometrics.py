@@ -25,7 +25,7 @@ _NUM_STIMULUS_LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
-    """Return the probability of a correct answer at stimulus levels >= 0 (two intervals)."""
+    """Return the probability of a correct two-interval answer at stimulus levels >= 0."""
     return 0.5 * lapse + (1.0 - lapse) * ndtr((level / threshold) ** slope / math.sqrt(2.0))
 
 
@@ -73,7 +73,7 @@ class PsiMethod:
         self._posterior /= self._posterior.sum()
 
     def threshold(self) -> EstimateWithLimits:
-        """Return the posterior median of the level with d' = 1."""
+        """Return median and 95 % interval of the level with d' = 1."""
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
@@ -83,7 +83,7 @@ class PsiMethod:
         return EstimateWithLimits(float(value), float(low), float(high))
 
     def estimate_d_prime(self, level: float) -> EstimateWithLimits:
-        """Return the posterior median of the sensitivity d' at a level."""
+        """Return median and 95 % interval of the sensitivity d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)

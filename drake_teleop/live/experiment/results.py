@@ -89,7 +89,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
 
 
 def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> EstimateWithLimits:
-    """Return the geometric mean, or for shares the arithmetic mean, with Student's interval."""
+    """Return the geometric mean (arithmetic for a `share`) with Student's 95 % interval."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:

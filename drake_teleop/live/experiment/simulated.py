@@ -62,9 +62,9 @@ def simulate_participant(
     stations: dict[tuple[int, int], Apparatus],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run the remaining trials; `progress` receives the numbers of finished and all trials.
+    """Run the remaining trials; keys of `stations`: indices of task and condition.
 
-    Keys of `stations`: indices of task and condition.
+    After each answer, `progress` receives the numbers of finished and of all trials.
     """
     experiment, responses = procedure.experiment, [0.0, 0.0]
     while procedure.phase != END_PHASE:
@@ -91,7 +91,7 @@ def simulate_participant(
 def answer_by_larger_response(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger noisy response [N], or a guess (lapse)."""
+    """Return the interval (1, 2) with the larger response [N] plus noise; in a lapse, guess."""
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
     noisy = [

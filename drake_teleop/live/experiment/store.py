@@ -48,7 +48,7 @@ class TrialRow:
 
 
 def table_schema(row: type) -> dict[str, type[pl.DataType]]:
-    """Return the column types of a table whose rows have the annotated fields of a class."""
+    """Return the column types of a table whose rows are instances of the class `row`."""
     types: dict[type, type[pl.DataType]] = {int: pl.Int64, float: pl.Float64, str: pl.String}
     return {name: types[kind] for name, kind in get_type_hints(row).items()}
 
@@ -73,13 +73,13 @@ class TrialStore:
         path = self.participant_file(participant)
         if not path.exists():
             return []
-        remedy = "remove it; the participant then starts again"
+        remedy = "remove this file; the participant then starts again"
         with wrap_read_errors(path, remedy):
             table = pl.read_csv(path, schema=_TRIAL_SCHEMA)
         rows = [TrialRow(**row) for row in table.iter_rows(named=True)]
         gaps = [index for index, row in enumerate(rows) if row.trial != index]
         if gaps or table.null_count().sum_horizontal()[0]:
-            what = f"row {gaps[0]} is of another trial" if gaps else "lacks values"
+            what = f"row {gaps[0]} is not that of trial {gaps[0]}" if gaps else "has empty cells"
             raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         return rows
 

@@ -1,4 +1,4 @@
-"""Least squares fit among loads that a rigid body can have, Eqs. (T1), (T5)."""
+"""Least squares fit restricted to physically consistent loads, Eqs. (T1), (T5)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _MIN_KEPT_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 
 
 def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
-    """Return [offsets; phi] (16,) of the rigid body that fits best.
+    """Return [offsets; phi] (16,) of the best-fitting physically consistent load.
 
-    `theta` (16,) solves the normal equations `gram` and `right` without constraint; it is returned
-    if they cannot separate load and offsets.
+    `theta` (16,), the solution of gram theta = right, is returned if it is consistent, or if load
+    and offsets cannot be separated.
     """
     if is_physically_consistent(theta[6:]):
         return theta
@@ -79,7 +79,7 @@ def _cone_program_of_thread(thread: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _distance_cone_coefficients(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return matrix and vector of the cone t >= |R x - d| with R^T R = H and R^T d = b."""
+    """Return A (11, 11), c (11,) of the cone t >= |R x - d|; R^T R = H, R^T d = b, both scaled."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale

@@ -35,7 +35,7 @@ from drake_teleop.load.normal_equations import (
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
 _MIN_NOISE_OVER_RMS = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_MIN_NOISE_OVER_RESIDUAL = 0.01
+_MIN_WRENCH_NOISE_VARIANCE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
@@ -58,7 +58,7 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
-        equations: second moments of the kept samples.
+        equations: second moments of the other samples.
     """
 
     identification: Identification
@@ -96,7 +96,7 @@ def _fit_total_least_squares(
             if options.shared_noise:
                 squares = squares.reshape(2, 3).mean(axis=1).repeat(3)
                 explained = explained.reshape(2, 3).mean(axis=1).repeat(3)
-            variances = np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL * squares)
+            variances = np.maximum(squares - explained, _MIN_WRENCH_NOISE_VARIANCE_SHARE * squares)
             std = np.sqrt(variances.clip(floor**2))
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
@@ -117,7 +117,7 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
     # A subset of the samples is sufficient as a starting point.
-    form = _fit_huber(record.decimate(max(1, n // _MAX_HUBER_SAMPLES)), options)
+    form = _fit_huber(record.with_row_step(max(1, n // _MAX_HUBER_SAMPLES)), options)
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
@@ -160,7 +160,7 @@ def _std_growth_by_rejection(whole: EstimatorFit, kept: SecondMoments) -> float:
 
 
 class Method(NamedTuple):
-    """Batch estimator: name for results, and fitting function."""
+    """Batch estimator: value of `Identification.method`, and function that fits a record."""
 
     name: str
     fit: Callable[[SampleRecord, EstimatorOptions], EstimatorFit]
@@ -196,14 +196,14 @@ def identify_batch(
     delay_s: float = 0.0,
     gain_std: float = 0.0,
 ) -> BatchResult:
-    """Return load and sensor offsets of a free motion, by a batch estimator.
+    """Return load and sensor offsets of a free motion, fitted by the batch estimator `method`.
 
     Args:
         wrench, s, omega, alpha, delay_s: as for `identify`.
         noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
-        resolution: (2,) quantisation step of forces and torques [N, N m], with `shared_noise` only.
+        resolution: (2,) quantisation step of forces and torques [N, N m], for `shared_noise` only.
         gain_std: relative standard deviation of the sensor's 36 gains.
     """
     METHODS.check(method, "method")

@@ -34,8 +34,8 @@ class SolvedNormalEquations(NamedTuple):
     """Normal equations gram theta = right, and their solution theta = [offsets; phi] (16,).
 
     Attributes:
-        gram: (16, 16) Gram matrix per sample, compensated for noise.
-        weights: (6, 6) weights between wrench channels.
+        gram: (16, 16) Gram matrix per sample, without the part due to motion noise.
+        weights: (6, 6) weighting matrix of the residual.
         noise_scale: ratio of residual variance to specified noise variance.
         map_from_ordinary: (16, 16) matrix that maps the ordinary least squares theta to this one.
     """
@@ -54,16 +54,16 @@ def total_least_squares(
 ) -> SolvedNormalEquations:
     """Return the total least squares fit of load and offsets to the moments of a record.
 
-    `wrench_noise` (6,) [N, N m] are standard deviations; `offsets` False fixes the offsets at 0.
+    `noise` is of the motion, `wrench_noise` (6,) of the wrench; `offsets` False: offsets are 0.
     """
     Z, Q = moments.mean_products, moments.mean_noise_covariance_of_z(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_WRENCH_MEAN_SQUARE:
         raise unidentifiable_mass_error("the wrench is 0 throughout")
     W: Array = np.diag(wrench_noise**-2.0)
     excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
-    previous, min_gain = np.zeros(16), excess / (1.0 + excess)
+    previous, min_remaining = np.zeros(16), excess / (1.0 + excess)
     for _ in range(_MAX_REWEIGHTINGS):
-        form = _solve_compensated_equations(Z, Q, W, offsets, min_gain)
+        form = _solve_compensated_equations(Z, Q, W, offsets, min_remaining)
         change = np.linalg.norm(form.theta - previous)
         if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
             break
@@ -73,7 +73,7 @@ def total_least_squares(
 
 
 def _solve_compensated_equations(
-    Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float
+    Z: Array, Q: Array, W: Array, offsets: bool, min_remaining: float
 ) -> SolvedNormalEquations:
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
@@ -86,16 +86,16 @@ def _solve_compensated_equations(
     basis = root @ vectors
     squares, noise = (float(np.sum(W * moments[1:7, 1:7])) for moments in (Z, Q))
     scale = _min_singular_noise_scale(basis.T @ right, nu, squares, noise)
-    gain = 1.0 - scale * nu
-    kept = gain > (min_gain if nu[-1] > 0.0 else 0.0)
-    inverse = (basis[:, kept] / gain[kept]) @ basis[:, kept].T
+    remaining = 1.0 - scale * nu
+    kept = remaining > (min_remaining if nu[-1] > 0.0 else 0.0)
+    inverse = (basis[:, kept] / remaining[kept]) @ basis[:, kept].T
     theta = inverse @ right
     if not offsets:
         theta[:6] = 0.0
     gram_basis = gram @ basis[:, kept]
     variance = np.sum(basis**2, axis=1)
     return SolvedNormalEquations(
-        gram=(gram_basis * gain[kept]) @ gram_basis.T,
+        gram=(gram_basis * remaining[kept]) @ gram_basis.T,
         right=gram_basis @ (basis[:, kept].T @ right),
         theta=theta,
         weights=W,
@@ -106,19 +106,19 @@ def _solve_compensated_equations(
 
 
 def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: float) -> float:
-    def determinant_condition(ratio: float) -> float:
-        return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
+    def schur_complement(scale: float) -> float:
+        return float(squares - scale * noise - np.sum(right**2 / (1.0 - scale * nu)))
 
     highest = squares / noise
     if highest * nu[-1] >= 1.0:
         highest = (1.0 - _MIN_POLE_DISTANCE) / nu[-1]
-    if determinant_condition(0.0) <= 0.0:  # no residual
+    if schur_complement(0.0) <= 0.0:  # no residual
         return 0.0
     from scipy.optimize import brentq  # 0.2 s, which a study with known loads saves
 
-    if determinant_condition(highest) >= 0.0:
+    if schur_complement(highest) >= 0.0:
         return highest
-    return float(brentq(determinant_condition, 0.0, highest, rtol=1e-14))
+    return float(brentq(schur_complement, 0.0, highest, rtol=1e-14))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class SampleRecord:
         moments.add_samples(*self.wrench_and_motion)
         return moments
 
-    def decimate(self, step: int) -> SampleRecord:
+    def with_row_step(self, step: int) -> SampleRecord:
         return SampleRecord(*(table[::step] for table in self.wrench_and_motion))
 
     def residual(self, theta: Array, part: slice) -> Array:

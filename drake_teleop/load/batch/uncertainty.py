@@ -56,8 +56,8 @@ class ParameterCombination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading_index: index of the leading parameter in `PARAMETER_NAMES`.
-        relative_std: standard deviation relative to the natural scale of the combination.
-        text: the sum in words.
+        relative_std: standard deviation over the norm of the coefficients times `natural_scales`.
+        text: the sum as a formula, such as "m c_x + 0.5 f_ox".
     """
 
     coefficients: Array
@@ -78,8 +78,8 @@ class BaseParameters:
 
     Attributes:
         parameters_without_influence: names of parameters without influence on the wrench.
-        weak_directions: combinations of the parameters that are not identified individually.
-        channels_with_slow_noise: names of wrench channels with drift.
+        weak_directions: principal combinations of parameters that are determined, not identified.
+        channels_with_slow_noise: names of wrench channels with drift or slow noise.
     """
 
     combinations: tuple[ParameterCombination, ...]
@@ -106,7 +106,7 @@ class BaseParameters:
                     " further and faster, about more axes"
                 )
             else:
-                lines.append(f"combination identified, its parameters are not: {c}")
+                lines.append(f"identified only as a combination: {c}")
         if self.channels_with_slow_noise:
             names = ", ".join(self.channels_with_slow_noise)
             lines.append(
@@ -178,9 +178,9 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 def covariance_for_white_noise(
     least_squares_covariance: Array, equations: SecondMoments, fit: EstimatorFit
 ) -> Array:
-    """Return the covariance (16, 16) due to noise whose channels correlate as in the fit's weights.
+    """Return the covariance (16, 16) of [offsets; phi] for noise correlated between channels.
 
-    Without correlation it is `least_squares_covariance`.
+    The correlation is that of the inverse of `fit.form.weights`.
     """
     W, Z = fit.form.weights, fit.moments.mean_products
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -204,12 +204,13 @@ def covariance_for_random_walks(
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `step_covariance` (6, 6) is that of the wrench change per sample.
+    `step_covariance` (6, 6) is that of the residual's step per sample; `kept` (N,) marks used
+    samples.
     """
     covariance = np.zeros((16, 16))
     if not step_covariance.any():
         return covariance
-    backwards, used = record.decimate(-1), kept[::-1]
+    backwards, used = record.with_row_step(-1), kept[::-1]
     after = np.zeros((6, 16))
     for start in range(0, len(used), SAMPLES_PER_CHUNK):
         part = slice(start, start + SAMPLES_PER_CHUNK)
@@ -228,8 +229,8 @@ def covariance_for_random_walks(
 def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Array:
     """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains.
 
-    `products` (B, 6, n, 6): regressor times wrench; `W` (B, 6, 6): weights; `inverse` (n, n): of
-    the Gram matrix.
+    `products` (B, 6, n, 6): regressor times wrench in B groups; `W` (B, 6, 6): weights; `inverse`
+    (n, n): inverse Gram matrix.
     """
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
@@ -237,10 +238,10 @@ def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Arra
     return np.asarray(effect.reshape(len(inverse), 36))
 
 
-def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
+def covariance_for_gain_errors(fit: EstimatorFit, offsets_estimated: bool) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] for gain errors of standard deviation 1."""
     Z, W = fit.moments.mean_products, fit.form.weights
-    used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
+    used = excited_columns(Z) & (offsets_estimated | (np.arange(16) >= 6))
     root = root_of_pseudo_inverse(normal_equations(Z, W)[0], used)
     products = (regressor_coefficients() @ Z)[None, :, :, 1:7]
     errors = parameter_errors_by_gains(products, W[None], root @ root.T)

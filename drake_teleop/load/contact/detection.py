@@ -1,6 +1,7 @@
 """Contact detection, sample by sample, in a wrench from which the load's wrench is removed.
 
-The statistics are functions of the normalised wrench z and its unpredictable part e::
+z is the wrench whitened to unit covariance, e the part of z that the last z does not predict, and
+w_n a factor from `NoiseFloor.sum_widths`::
 
     level    |z|; its square is chi-squared with six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|) (Crosier, Technometrics 30, 1988)
@@ -63,7 +64,7 @@ def _square_of_innovation_sum(memory, last, n):
 def update_statistics(
     memory, contact_wrench, s, omega, alpha, acceleration, parameters, slack, following, quiet_level
 ):
-    """Process one sample and write level, cusum and glr to memory[5:8].
+    """Process one sample: write level, cusum and glr to memory[5:8].
 
     `memory` (MEMORY_SIZE,) is zero at the start, the sample is a row of `DetectorSamples`.
     `parameters` are `NoiseFloor.compiled_parameters`, `quiet_level` is CONTACT_END_LEVEL.
@@ -123,9 +124,10 @@ def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
 
 @njit(cache=True)
 def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
-    """Update the contact flag in the memory after `update_statistics`, and return it.
+    """Update the contact flag in `memory` after `update_statistics`; return True in contact.
 
-    Contact begins at `enter`, ends at `leave`; `widths` are `NoiseFloor.sum_widths`.
+    Contact begins if statistic 0, 1 or 2 (`statistic`) reaches `enter`; `leave`: CONTACT_END_LEVEL;
+    `hold`: as for `ContactDetector`; `widths`: `NoiseFloor.sum_widths`.
     """
     if memory[CONTACT_INDEX] == 0.0:
         if memory[STATISTICS_START + statistic] >= enter:
@@ -145,7 +147,7 @@ def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
 def update_contact_flag(
     memory, contact_wrench, s, omega, alpha, acceleration, parameters, flag_settings
 ):
-    """Process a row of `DetectorSamples` with `ContactDetector.settings`; return if in contact."""
+    """Update `memory` by a row of `DetectorSamples`; return True in contact."""
     slack, following, statistic, enter, leave, hold = flag_settings
     sample = contact_wrench, s, omega, alpha, acceleration
     update_statistics(memory, *sample, parameters, slack, following, leave)
@@ -162,7 +164,7 @@ def _detect_contact_in_rows(memory, rows, settings, statistics, flags):
 
 
 def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUSUM_SLACK) -> Array:
-    """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
+    """Return level, cusum and glr (N, 3) for the arrays of a `DetectorSamples`."""
     # Without contact, which would reset the sums.
     flag_settings = float(positive_array("slack", slack)), 0.0, 0, np.inf, CONTACT_END_LEVEL, 0
     settings = floor.compiled_parameters, flag_settings
@@ -183,9 +185,9 @@ class ContactDetector:
 
     Args:
         threshold: value of the statistic at which contact begins.
-        statistic: "level" (norm of the normalised wrench), "cusum" or "glr", see the module.
-        hold: contact ends after more than `hold` consecutive samples with a level, and then a
-            normalised sum of innovations, below `CONTACT_END_LEVEL`.
+        statistic: "level", "cusum" or "glr", see the module.
+        hold: contact ends after more than `hold` successive levels below `CONTACT_END_LEVEL`, if
+            also the normalised sum of their innovations is below it.
         following: sample period over time constant of a mean that is subtracted from the contact
             wrench, updated while the level is below `CONTACT_END_LEVEL`; 0: no mean.
     """
@@ -219,12 +221,12 @@ class ContactDetector:
         return bool(update_contact_flag(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
-        """Process N `DetectorSamples` of a log; return (N,) True for contact."""
+        """Process the arrays of a `DetectorSamples`; return (N,) True in contact."""
         return _statistics_and_flags(self._memory, samples, self.settings)[1]
 
 
 def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S.
+    """Return direction, point nearest to So and pitch [m] of the central axes of wrenches, in S.
 
     NaN for a zero force.
     """
@@ -253,7 +255,7 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """Return the noise floor of `DetectorSamples` in free motion."""
+    """Return the noise floor fitted to the arrays of a `DetectorSamples` in free motion."""
     from scipy.optimize import nnls
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)

@@ -1,8 +1,9 @@
-"""Noise floor: standard deviation sigma of the contact wrench in free motion.
+"""Noise floor: standard deviation sigma of the contact wrench in free motion, per channel c.
 
     sigma_c^2 = n_c^2 + (J P J^T)_cc + k_c^2 |a|^2 + l_c^2 |alpha|^2,    J = [E V]
 
-n is the noise at rest, P the covariance of [offsets; phi]; a and alpha are accelerations of S.
+n is the noise at rest, J the regressor of [offsets; phi], P their covariance; a and alpha are
+accelerations of S, k and l fitted factors.
 """
 
 from __future__ import annotations
@@ -68,9 +69,9 @@ class NoiseFloor:
         covariance: (16, 16) finite covariance P of [offsets; phi].
         per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
         correlation: (6, 6) correlation between channels.
-        rho: (6,) lag-one correlation of the normalised wrench.
-        sum_widths: (8,) standard deviations of sums of 1, 2, 4 ... innovations over sqrt(number).
-        fade: factor per sample of the held acceleration peaks; 0: peaks are not held.
+        rho: (6,) correlation of successive samples of the normalised wrench.
+        sum_widths: (8,) standard deviations of sums of n = 1, 2 ... 128 innovations over sqrt(n).
+        fade: factor per sample on held maxima of |a|^2 and |alpha|^2; 0: no hold.
         free_maxima: (3,) largest value of each statistic in the fitted motion.
     """
 
@@ -99,7 +100,7 @@ class NoiseFloor:
             (indefinite, "correlation", "the matrix is not positive definite"),
         ):
             if is_wrong:
-                raise DrakeTeleopError(what, where=where, remedy="call fit_noise_floor")
+                raise DrakeTeleopError(what, where=where, remedy="use fit_noise_floor")
 
     def threshold(self, statistic: str, margin: float = THRESHOLD_MARGIN) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
@@ -114,7 +115,7 @@ class NoiseFloor:
         return variances, self.covariance, growth, root, self.rho, self.sum_widths, self.fade
 
     def noise_std_along(self, *motion: ArrayLike) -> Array:
-        """Return the noise sigma (N, 6) [N, N m] along a free motion."""
+        """Return sigma (N, 6) [N, N m] for a motion: s, omega, alpha, acceleration (N, 3)."""
         rows = validate_detector_samples(*motion)
         out = np.empty((len(rows[0]), 6))
         noise_std_into(*rows, *self.compiled_parameters[:3], self.fade, out)
@@ -125,8 +126,8 @@ class NoiseFloor:
 def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
     """Write the variances (6,) of a sample's contact wrench into `out`.
 
-    `peaks` (2,) are held squares of acceleration and alpha, updated; `V` (6, 10) is scratch memory;
-    others: `NoiseFloor.compiled_parameters`.
+    `peaks` (2,) are the held |acceleration|^2 and |alpha|^2, which are updated; `V` (6, 10) is
+    scratch memory; others: `NoiseFloor.compiled_parameters`.
     """
     peaks[0] = max(dot(acceleration, acceleration), fade * peaks[0])
     peaks[1] = max(dot(alpha, alpha), fade * peaks[1])
@@ -146,7 +147,7 @@ def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, gro
 
 @njit(cache=True)
 def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, out):
-    """Write the noise sigma (N, 6) of contact wrenches, as `noise_variances_into`, to `out`."""
+    """Write sigma (N, 6) of N samples to `out`; arguments as for `noise_variances_into`."""
     peaks, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, growth, fade)
     for k in range(s.shape[0]):
         noise_variances_into(peaks, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])
@@ -159,7 +160,7 @@ def validate_detector_samples(*arrays: ArrayLike) -> list[Array]:
 
 
 def limit_covariance_to_scales(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi], with deviations up to `natural_scales`.
+    """Return the covariance (16, 16) with standard deviations of at most `natural_scales`.
 
     `tared`: the offsets are from the same record; their variance is 0.
     """

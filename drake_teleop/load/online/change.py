@@ -48,7 +48,7 @@ _CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
 # Factor of this limit for first moments relative to that of the mass, and smallest size [m].
 _FIRST_MOMENT_BOUND_FACTOR, _MIN_LOAD_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_MAX_NEGATIVE_MASS_OVER_STD = 4.0
+_MAX_MASS_STDS_BELOW_ZERO = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
@@ -61,10 +61,10 @@ _MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_
 
 MEMORY_SIZE = _KNOWN_LOAD_START + 816
 """Length of the memory of `update_change_detector`."""
-KNOWN_LOAD = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
-NEW_LOAD = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
+KNOWN_LOAD_SLICE = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
+NEW_LOAD_SLICE = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
 """Parts of the memory: [offsets; phi] of the known and of the new load."""
-_NEW_LOAD_COVARIANCE = slice(NEW_LOAD.stop, MEMORY_SIZE)
+_NEW_LOAD_COVARIANCE_SLICE = slice(NEW_LOAD_SLICE.stop, MEMORY_SIZE)
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
@@ -74,8 +74,8 @@ _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
 def whitening_matrix(motion, phi, noise, model_var, n):
     """Return the matrix (6, 6) that maps noise of an n-sample mean wrench to unit covariance.
 
-    `motion` (9,) is [s, omega, alpha]. `noise` begins with variances (15,) of a sample's wrench and
-    motion; `model_var` is that of the relative error of the load's wrench.
+    `motion` (9,) is [s, omega, alpha], `noise` that of `change_detector_parameters`, `model_var`
+    the variance of the load's relative wrench error.
     """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
@@ -110,7 +110,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate_by_block_mean(estimate, V, wrench, root):
-    """Update [theta (16); covariance (256)] by a block mean, Eq. (T6); return its chi-squared."""
+    """Update [theta (16); covariance (256)] by a block's mean, Eq. (T6); return its chi-squared."""
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
     for c in range(6):
@@ -169,7 +169,7 @@ def _restart_filter_from_known_load(memory, filter_start):
 
 @njit(cache=True)
 def _is_new_load_identified(memory, mass_std_ratio):
-    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
+    theta, P = memory[NEW_LOAD_SLICE], memory[_NEW_LOAD_COVARIANCE_SLICE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = mass_std_ratio * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
@@ -178,8 +178,8 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 
 @njit(cache=True)
-def _widen_inertias_by_alpha_noise(memory, noise, block):
-    theta, P = memory[NEW_LOAD], memory[_NEW_LOAD_COVARIANCE].reshape(16, 16)
+def _add_alpha_noise_to_inertia_variances(memory, noise, block):
+    theta, P = memory[NEW_LOAD_SLICE], memory[_NEW_LOAD_COVARIANCE_SLICE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
@@ -190,7 +190,7 @@ def _widen_inertias_by_alpha_noise(memory, noise, block):
 
 @njit(cache=True)
 def update_change_detector(memory, sample, block, noise, window, hold, mass_std_ratio):
-    """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
+    """Update `memory` by a sample (15,); `block` and on: `change_detector_parameters`."""
     V = np.empty((6, 10))
     motion = sample[regressor.SAMPLE_MOTION]
     regressor.regressor_into(motion[:3], motion[3:6], motion[6:], V)
@@ -242,14 +242,14 @@ def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
     # A clearly negative mass is not a load.
     mass = memory[_NEW_FILTER_START + 6]
     deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
-    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_MASS_OVER_STD * deviation:
+    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_MASS_STDS_BELOW_ZERO * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_filter_from_known_load(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
         memory[_STATE_INDEX] = STATE_CHANGED
     elif memory[_STATE_INDEX] == STATE_CHANGED and _is_new_load_identified(memory, mass_std_ratio):
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
-        _widen_inertias_by_alpha_noise(memory, noise, block)
+        _add_alpha_noise_to_inertia_variances(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
         memory[_IDENTIFIED_SAMPLES_INDEX] = memory[_ESTIMATE_AGE_INDEX] * block
         share = block / memory[_ESTIMATE_AGE_INDEX]
@@ -277,13 +277,15 @@ def change_detector_parameters(
     relative_wrench_error: float = 0.0,
     mass_std_ratio: float | None = None,
 ) -> DetectorParameters:
-    """Return block [samples], noise variances (17,), window and hold [blocks], mass_std_ratio.
+    """Return block [samples], noise (17,), window and hold [blocks], mass_std_ratio.
+
+    `noise`: variances of wrench, motion and relative wrench error, duration of that error [blocks].
 
     Args:
-        wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
+        wrench_std, motion_std: (6,), (9,) roots of the long-run variances of `SecondMoments` [SI].
         period: time between samples [s].
         relative_wrench_error: relative error of the load's wrench.
-        mass_std_ratio: required standard deviation of a new load's mass, over the change.
+        mass_std_ratio: required standard deviation of a new load's mass over the change of mass.
     """
     positive_array("period", period)
     if not 0.0 <= relative_wrench_error < 1.0:
@@ -308,7 +310,7 @@ def initial_change_memory(
 ) -> Array:
     """Return the initial memory of the change detector for a known load.
 
-    `offset_drift` (6,) is the standard deviation of the drift since the identification [N, N m].
+    `offset_drift` (6,): standard deviation of the offsets' drift since identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
     P = covariance.copy()
@@ -321,7 +323,7 @@ def initial_change_memory(
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
     memory = np.zeros(MEMORY_SIZE)
-    memory[KNOWN_LOAD] = np.concatenate([theta[:6], phi])
+    memory[KNOWN_LOAD_SLICE] = np.concatenate([theta[:6], phi])
     memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START] = P.ravel()
     copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
     return memory
@@ -329,14 +331,13 @@ def initial_change_memory(
 
 @njit(cache=True)
 def current_change_state(memory):
-    """Return the state as index into `STATE_NAMES`; a new load becomes known once identified."""
+    """Return the index of the state in `STATE_NAMES`; "identified" is returned as "known"."""
     is_known = memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
     return STATE_KNOWN if is_known else int(memory[_STATE_INDEX])
 
 
 @njit(cache=True)
 def new_load_age_in_samples(memory):
-    """Return the number of samples since the estimate of a new load started."""
     return memory[_SAMPLE_COUNT_INDEX] - memory[_NEW_LOAD_START_INDEX]
 
 
@@ -348,7 +349,7 @@ def detector_states_of_log(
     omega: ArrayLike,
     alpha: ArrayLike,
 ) -> NDArray[np.int_]:
-    """Return the detector's states (N,) for N samples of a log, as indices into `STATE_NAMES`."""
+    """Process a log of N samples; return the states (N,) as indices into `STATE_NAMES`."""
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
     _process_samples_of_log(memory, np.concatenate(rows, axis=1), states, *parameters)
@@ -359,7 +360,7 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    theta = memory[KNOWN_LOAD].copy()
+    theta = memory[KNOWN_LOAD_SLICE].copy()
     covariance = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START].reshape(16, 16).copy()
     return replace(
         known,

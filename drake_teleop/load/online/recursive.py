@@ -35,9 +35,9 @@ _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
 
 @njit(cache=True)
 def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual_square_sums):
-    """Update estimate theta (16,) and covariance P (16, 16) by N samples, without checks.
+    """Update theta (16,), covariance P (16, 16) and `residual_square_sums` (6,) by N samples.
 
-    `max_variances` (16,) limits the variances during forgetting; `residual_square_sums` is (6,).
+    Values are not checked. `max_variances` (16,) limits the variances during forgetting.
     """
     V, gain = np.empty((6, 10)), np.empty(16)
     step = 1.0 / math.sqrt(forgetting)
@@ -83,7 +83,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual
 class RecursiveEstimator(ABC):
     """Recursive estimator of load and sensor offsets, theta = [offsets; phi] (16,).
 
-    The caller may keep its state, theta and a `memory` array.
+    A caller may keep the state itself: theta, and an array from `initial_memory`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
@@ -120,7 +120,7 @@ class RecursiveEstimator(ABC):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, settled_std: float
     ) -> RecursiveEstimator:
-        """Return an estimator for standard deviations of wrench (6,) and [s, omega, alpha] (9,)."""
+        """Return an estimator for noise of the wrench (6,) and, if supported, the motion (9,)."""
         motion: Any = {"motion_std": motion_std} if cls.allows_for_noisy_motion else {}
         return cls(noise_std, forgetting=forgetting, settled_std=settled_std, **motion)
 
@@ -142,11 +142,10 @@ class RecursiveEstimator(ABC):
         return self.is_state_settled(self._theta, self._memory)
 
     def is_state_settled(self, theta: Array, memory: Array) -> bool:
-        """Return `is_settled` for a given estimate and memory."""
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
-        return bool(self._are_certain(deviations, theta, self._settled_std).all())
+        return bool(self._are_identified(deviations, theta, self._settled_std).all())
 
     @abstractmethod
     def initial_memory(self, theta: Array) -> Array: ...
@@ -201,7 +200,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._are_certain(deviations, self._theta, MAX_IDENTIFIED_STD_SHARE),
+            identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_STD_SHARE),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -210,7 +209,7 @@ class RecursiveEstimator(ABC):
             prior_dominated=is_prior_dominated(deviations, np.sqrt(self._prior)),
         )
 
-    def _are_certain(self, deviations: Array, theta: Array, max_std: float) -> NDArray[np.bool_]:
+    def _are_identified(self, deviations: Array, theta: Array, max_std: float) -> NDArray[np.bool_]:
         scaled = deviations * (MAX_IDENTIFIED_STD_SHARE / max_std)
         from_data = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return from_data & is_precise_enough(scaled, theta[6:])

@@ -27,7 +27,7 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `normal_equations`.
 _WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
-_ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
+_INDICES_IN_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
@@ -39,7 +39,7 @@ _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 @cache
 def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
     """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
-    T = regressor_coefficients()[:, :, _ORDER_OF_BATCH_MOMENTS].swapaxes(1, 2)
+    T = regressor_coefficients()[:, :, _INDICES_IN_BATCH_MOMENTS].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
     return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
@@ -69,7 +69,6 @@ def add_outer_product(y, z, total):
 
 @njit(cache=True)
 def discount_samples_and_recentre_prior(memory, theta, information, forgetting):
-    """Multiply the sums in the memory by `forgetting`, and centre the prior at theta (16,)."""
     memory[:-1] *= forgetting
     memory[-1, :16] = information * theta
 
@@ -99,7 +98,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the part of Z, the sum of z z^T, that noise is expected to cause into Q (19, 19)."""
+    """Write to Q (19, 19) the part of Z, the sum of z z^T, that noise is expected to cause."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH_START_IN_Z + c, _WRENCH_START_IN_Z + c] = Z[0, 0] * noise_std[c] ** 2
@@ -116,7 +115,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into G[:, first:]; Z sums y z^T, X and Y are [E V] of y and z."""
+    """Write the sum of X^T W Y to G[:, first:]; Z sums y z^T, X and Y are [E V] of y and z."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
@@ -137,7 +136,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right_side(LZ, W, index, factors, g):
-    """Write the sum of X^T W r into g (16,); LZ sums r z^T, X is [E V] of z."""
+    """Write the sum of X^T W r (16,) to g; LZ sums r z^T, X is [E V] of z, r the residual."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -149,7 +148,7 @@ def weighted_right_side(LZ, W, index, factors, g):
 
 @njit(cache=True)
 def eliminate_rows(A):
-    """Replace [A B] by [D L^T, L^-1 B] in place, for the symmetric A = L D L^T (n, n)."""
+    """Replace the rows [S B] in A by [D L^T, L^-1 B], for symmetric S = L D L^T (n, n)."""
     n, m = A.shape
     for k in range(n):
         inverse = 1.0 / A[k, k]
@@ -162,7 +161,7 @@ def eliminate_rows(A):
 
 @njit(cache=True)
 def solve_augmented_system_in_place(A):
-    """Replace the right part of [A B] by A^-1 B in place, A symmetric and positive definite."""
+    """Replace B in A = [S B] by S^-1 B, for symmetric, positive definite S (n, n)."""
     n, m = A.shape
     for i in range(n):
         A[i, i] *= 1.0 + RELATIVE_RIDGE
@@ -186,7 +185,7 @@ def write_inverse_6x6(S, A, W):
 
 
 class MomentEstimator(RecursiveEstimator):
-    """Recursive estimator whose memory is the sum of z z^T of Eq. (T18), and a row of the prior."""
+    """Recursive estimator with memory (20, 19): sum of z z^T, Eq. (T18), and row of the prior."""
 
     def initial_memory(self, theta: Array) -> Array:
         memory = np.zeros((20, 19))
@@ -205,7 +204,7 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated_parameters(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise N can be removed from G, otherwise to 0."""
+    """Set `taper` (16,) to 1 where G - `strength` N stays positive definite, otherwise to 0."""
     taper[:] = 1.0
     for i in range(16):
         for j in range(16):
@@ -237,7 +236,7 @@ def select_compensated_parameters(G, N, strength, K, taper):
 
 @njit(cache=True)
 def write_rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G, its part from noise into N; return the ratio of actual to given noise."""
+    """Write [G g] to G and G's noise part to N; return the ratio of observed to stated noise."""
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
@@ -261,8 +260,8 @@ def rtls_update(
 ):
     """Update theta (16,) and memory (20, 19) of recursive total least squares by N samples.
 
-    `noise_std` (6,) and `motion_std` (9,) are standard deviations of the wrench and of [s, omega,
-    alpha]; `information` (16,) are inverse variances of the prior.
+    `noise_std` (6,) is of the wrench, `motion_std` (9,) of [s, omega, alpha]; `information` (16,)
+    contains inverse variances of the prior.
     """
     space, Q, z, taper = allocate_scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))

@@ -1,4 +1,4 @@
-"""Monitor of a known load in use, which selects the load to eliminate, sample by sample.
+"""Monitor of a known load in use, which selects the load whose wrench is removed from a sample.
 
 Its states::
 
@@ -24,11 +24,11 @@ STATE_LEARNING, STATE_SETTLED, STATE_DISTURBED, STATE_OTHER_LOAD = range(4)
 LOAD_FADE_TIME_S, MIN_REST_TIME_S, OFFSET_TIME_CONSTANT_S, MIN_CHANGE_TIME_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
-MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
+MAX_RESIDUAL_OF_OFFSET_DRIFT = np.array([0.3] * 3 + [0.015] * 3)
 """Largest residual that offsets follow, three times `change.OFFSET_DRIFT_STD` [N, N m]."""
 MIN_FORCE_CHANGE_N = 0.5
 """Smallest change of the low-passed force that noise cannot cause [N]."""
-MAX_COM_DISTANCE_M = 1.0
+MAX_COM_DISTANCE_FROM_SENSOR_M = 1.0
 """Largest distance of So from the centre of mass of a grasped or released object [m]."""
 
 # Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
@@ -90,19 +90,18 @@ def _update_and_test_force_change(memory, residual, age, period):
 @njit(cache=True)
 def _is_com_of_change_within_reach(known, new):
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
-    return moment < (MAX_COM_DISTANCE_M * (new[6] - known[6])) ** 2
+    return moment < (MAX_COM_DISTANCE_FROM_SENSOR_M * (new[6] - known[6])) ** 2
 
 
 @njit(cache=True)
 def monitor_load(out, memory, sample, fallback, period, block, noise, window, hold, mass_std_ratio):
-    """Process one sample: monitor the known load and write the load to eliminate into `out` (16,).
+    """Process one sample (15,): ramp `out` (16,), [offsets; phi], to the load to remove.
 
-    `fallback` (10,) is the phi for a changed load; the last arguments are from
-    `change_detector_parameters`.
+    `fallback` (10,) is the phi for a changed load; `block` and on: `change_detector_parameters`.
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
-    known, residual, target = watch[change.KNOWN_LOAD], np.empty(6), np.empty(16)
+    known, residual, target = watch[change.KNOWN_LOAD_SLICE], np.empty(6), np.empty(16)
     wrench, motion = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
@@ -113,11 +112,11 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     if verdict == change.STATE_KNOWN:
         memory[STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
-        if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
+        if at_rest and (low_passed <= MAX_RESIDUAL_OF_OFFSET_DRIFT).all():
             for i in range(6):
                 known[i] += period / OFFSET_TIME_CONSTANT_S * residual[i]
     elif memory[STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD])
+        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD_SLICE])
         other = verdict == change.STATE_CHANGED and force_changed and near
         memory[STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)

@@ -1,4 +1,4 @@
-"""Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md)."""
+"""Load, delay and pose frame from a wrench and poses (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.logs.pose_motion.rigid import RigidFit, RigidParameters, Units
 from drake_teleop.logs.pose_motion.spectra import FitWindow, Spectra, WrenchGrid
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-_SEARCHED_RECORD_PART_S = 120.0
+_MAX_SEARCHED_DURATION_S = 120.0
 MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
 MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG = 5.0, 1.0
@@ -29,7 +29,7 @@ _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_MAX_ORIGIN_SENSITIVITY_TO_UNKNOWNS = 1e-3
+_MAX_ORIGIN_DERIVATIVE_BY_UNDETERMINED = 1e-3
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -42,7 +42,7 @@ class PoseFrame:
         R_SP: (3, 3) rotation from axes of P to those of S.
         position_stds_m: (3,) standard deviations of `p_SoPo_S` [m]; inf if undetermined.
         rotation_stds_deg: (3,) standard deviations of R_SP about the axes of S [deg].
-        is_shifted, is_rotated: whether origin, axes differ significantly from the description.
+        is_shifted, is_rotated: whether origin, axes differ significantly from the given ones.
     """
 
     p_SoPo_S: Array
@@ -87,11 +87,11 @@ class PoseEstimate(PoseMotion):
     """Load, delay and pose frame from a wrench and poses.
 
     Attributes:
-        fit: load for the given pose frame, which is estimated where None.
-        free_frame_fit: load, with the pose frame always estimated.
-        frame: pose frame of `free_frame_fit`.
+        fit: fit with the given origin and axes of the pose frame, if given.
+        free_frame_fit: fit with an estimated pose frame, `frame`.
         units_and_axes: unit of positions, axes and masses from the linear model's fit.
         t, rejected: (M,) instants [s], and True for disturbed ones.
+        note: text if disturbances could not be rejected.
     """
 
     fit: RigidFit
@@ -127,9 +127,9 @@ def estimate_from_poses(
 ) -> PoseEstimate:
     """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
-    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Origin
-    `p_SoPo_S` [m], rotation `R_SP`, and delay of the poses behind the wrench [s] are estimated
-    where None. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
+    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Each of
+    `p_SoPo_S` [m], `R_SP` and the delay of the poses behind the wrench [s] is estimated if None,
+    else kept. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
     are excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
@@ -253,7 +253,7 @@ def _find_splines_and_delay(
 
 
 def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
-    rows, length = len(grid.t), round(_SEARCHED_RECORD_PART_S / grid.dt)
+    rows, length = len(grid.t), round(_MAX_SEARCHED_DURATION_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     coarse, parts = grid.wrench[:: grid.stride], range(0, rows - length, length // 2)
@@ -288,16 +288,16 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_SENSITIVITY_TO_UNKNOWNS
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_DERIVATIVE_BY_UNDETERMINED
         deviations = np.where(lost, np.inf, deviations)
     moved = free.parameters.p_PoSo_P - start.p_PoSo_P
     turned = Rotation.from_matrix(start.R_PS.T @ free.parameters.R_PS).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
     limits = MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
-    shifted = _is_frame_wrong(moved, covariance[:3, :3], *limits)
+    shifted = _is_change_significant(moved, covariance[:3, :3], *limits)
     limits = MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG
-    tilted = _is_frame_wrong(turned, covariance[3:, 3:], *np.radians(limits))
+    tilted = _is_change_significant(turned, covariance[3:, 3:], *np.radians(limits))
     return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,
@@ -308,11 +308,11 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     )
 
 
-def _is_frame_wrong(x: Array, covariance: Array, min_size: float, largest_deviation: float) -> bool:
+def _is_change_significant(x: Array, covariance: Array, min_size: float, max_std: float) -> bool:
     if not np.isfinite(np.diag(covariance)).all():
         return False
     length = np.linalg.norm(x)
     direction = x / (length + 1e-300)
     deviation = float(np.sqrt(direction @ covariance @ direction))
     significant = length > max(min_size, _MIN_FRAME_ERROR_OVER_STD * deviation)
-    return bool(significant and deviation < largest_deviation)
+    return bool(significant and deviation < max_std)

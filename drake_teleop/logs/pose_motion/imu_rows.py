@@ -34,7 +34,7 @@ class _ImuSensorModel:
 
 
 def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
-    """Return IMU data corrected to fit splines of poses alone; None if the two do not agree."""
+    """Return IMU data with bias, axes and clock corrected to splines; None if they disagree."""
     position_std, rotation_std = splines.estimate_pose_noise()
     powers = position_std**2 / splines.rate, rotation_std**2 / splines.rate
     averaged = imu.average_to_rate(_COMPARED_IMU_RATE_HZ)
@@ -68,7 +68,7 @@ def _fit_sensor_model(
     which: int,
     pose_noise_power: float,
 ) -> _ImuSensorModel | None:
-    """Fit accelerometer (0) or gyroscope (1) data y (K, 3) to splines; None if unexplained."""
+    """Fit a model of accelerometer (0) or gyroscope (1) data y (K, 3); None for a poor fit."""
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
     even = t[0] + dt * np.arange(place[-1] + 1)

@@ -68,7 +68,7 @@ class LinearFit:
 def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -> LinearFit:
     """Fit the wrench by 16 signals, from second moments Z (..., bands, n, n); n is 22 or 38.
 
-    With the coefficients `load` (6, 16) only the constants are fitted.
+    With the coefficients `load` (6, 16) only the offsets are fitted.
     """
     zz, zf = (Z[..., :NUM_MOTION_SIGNALS, x] for x in (slice(NUM_MOTION_SIGNALS), WRENCH_COLUMNS))
     ff, floor = _wrench_powers(Z), min_noise_power(Z, levels)
@@ -119,14 +119,14 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 
 def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
-    """Return the least noise power (..., 1, 6) of the wrench, by rounding."""
+    """Return a lower limit (..., 1, 6) of noise power: rounding of the wrench's numbers."""
     power = _wrench_powers(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
     both = power.reshape(*power.shape[:-1], 2, 3).sum(axis=-1).repeat(3, axis=-1)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
-    """Return noise levels, with the best of white noise and random walks (T74) in each channel."""
+    """Return noise levels; each channel has white noise, or the likelier random walk (T74)."""
     levels = NoiseLevels.white_within_groups(bands)
     least = fit_linear_model(Z, levels).channel_costs - _MIN_COST_REDUCTION_BY_DRIFT
     shape = levels.relative_power.copy()
@@ -139,7 +139,7 @@ def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
 
 
 def fit_coefficients(spectra: Spectra) -> LinearFit:
-    """Fit the coefficients of all signals, or only the constants if the load is known."""
+    """Fit the coefficients of all signals, or only the offsets if the load is known."""
     levels = NoiseLevels.white_within_groups(spectra.window.bands)
     return fit_linear_model(spectra.second_moments(), levels, spectra.window.grid.known_load)
 
@@ -155,7 +155,7 @@ def _costs_at_delays(spectra: Spectra, delays: Array) -> Array:
 def find_best_delay_and_cost(
     spectra: Spectra, reach: float, finest: float = _FINEST_DELAY_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay [s] of highest likelihood within +-`reach`, and its cost, Eq. (T75)."""
+    """Return the likeliest delay [s] within +-`reach` of the present one, and its cost (T75)."""
     step = min(_COARSE_DELAY_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = _costs_at_delays(spectra, at)
@@ -184,7 +184,7 @@ def delay_std(spectra: Spectra) -> float:
 def guess_knot_spacing_and_delay(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return likeliest knot distance and delay [s] on a coarse grid; keep the delay if `known`."""
+    """Return likeliest knot distance and delay [s] on a coarse grid; a `known` delay is kept."""
     found, reach = [], window.delay_search_half_range_s
     for h in _knot_spacings_for_pose_rate(cache)[::2]:
         spectra, late = window.spectra_at_delay(cache.splines_with_spacing(h), delay), delay
@@ -201,7 +201,8 @@ def choose_knot_spacing_and_delay(
 ) -> tuple[SplineCache, float, float]:
     """Return splines, knot distance [s] and delay [s] of about the highest likelihood.
 
-    Knots are 8 or 16 % closer than at the highest likelihood. The delay is not changed if `known`.
+    Knots are closer than at the highest likelihood: by 8 % with a known load, else by 16 %. The
+    delay is not changed if `known`.
     """
 
     def spectra_of(cache: SplineCache, knot_spacing_s: float) -> Spectra:
@@ -226,7 +227,7 @@ def choose_knot_spacing_and_delay(
 
 
 def spline_cache_of_averaged_poses(poses: Poses) -> SplineCache:
-    """Return splines of poses that are averaged to 125 Hz or more."""
+    """Return splines of poses that are averaged down to 125 Hz or just above."""
     count = max(1, int(poses.rate / _MIN_AVERAGED_POSE_RATE_HZ + 1e-6))
     return SplineCache(poses.average_consecutive(count))
 
@@ -265,7 +266,7 @@ def estimate_clock_rate_error(
 
 
 def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay: float) -> Poses:
-    """Return the poses with stamps on the wrench's clock, for a relative rate error of theirs."""
+    """Return the poses with stamps corrected for the relative rate error of their clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 
@@ -306,9 +307,9 @@ _MIN_REJECTION_MARGIN_S = 0.1  # least margin on both sides of a rejected time s
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return True for instants (M,) with contact, impact or saturation, and a note or "".
+    """Return True for instants (M,) with contact, impact or saturation, and a note.
 
-    `spacing` is that of the splines' knots [s]. The note says that nothing could be rejected.
+    `spacing` is that of the splines' knots [s]. The note is "" unless rejection is impossible.
     """
     # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
     window, grid = spectra.window, spectra.window.grid

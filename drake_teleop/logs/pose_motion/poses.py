@@ -34,7 +34,7 @@ class Poses:
         return Poses(self.t, self.position, self.quaternion * sign[:, None])
 
     def average_consecutive(self, count: int) -> Poses:
-        """Return means of `count` consecutive poses, whose quaternion signs must not jump."""
+        """Return the mean of each `count` consecutive poses; quaternion signs must not jump."""
         rows = len(self.t) // count * count
         t, p, q = (
             x[:rows].reshape(-1, count, *x.shape[1:]).mean(axis=1)
@@ -57,7 +57,7 @@ class ImuData:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def average_to_rate(self, min_rate_hz: float) -> ImuData:
-        """Return means of consecutive rows without gaps, at `min_rate_hz` [Hz] or just above."""
+        """Return means of consecutive rows, at `min_rate_hz` or just above; none across gaps."""
         count = max(1, int(self.rate / min_rate_hz))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
@@ -73,8 +73,7 @@ class ImuData:
 class PosesOfLog:
     """Poses of S in a log, with gravity (3,) in the world [m/s^2].
 
-    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are the pose of the recorded frame P in the log
-    description.
+    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are those of the log description.
     """
 
     poses: Poses

@@ -32,7 +32,7 @@ _OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, eq=False)
 class RigidParameters:
-    """Parameters [offsets; phi] (16,), delay tau [s], and r (3,) [m], R (3, 3) of Eq. (T79)."""
+    """Parameters [offsets; phi] (16,), delay tau [s], r = p_PoSo_P [m] and R_PS, Eq. (T79)."""
 
     theta: Array
     delay_s: float
@@ -48,8 +48,8 @@ class RigidFit:
         parameters: estimated; `delay_s` is relative to the delay of the moments.
         covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
             if undetermined, 0 if not free.
-        misfit, degrees_of_freedom: twice the log likelihood ratio to the linear model, and its
-            degrees of freedom.
+        misfit: twice the log likelihood ratio to the linear model.
+        degrees_of_freedom: those of the misfit.
         expected_misfit_by_gains: expected increase of the misfit by the stated gain errors.
     """
 
@@ -71,24 +71,22 @@ class RigidFit:
 
     @property
     def std_inflation_by_misfit(self) -> float:
-        """Factor (>= 1) on standard deviations due to misfit."""
         left = self.misfit - _MAX_GAIN_MISFIT_OVER_EXPECTED * self.expected_misfit_by_gains
         by_noise = _NOISE_MISFIT_OVER_DOF * self.degrees_of_freedom
         return float(np.sqrt(max(1.0, left / by_noise)))
 
 
-def motion_transformation_matrix(R: Array, r: Array) -> Array:
-    """Return the matrix M (19, 22) of z = M [zeta; F], Eq. (T79), for R = R_PS, r = p_PoSo [m]."""
+def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
+    """Return M (19, 22), Eq. (T79), from [signals of P; wrench] to [1; wrench; motion of S]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
-    M[7:10, 1:4] = M[7:10, 4:7] = R.T
-    M[7:10, 7:10] = -R.T @ cross_matrix(r)
-    M[7:10, 10:16] = R.T @ centripetal_matrix(r)
-    M[10:13, 7:10] = R.T
+    M[7:10, 1:4] = M[7:10, 4:7] = M[10:13, 7:10] = R_PS.T
+    M[7:10, 7:10] = -R_PS.T @ cross_matrix(p_PoSo_P)
+    M[7:10, 10:16] = R_PS.T @ centripetal_matrix(p_PoSo_P)
     i, j = np.transpose(_OMEGA_PRODUCT_PAIRS)[:, :, None]
     k, m = np.transpose(_OMEGA_PRODUCT_PAIRS)[:, None]
-    M[13:19, 10:16] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
+    M[13:19, 10:16] = R_PS[k, i] * R_PS[m, j] + (k != m) * R_PS[m, i] * R_PS[k, j]
     return M
 
 
@@ -119,8 +117,8 @@ def fit_rigid(
 ) -> RigidFit:
     """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
 
-    Z (bands, 38, 38) are second moments, Q the part that noise of the poses adds. Parameters with
-    `free` (23,) True are estimated. The residual of the fit `linear` gives the first weights.
+    Z (bands, 38, 38) are `Spectra.second_moments_with_rates`, Q the part by noise of the poses.
+    Parameters with `free` (23,) True are estimated. The first weights are those of `linear`.
     """
     record = _RigidFitData(Z, Q, levels, free, linear.noise_power)
     solution = _solve_rigid_fit(record, start)
@@ -229,7 +227,7 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 
 
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38) and e (6, 38), the residual's coefficients of 38 signals."""
+    """Return B = -de/dx (6, 23, 38) and e (6, 38), coefficients of the residual wrench."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
     step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
@@ -346,7 +344,7 @@ class UnitsAndAxes:
 
     @property
     def is_usable(self) -> bool:
-        """Whether M_g, force over minus gravity, is known to 5 % of the mass."""
+        """Whether M_g, force over minus gravity, is known to 5 % of the mean mass."""
         return bool(self.max_mass_std_kg < 0.05 * self.axis_masses_kg.mean())
 
     @property

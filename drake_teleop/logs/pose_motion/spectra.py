@@ -40,9 +40,10 @@ SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
 
 @dataclass(frozen=True, eq=False)
 class WrenchGrid:
-    """Instants t (M,) of the motion signals [s], at about 100 Hz, and samples of the wrench.
+    """Instants t (M,) of the motion signals [s], below 200 Hz, and samples of the wrench.
 
-    `wrench` (N, 6) has N = M stride samples; `known_load` (6, 16) is Eq. (T73) of a load, or None.
+    `wrench` (N, 6) has `stride` samples for each instant. `known_load` (6, 16) are the
+    coefficients of a known load, Eq. (T73).
     """
 
     t: Array
@@ -98,7 +99,7 @@ class FrequencyBands:
 
     @cached_property
     def slices(self) -> list[slice]:
-        """Frequencies of each band."""
+        """Slice of `frequency` for each band."""
         starts = np.searchsorted(self.band_of_frequency, np.arange(self.num_bands + 1))
         return [slice(*ends) for ends in itertools.pairwise(starts)]
 
@@ -118,7 +119,7 @@ def end_taper(t: Array, start: float, stop: float) -> Array:
 def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
-    """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
+    """Return the taper (M,) with zeros within `margin` [s] of `lost`, and cosine edges."""
     edge = np.clip((samples_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
@@ -171,7 +172,7 @@ class FitWindow:
 
     @cached_property
     def is_taper_fixed(self) -> bool:
-        """Whether the weights of samples stay in place when the delay changes."""
+        """Whether the taper keeps its place over the wrench when the signals are delayed."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.known_load is not None)
@@ -185,7 +186,7 @@ class FitWindow:
         return out
 
     def filtered_taper(self, response: NDArray[np.complexfloating]) -> Array:
-        """Return the taper (M,), periodic after padding, filtered by a response at all K."""
+        """Return the taper (M,), padded and filtered by a response at each grid frequency."""
         n = self.grid.transform_length
         return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
 
@@ -197,7 +198,7 @@ class FitWindow:
         return replace(self, grid=grid, taper=taper)
 
     def spectra_at_delay(self, splines: PoseSplines, delay: float) -> Spectra:
-        """Return spectra of the wrench, and of the motion `delay` [s] later."""
+        """Return spectra of the wrench, and of the motion that is `delay` [s] behind it."""
         zeta = splines.signals(self.grid.t + delay, self.gravity_W)
         return Spectra(self, self.signal_spectrum(zeta), delay, zeta)
 
@@ -217,14 +218,14 @@ class Spectra:
     motion_signals: Array
 
     def with_delay(self, delay: float) -> Spectra:
-        """Return the spectra with signals shifted to a delay [s]; only `signals` changes."""
+        """Return the spectra with `signals` at another delay [s]."""
         window, shift, signals = self.window, delay - self.delay, self.signals
         if window.is_taper_fixed:
             before = window.filtered_taper(np.exp(-2j * np.pi * window.grid.frequency * shift))
             signals = window.signal_spectrum(self.motion_signals, before)
         late = signals * np.exp(2j * np.pi * window.bands.frequency * shift)[:, None]
         late[:, 0] = self.signals[:, 0]
-        return replace(self, signals=late)
+        return replace(self, signals=late, delay=delay)
 
     def second_moments(self) -> Array:
         """Return second moments (bands, 22, 22) of signals and wrench."""
@@ -240,7 +241,7 @@ class Spectra:
         return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
 
     def second_moments_at_delays(self, delays: Array) -> Array:
-        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows of signals."""
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows 0 to 15."""
         bands, wrench = self.window.bands, self.window.wrench_spectrum
         if self.window.is_taper_fixed:
             return np.array([self.with_delay(delay).second_moments() for delay in delays])
@@ -280,7 +281,7 @@ _MIN_REMAINING_DOF_SHARE = 0.25
 class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
-    Each band has half its number of independent values, its group, and power (6,) over the level.
+    `relative_power` (bands, 6) is the noise power of a band over the level of its group.
     """
 
     half_dof_of_bands: Array
@@ -292,7 +293,7 @@ class NoiseLevels:
         return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
-        """Return the noise power (..., bands, 6) of residuals with summed power `sums`, same shape.
+        """Return the noise power (..., bands, 6) of residuals, from their `sums` over bands.
 
         `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """

@@ -51,7 +51,7 @@ class ImuSplineRows:
     def with_data_in_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
-        """Return rows with specific force s and omega (K, 3), rotated from S by `splines`."""
+        """Return the rows with acceleration, quaternion rate from data s, omega (K, 3) in S."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -76,8 +76,8 @@ class PoseSplines:
     """Least-squares splines of poses of a frame P, with knots every `spacing` [s].
 
     Args:
-        smooth: penalize the fifth derivative, by the weight of largest likelihood, Eq. (T84), and
-            expect derivatives at the ends as large as inside, with the same correlations.
+        smooth: penalize the fifth derivative with the likeliest weight, Eq. (T84), and limit
+            derivatives at the ends to the statistics of those inside.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class PoseSplines:
         for part in (slice(0, 3), slice(3, 7)):
 
             def penalized(log_frequency: float, part: slice = part) -> tuple[Array, float, float]:
-                """Return normal matrix, noise variance and -2 log likelihood for a cutoff."""
+                """Return normal matrix, noise variance, -2 log likelihood for a cut-off."""
                 weight = self.rate / (2 * np.pi * np.exp(log_frequency)) ** (2 * SPLINE_DEGREE)
                 band = gram + weight * penalty
                 factor = cholesky_banded(band)

@@ -37,7 +37,7 @@ def uniform_times(t: Array) -> Array:
 
 
 def resample(t_new: Array, t: Array, x: Array) -> Array:
-    """Interpolate samples x (N, ...) at `t` linearly at `t_new`; hold the end values."""
+    """Interpolate x (N, ...), sampled at `t`, linearly at `t_new`; hold the end values."""
     first = int(np.searchsorted(t, t_new[0])) if len(t_new) else 0
     if np.array_equal(t_new, t[first : first + len(t_new)]):
         return x[first : first + len(t_new)]
@@ -103,13 +103,13 @@ def smooth_derivatives(
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return noise (3,) of `smooth_derivatives` over white noise of x [1, 1/s, 1/s^2]."""
+    """Return standard deviations (3,) of `smooth_derivatives` for unit white noise of x."""
     weights = polynomial_fit_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
 def polynomial_fit_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
-    """Return weights (6, w) that map w <= n samples to the coefficients of their polynomial."""
+    """Return weights (6, w) from w <= n samples to coefficients of their fitted polynomial."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
     half = max(_MIN_SMOOTHER_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
@@ -159,7 +159,7 @@ def low_pass_log(log: Log, cutoff_hz: float | None) -> Log:
 
 
 def remove_delay(log: Log, delay_s: float) -> Log:
-    """Return the log with its motion advanced by the delay, without samples that lack motion."""
+    """Return the log with its motion advanced by the delay [s]; drop samples without motion."""
     if log.static or delay_s == 0:
         return log
     at = log.t + delay_s
@@ -181,7 +181,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
 
 
 def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) True for samples that no gap affects, even after the low-pass."""
+    """Return (N,) True for samples that no gap affects, even after a low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     reach = 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))

@@ -43,7 +43,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 
 
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
-    """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
+    """Return `rows` of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
     zarr = import_optional_module("zarr", path)
     members = zarr.open_group(path, mode="r").members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}

@@ -180,14 +180,14 @@ def block_means_of_log(log: Log) -> BlockMeans:
 
 
 def wrench_of_weight(weight: Array, gravity: Array) -> Array:
-    """Return the wrench (N, 6) of a weight [m, m c] at rest, for gravity (N, 3) in S, Eq. (1)."""
+    """Return the wrench (N, 6) that holds a weight [m, m c] at rest in gravity (N, 3), in S."""
     return np.hstack([-weight[0] * gravity, np.cross(weight[1:], -gravity)])
 
 
 def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
-    """Add the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] to a log.
+    """Return the log plus the wrench of a weight [m, m c] (4,) that the robot has subtracted.
 
-    The delay of `motion_log`, the same log with motion, is estimated and taken into account.
+    Gravity is from `motion_log`, the same log with motion, at its estimated delay.
     """
     assert motion_log.gravity is not None
     at = log.t + delay_of_linear_fit(block_means_of_log(motion_log))
@@ -203,10 +203,10 @@ def estimate_auto_gravity(description: Description, source: str, read: ReadLog) 
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
 
-    def instants_at_delay(delay_s: float) -> BlockMeans:
+    def block_means_at_delay(delay_s: float) -> BlockMeans:
         return block_means_of_log(remove_delay(log, delay_s))
 
-    explanation = explain_misfit(block_means_of_log(log), instants_at_delay, ("gravity",))
+    explanation = explain_misfit(block_means_of_log(log), block_means_at_delay, ("gravity",))
     if explanation.theta[6] > 0.0:
         change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change

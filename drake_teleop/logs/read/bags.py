@@ -1,7 +1,7 @@
 """ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
 Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
-(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two.
+(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp` (`header.stamp` or `received`).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ _MESSAGES_PER_BLOCK, _RECEPTION_TIME_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
 _MCAP_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
-_TOO_LARGE_MESSAGE = "its uncompressed size is too large"
-_SPLIT_REMEDY = "cut it, or write the topics one by one"
-_VECTOR_OF_MESSAGE_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
-_VECTOR_OF_MESSAGE_FIELD |= dict.fromkeys(("position", "translation"), "position")
-_UNRENAMED_FIELDS = ("force", "torque", "linear_acceleration", "angular_velocity")
-_VECTOR_OF_MESSAGE_FIELD |= {x: x for x in _UNRENAMED_FIELDS}
+_TOO_LARGE_MESSAGE = "its uncompressed size is too large (more than 1.5 GB, or 200 times the file)"
+_SPLIT_REMEDY = "cut the bag, or write each topic to its own bag"
+_SHORT_NAME_OF_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
+_SHORT_NAME_OF_FIELD |= dict.fromkeys(("position", "translation"), "position")
+_FIELDS_WITH_OWN_SHORT_NAME = ("force", "torque", "linear_acceleration", "angular_velocity")
+_SHORT_NAME_OF_FIELD |= {field: field for field in _FIELDS_WITH_OWN_SHORT_NAME}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -60,7 +60,7 @@ class Topic(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a folder with metadata.yaml, or a .mcap, .db3 or .bag file."""
+    """Return whether a path is a folder with metadata.yaml, or ends in .mcap, .db3 or .bag."""
     return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in BAG_SUFFIXES
 
 
@@ -91,7 +91,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         )
         blocks = _read_column_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
-        raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
+        raise DrakeTeleopError("has no messages", where=f"{path}:{topic}", remedy="record it again")
     columns = {
         name: np.concatenate([block[name] for block in blocks])
         for name, values in blocks[0].items()
@@ -269,6 +269,6 @@ def _columns_by_short_name(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]
-        if group in _VECTOR_OF_MESSAGE_FIELD and axis in ("x", "y", "z", "w"):
-            found.setdefault(f"{_VECTOR_OF_MESSAGE_FIELD[group]}.{axis}", []).append(path)
+        if group in _SHORT_NAME_OF_FIELD and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_SHORT_NAME_OF_FIELD[group]}.{axis}", []).append(path)
     return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

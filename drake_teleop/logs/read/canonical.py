@@ -34,7 +34,7 @@ _KINEMATIC_COLUMNS = {
     "position": POSITION_COLUMNS,
 }
 _MAX_REST_SPEED_RAD_S = 0.05  # rad/s
-_MIN_TURN_BETWEEN_POSES_RAD = np.radians(10.0)
+_MIN_ROTATION_BETWEEN_POSES_RAD = np.radians(10.0)
 _VECTOR_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration", "gravity")
 _ROW_SHAPE_OF_FIELD: dict[str, tuple[int, ...]] = {"t": (), "wrench": (6,)}
 _ROW_SHAPE_OF_FIELD |= dict.fromkeys(_VECTOR_FIELDS, (3,)) | {"bridged": (), "R_WS": (3, 3)}
@@ -60,7 +60,7 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        estimated: those of "gravity" and "weight" that are estimated from the data.
+        estimated: "gravity", "weight", if the data determine them.
         resolution: quantization step of force and torque, for static poses [N, N m].
     """
 
@@ -162,8 +162,8 @@ def write_log(log: Log, path: str | Path) -> None:
 def describe_canonical(path: Path, table: Table) -> Description:
     """Return the description of a canonical table (columns `t`, `f_x` ...).
 
-    Rows are static poses if `t` is absent, or if they are slower than 5 Hz and gravity turns by
-    more than 10 deg in a fifth of the steps.
+    Rows with orientation or specific force are static poses unless the sensor rotates: if `t` is
+    absent, or slower than 5 Hz with rotations by more than 10 deg in a fifth of the steps.
     """
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"
@@ -223,4 +223,4 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         vertical = table.finite_numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
     turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _MIN_TURN_BETWEEN_POSES_RAD)
+    return bool(np.quantile(turned, 0.8) > _MIN_ROTATION_BETWEEN_POSES_RAD)

@@ -33,7 +33,7 @@ class Clock:
         kept_rows: (N,) row of the table for each time.
         num_rows: number of the table's rows, with removed ones.
         notes: sentences about corrections.
-        num_episodes: number of times at which the clock starts.
+        num_episodes: number of episodes; the clock starts again in each.
     """
 
     t: Array
@@ -83,13 +83,12 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the times (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
-    Episodes are joined in the whole table, so that all its streams keep one clock. `time.rate` is
-    that of the stream's usual rows; missing rows are gaps, unless only another stream has numbers
-    in them.
+    Episodes are joined in the whole table, so that all its streams keep one clock. With
+    `time.rate`, rows without numbers of the stream are gaps, unless other streams fill them.
     """
     if time.column is None:
         assert time.rate is not None
-        rows = _row_numbers_without_other_streams(table)
+        rows = _row_numbers_excluding_other_streams(table)
         spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
         return rows / spacing / time.rate, 1
     whole = table.whole_table or table
@@ -109,7 +108,7 @@ def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[
     return (t if table.kept_rows is None else t[table.kept_rows]), episodes
 
 
-def _row_numbers_without_other_streams(table: Table) -> NDArray[np.intp]:
+def _row_numbers_excluding_other_streams(table: Table) -> NDArray[np.intp]:
     whole, kept = table.whole_table, table.kept_rows
     if whole is None or kept is None:
         return np.arange(table.rows)
@@ -125,7 +124,7 @@ def _row_numbers_without_other_streams(table: Table) -> NDArray[np.intp]:
 def join_episodes(t: Array) -> tuple[Array, int]:
     """Return increasing times (N,) for a clock that starts again, and the number of episodes.
 
-    A step back to near the first stamp is a new start. Other steps back are not changed.
+    A step back to near the first stamp is a new start. Times with other steps back are unchanged.
     """
     finite = np.isfinite(t)
     known = t[finite]

@@ -50,7 +50,7 @@ class Time(StrictModel):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
-            raise ValueError("time needs either column or rate, not both: give one of them")
+            raise ValueError("time needs either column or rate: give exactly one of them")
         if self.nanoseconds is not None and (self.column is None or self.unit != "s"):
             raise ValueError("nanoseconds require a column of seconds: give column, with unit s")
         return self
@@ -179,7 +179,7 @@ class Imu(_RecordedStream):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         if self.is_mounting_auto and not self.specific_force:
             raise ValueError(
-                "auto is found from specific_force: give that, or values of frame and position"
+                "auto is estimated from specific_force: add it, or give frame and position"
             )
         return self
 
@@ -210,7 +210,7 @@ class Pose(_RecordedStream):
         if self.frame == "base":
             raise ValueError("frame must be sensor, or a rotation matrix from the posed frame to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
-            raise ValueError("frame and rotation_in_sensor mean the same: give one of them")
+            raise ValueError("frame and rotation_in_sensor both give R_SP: give one of them")
         shifted = self.position_in_sensor == "auto" or any(self.position_in_sensor)
         if self.position is None and (shifted or self.rotation_in_sensor == "auto"):
             raise ValueError(
@@ -224,7 +224,7 @@ class Pose(_RecordedStream):
 
     @property
     def R_SP(self) -> Array | None:
-        """Rotation (3, 3) from the axes of the posed frame P to those of S; None if equal."""
+        """Rotation (3, 3) from the axes of the posed frame P to those of S; None: identity."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
                 return np.array(rotation)
@@ -249,7 +249,7 @@ class Static(_Stream):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
-            raise ValueError("static needs one of gravity, specific_force (both in S), orientation")
+            raise ValueError("static needs exactly one of gravity, specific_force and orientation")
         if self.weight == "removed":
             raise ValueError(
                 "weight: removed cannot be used with static poses: record the load in motion,"
@@ -272,16 +272,16 @@ class Description(StrictModel):
         if np.abs(self.gravity_W).max() > _MAX_GRAVITY_M_S2:
             raise ValueError(f"gravity exceeds {_MAX_GRAVITY_M_S2:g} m/s^2: give it in m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
-            raise ValueError("gravity: auto is found from a pose alone: add pose, and remove imu")
+            raise ValueError("gravity: auto requires a pose and no IMU: add pose, or remove imu")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
                 raise ValueError("static poses cannot be combined with wrench, imu or pose")
             return self
         if self.wrench is None:
-            raise ValueError("no wrench: add wrench (from any file), or only static (at rest)")
+            raise ValueError("no wrench: add wrench, or describe poses at rest as static")
         if self.pose is None:
             if self.imu is None:
-                raise ValueError("a wrench without kinematics: add imu or pose (from any file)")
+                raise ValueError("a wrench without kinematics: add imu or pose (in any file)")
             if self.imu.angular_velocity is None:
                 raise ValueError(
                     "the angular velocity is missing: add imu.angular_velocity or pose"
@@ -293,7 +293,7 @@ class Description(StrictModel):
             if self.wrench.weight is not None:
                 raise ValueError("wrench.weight requires an orientation: add pose")
         elif self.pose.is_frame_auto and self.wrench.frame == "base":
-            raise ValueError("pose: auto needs a wrench in the axes of the sensor, not in base")
+            raise ValueError("pose: auto requires a wrench in the axes of the sensor, not in base")
         pose = self.pose is not None and self.pose.is_frame_auto
         kinds = {"pose: auto": pose, "gravity: auto": self.gravity == "auto"}
         kinds["wrench.weight"] = self.wrench.weight is not None
@@ -320,14 +320,14 @@ class Description(StrictModel):
 
 
 def load_description(path: str | Path) -> Description:
-    """Read a log description; its paths are relative to its folder."""
+    """Return the log description of a YAML file, with paths joined to its folder."""
     path = Path(path)
     if not os.path.exists(path):
         raise DrakeTeleopError("no such log description", where=str(path), remedy="check the path")
     data = read_yaml(path)
     if not isinstance(data, dict):
         remedy = "see docs/log-description.md"
-        raise DrakeTeleopError("holds no fields", where=str(path), remedy=remedy)
+        raise DrakeTeleopError("contains no fields", where=str(path), remedy=remedy)
     try:
         description = Description.model_validate(data)
     except ValidationError as error:

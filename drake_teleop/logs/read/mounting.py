@@ -24,7 +24,7 @@ SignalPairs = list[tuple[Array, Array]]
 
 
 def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
-    """Return pairs of specific force, and omega if `gyroscope`: pose at `t`, IMU at `imu.t`."""
+    """Return (pose at `t`, IMU at `imu.t`) of specific force and, if `gyroscope`, omega."""
     signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
     return [(resample(t, pose.t, x), y) for x, y in signals]
 
@@ -34,7 +34,8 @@ def lag_of_imu_clock(
 ) -> float:
     """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
-    The axes of the IMU may differ by any affine map. The span of `arm_effects` (N, k) is removed.
+    The axes of the IMU may differ by any affine map. The span of the lever arm's accelerations
+    `arm_effects` (N, k) is removed.
     """
     U, singular, _ = np.linalg.svd(arm_effects - arm_effects.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
@@ -53,11 +54,11 @@ def lag_of_imu_clock(
 
 
 def mid_record_lag_and_clock_drift(
-    t: Array, pairs: SignalPairs, t_imu: Array, lag: float, independent: float
+    t: Array, pairs: SignalPairs, t_imu: Array, lag: float, num_independent: float
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `lag` [s] is a first estimate, from `independent` samples. An insignificant drift is 0.
+    `lag` [s] is a first estimate. An insignificant drift is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -81,7 +82,7 @@ def mid_record_lag_and_clock_drift(
             start = cost
         residual = np.concatenate([r.ravel() for r in left])
         found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
-    gain = independent * np.log(start / (cost + 1e-300))
+    gain = num_independent * np.log(start / (cost + 1e-300))
     total_drift_s = abs(found[1]) * float(t[-1] - t[0])
     if gain < _MIN_CLOCK_DRIFT_LIKELIHOOD_GAIN or total_drift_s < _MIN_CLOCK_DRIFT_S:
         return lag, 0.0
@@ -107,7 +108,7 @@ def least_squares_with_deviations(
 ) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
 
-    `residual` maps x to residuals (N, 3 k), with one weight for each three channels.
+    `residual` maps x to residuals (N, 3 k); each group of three channels has one weight.
     """
     from scipy.optimize import least_squares
 
@@ -324,8 +325,8 @@ def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mountin
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
     lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
-    independent = 2 * cutoff * float(t[-1] - t[0])
-    middle, drift = mid_record_lag_and_clock_drift(t, pairs, imu.t, lag, independent)
+    num_independent = 2 * cutoff * float(t[-1] - t[0])
+    middle, drift = mid_record_lag_and_clock_drift(t, pairs, imu.t, lag, num_independent)
     shifted = resample(t + middle + drift * (t - centre), imu.t, pairs[0][1])
     R, mirrored = _kabsch_rotation_and_is_mirrored(shifted, expected)
 
@@ -345,7 +346,7 @@ def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mountin
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
-        R_SI=_rotated_about_fixed_axes(R, x[:3]),
+        R_SI=_rotate_about_fixed_axes(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
         mid_record_lag_s=float(x[3]),
         mid_record_time_s=centre,
@@ -366,7 +367,7 @@ def _refine_mounting(
 
     def pose_residual(x: Array) -> Array:
         resampled = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3)
-        rotated = resampled @ _rotated_about_fixed_axes(R, x[:3]).T
+        rotated = resampled @ _rotate_about_fixed_axes(R, x[:3]).T
         left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
         return left.reshape(len(t), -1) + x[7:]
@@ -388,7 +389,7 @@ def _kabsch_rotation_and_is_mirrored(x: Array, y: Array) -> tuple[Array, bool]:
     return R, bool(reflected < 0.25 * direct and reflected < 0.05)
 
 
-def _rotated_about_fixed_axes(R: Array, vector: Array) -> Array:
+def _rotate_about_fixed_axes(R: Array, vector: Array) -> Array:
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 

@@ -43,7 +43,7 @@ _EstimateAuto = Callable[..., auto_frames.Estimate]
 def read_log(
     path: str | Path, *, bandwidth_hz: float | None = 30.0, differentiate: bool = True
 ) -> Log:
-    """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
+    """Read a canonical table (.csv, .parquet ...) or a log description (.yaml, .yml).
 
     Signals are resampled to the wrench's clock at its median rate. Angular velocity is from the
     gyroscope, else from the orientation; angular acceleration from the file, else differentiated;
@@ -129,14 +129,14 @@ class _LogReader:
             return log
         without = stream.model_copy(update={"weight": None})
         other = self.description.model_copy(update={"wrench": without})
-        return restore_removed_weight(log, np.array(weight), self._read_edited_log(other))
+        return restore_removed_weight(log, np.array(weight), self._read_log_with(other))
 
     def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
-        read = partial(self._read_edited_log, differentiate=differentiate)
+        read = partial(self._read_log_with, differentiate=differentiate)
         self.description, notes = describe(self.description, self.source, read)
         self.notes += notes
 
-    def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
+    def _read_log_with(self, description: Description, *, differentiate: bool = True) -> Log:
         for stream in self.description.streams.values():
             self._table_of_stream(stream)
         reader = _LogReader(description, self.source, 30.0, dict(self.tables))

@@ -28,9 +28,9 @@ MAX_PLAUSIBLE_VALUES = {
 
 @dataclass(frozen=True)
 class Stream:
-    """Signals (N, ...) of one stream on its clock `t` [s]; None for absent signals.
+    """Signals (N, ...) of one stream in S, at its times `t` [s]; None for absent signals.
 
-    `recorded_poses` are the poses of S, `imu_data` the IMU data in S.
+    `recorded_poses` are poses of S.
     """
 
     name: str

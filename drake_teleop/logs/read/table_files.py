@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
-_WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_CANONICAL_COLUMNS = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
@@ -53,7 +53,7 @@ _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are re
 
 
 def note_that_table_needs_description(source: str) -> str:
-    """Return a note on lines of a description for the log of a canonical table, otherwise ""."""
+    """Return a remark that fields of a table need a log description; "" for other files."""
     if Path(source).suffix.lower() not in TABLE_READERS:
         return ""
     return " (in a log description of this table; the canonical form has no such line)"
@@ -89,7 +89,7 @@ def _read_text(path: Path, header: bool = True) -> Table:
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
-    """Return the table of a CSV file, and the number of its first data line."""
+    """Return the table of a CSV file, and the line number of its first data row."""
     import polars as pl
 
     with path.open("rb") as file:
@@ -230,7 +230,7 @@ def _find_separator(line: str) -> str:
 
 def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
-    if not marked or not all(_is_number(cell) for cell in rest[0].split(separator)):
+    if not marked or not all(_is_decimal_number(cell) for cell in rest[0].split(separator)):
         return None
     cells = None if separator == " " else separator
     names = [name.strip() for name in marked[-1].lstrip("# ").split(cells)]
@@ -238,7 +238,7 @@ def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> l
     return names if matching else None
 
 
-def _is_number(cell: str) -> bool:
+def _is_decimal_number(cell: str) -> bool:
     try:
         float(cell.replace(",", "."))
     except ValueError:
@@ -255,8 +255,8 @@ def _strip_column_names(names: list[str]) -> list[str]:
 
 def _add_lower_case_names_if_canonical(columns: dict[str, _ColumnType]) -> dict[str, _ColumnType]:
     small = {name.lower(): column for name, column in columns.items()}
-    canonical = len(small) == len(columns) and _WRENCH_COLUMN_NAMES.issubset(small)
-    return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
+    canonical = len(small) == len(columns) and _CANONICAL_COLUMNS.issubset(small)
+    return small | columns if canonical and not _CANONICAL_COLUMNS.issubset(columns) else columns
 
 
 def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
@@ -405,14 +405,14 @@ def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
 
 
 def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Move the last axis of arrays (k, N), (j, k, N) to the front if a vector has N > k numbers."""
+    """Move the last axis of arrays (k, ..., N > k) to the front if vectors have N numbers."""
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
 
-    def is_turned(array: NDArray) -> bool:
+    def is_transposed(array: NDArray) -> bool:
         rows, last = len(array), array.shape[-1]
         return array.ndim > 1 and rows < last and rows not in lengths and last in lengths
 
-    return {name: np.moveaxis(x, -1, 0) if is_turned(x) else x for name, x in arrays.items()}
+    return {name: np.moveaxis(x, -1, 0) if is_transposed(x) else x for name, x in arrays.items()}
 
 
 TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(

@@ -26,8 +26,7 @@ class Table:
     """Columns of one file.
 
     Attributes:
-        columns: arrays (N,) of any type by name; also (N, ...), with its elements as `name[0]`,
-            row-major.
+        columns: arrays (N,) by name; of arrays (N, ...) also the elements, `name[0]` (row-major).
         first_row: number of the first data row in the file.
         absent_groups: names of column groups that the file marks as not provided.
         whole_table: table of all rows, if this one has only some of them.
@@ -44,11 +43,11 @@ class Table:
     note: str = ""
 
     def line_in_file(self, row: int) -> int:
-        """Return the number that a row of this table has in its file, for messages."""
+        """Return the number in the file, for messages, of a row of this table."""
         return self.first_row + int(row if self.kept_rows is None else self.kept_rows[row])
 
     def rows_with_any_number(self, names: Sequence[str | int]) -> Table:
-        """Return the rows in which at least one of the named columns has a number."""
+        """Return a table of the rows with a number in at least one of the named columns."""
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.numbers_with_nan(names[0], "")).all():
             return self
@@ -59,11 +58,11 @@ class Table:
         if not 0 < len(rows) < self.rows:
             return self
 
-        def selected(name: str) -> NDArray:
+        def kept_part_of_column(name: str) -> NDArray:
             column = self.columns[name]
             return column[rows] if rows[-1] < len(column) else column
 
-        columns = ColumnsOnAccess(self.columns, selected)
+        columns = ColumnsOnAccess(self.columns, kept_part_of_column)
         return replace(self, columns=columns, whole_table=self, kept_rows=rows)
 
     @property
@@ -75,7 +74,7 @@ class Table:
     def finite_numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
-        """Return the numbers (N, width) of the named columns, side by side."""
+        """Return the finite numbers (N, width) of the named columns; raise an error for others."""
         out, found = np.empty((0, width)), 0
         for name in names:  # one after the other, to save memory
             column = self._finite_column(str(name), where)
@@ -159,7 +158,7 @@ class Table:
         if bad.any():
             row = self.line_in_file(int(np.argmax(bad)))
             what = f"no finite number in {int(bad.sum())} rows, the first is row {row}"
-            remedy = "cut the log before it or repair the rows"
+            remedy = "cut the log before this row, or repair the rows"
             raise DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
         return numbers
 
@@ -172,7 +171,7 @@ class Table:
 
 
 def decimal_resolution(values: Array) -> float:
-    """Return the largest power of ten <= 1 of which all values are multiples, or 0."""
+    """Return the largest power of ten <= 1 of which all values are multiples; 0: none."""
     for decimals in range(_MAX_RESOLUTION_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
         if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
@@ -181,7 +180,7 @@ def decimal_resolution(values: Array) -> float:
 
 
 class ColumnsOnAccess(UserDict[str, Any]):
-    """Columns by name, which `read` returns at each access."""
+    """Columns by name; each access calls `read`."""
 
     def __init__(self, names: Iterable[str], read: Callable[[str], NDArray]) -> None:
         super().__init__(dict.fromkeys(names))

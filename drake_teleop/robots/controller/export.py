@@ -34,8 +34,8 @@ from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
-"""Options of a C compiler for the bits of Python."""
-_TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
+"""Options of a C compiler for results that are bit-equal to those of Python."""
+_TEST_VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
 _MODEL_NAME = "wrench_compensator"
@@ -48,7 +48,7 @@ ExportedFiles = Mapping[str, str | bytes]
 
 
 class ExportedCompensation(NamedTuple):
-    """Load, rate, low-pass and sensor of an export.
+    """Load, rate, low-pass and sensor range of an export.
 
     Attributes:
         dt: period of the readings [s].
@@ -120,14 +120,14 @@ def render_template(name: str, **values: Any) -> str:
 def _test_vector_header(target: ExportedCompensation) -> str:
     inputs, sensor_range = _simulated_readings_and_sensor_range(target)
     target = target._replace(sensor_range=sensor_range)
-    python = target.make_compensator(**_TEST_SCALES)
+    python = target.make_compensator(**_TEST_VECTOR_SCALES)
     outputs = [
         python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
         "test_vector.h",
-        settings=target.settings_initializer(**_TEST_SCALES),
+        settings=target.settings_initializer(**_TEST_VECTOR_SCALES),
         inputs=[_c_literal(row) for row in inputs],
         outputs=[_c_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
         flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
@@ -239,7 +239,6 @@ def _model_variables(target: ExportedCompensation) -> list[tuple[str, str, str, 
 
 
 def ros2_filter_files(target: ExportedCompensation) -> ExportedFiles:
-    """Return the files of a ROS 2 package with a filter of wrenches."""
     shipped = {
         f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
         "package.xml": "package.xml",

@@ -1,4 +1,4 @@
-"""Drake blocks of the paper's Fig. 4, with one port per signal, for use in your own Diagram."""
+"""Drake blocks of the paper's Fig. 4, with one port per signal, for custom Diagrams."""
 
 from drake_teleop.station.blocks.channel import NetworkChannel, PassivityAtMaster, PassivityAtSlave
 from drake_teleop.station.blocks.estimators import ContactDetector, LoadEstimator

@@ -1,4 +1,4 @@
-"""Blocks for the channel: a network, and both ends of a passivity method for any network."""
+"""Blocks of the channel: a network, and a passivity method's two ends for any network."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OPTIONAL_INPUT_PORTS = ("hand_wrench_E", "load_wrench_B", "saturated", "contact
 
 
 class NetworkChannel(SteppedBlock):
-    """Network that transmits a vector in every period; a packet takes at least one period.
+    """Network that sends one vector per period; a packet takes at least one period.
 
     .. pydrake_system::
 
@@ -30,9 +30,9 @@ class NetworkChannel(SteppedBlock):
         - packet: (N,) numbers to send
         output_ports:
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
-        - arriving: (N + 1,) value of `received` at the next period; depends on the input
+        - arriving: (N + 1,) value of `received` in the next period; direct feedthrough
 
-    Connect `arriving` to a block with the same period and without feedthrough.
+    Connect `arriving` to a block with the same period and without direct feedthrough.
 
     Args:
         size: length N of the vector.
@@ -83,17 +83,7 @@ class NetworkChannel(SteppedBlock):
 
 
 class _PassivityEndBlock(SteppedBlock):
-    """Base class of both ends of a passivity method.
-
-    Args:
-        passivity: method and parameters, equal at both ends.
-        period: time between packets [s].
-        start: (7,) pose X_WS of the slave at the start.
-        R_WB: (3, 3) alignment of the master's base with the world.
-        scales: (2,) motion of the slave over motion of the master: translation, rotation.
-        force_scale: force at the master over force at the slave.
-        timeout: time without packets after which the safe state begins [s].
-    """
+    """Base class of the blocks `PassivityAtMaster` and `PassivityAtSlave`."""
 
     __slots__ = ()
 
@@ -126,7 +116,7 @@ class _PassivityEndBlock(SteppedBlock):
         self._declare_output("packet", 4, slice(0, PACKET_SIZE))
         self._declare_end_specific_output()
 
-    def _inputs_and_packet(self, context: Context) -> tuple[list[Array], Array, bool]:
+    def _evaluate_inputs_and_packet(self, context: Context) -> tuple[list[Array], Array, bool]:
         packet = self._received.Eval(context)
         inputs = []
         for port, is_optional in self._ports:
@@ -136,20 +126,27 @@ class _PassivityEndBlock(SteppedBlock):
 
 
 class PassivityAtMaster(_PassivityEndBlock):
-    """Block for the master's end of a passivity method: renders a wrench, sends pose and energy.
+    """Block of a passivity method's end at the master: renders a wrench, sends pose and energy.
 
     .. pydrake_system::
 
         name: PassivityAtMaster
         input_ports:
-        - received: (39,) newest packet of the slave, and 1 if it is new
+        - received: (39,) newest packet from the slave; 1 if it is new
         - pose_command: (7,) commanded pose X_WS, after kinematic scaling
-        - hand_wrench_E: (6,) wrench of the hand at E, in B [N, N m]; 0 if unconnected
+        - hand_wrench_E: (6,) wrench of the hand on the stylus at E, in B; 0 if unconnected
         output_ports:
         - packet: (38,) for the slave
         - wrench_to_master: (6,) F_E_B to render at the hand [N, N m]
 
-    Arguments as for `_PassivityEndBlock`.
+    Args:
+        passivity: method and parameters, equal at both ends.
+        period: time between packets [s].
+        start: (7,) pose X_WS [qw qx qy qz px py pz] of the slave at the start.
+        R_WB: (3, 3) orientation of the master's base B in world W.
+        scales: (2,) slave motion over master motion: translation, rotation.
+        force_scale: force at the master over force at the slave.
+        timeout: time without packets before an end fades the wrench or stops the slave [s].
     """
 
     __slots__ = ()
@@ -160,29 +157,29 @@ class PassivityAtMaster(_PassivityEndBlock):
 
     def _advance(self, context: Context, results: list[Array]) -> None:
         ends, _, port_energies, wrench, packet = results
-        inputs, *received = self._inputs_and_packet(context)
+        inputs, *received = self._evaluate_inputs_and_packet(context)
         states = *self._constants, ends, port_energies[:2], packet, wrench
         steps.step_master_end(self._method, *inputs, *received, *states)
 
 
 class PassivityAtSlave(_PassivityEndBlock):
-    """Block for the slave's end of a passivity method: commands a pose, sends wrench and energy.
+    """Block of a passivity method's end at the slave: commands a pose, sends wrench and energy.
 
     .. pydrake_system::
 
         name: PassivityAtSlave
         input_ports:
-        - received: (39,) newest packet of the master, and 1 if it is new
+        - received: (39,) newest packet from the master; 1 if it is new
         - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
-        - load_wrench_B: (6,) part of wrench_B from the load, for method "ledger"; 0 if unconnected
+        - load_wrench_B: (6,) part of wrench_B from the load, for method `ledger`; 0 if unconnected
         - pose_slave: (7,) actual X_WS of the slave
-        - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
+        - saturated: (1,) 1 to send the last valid wrench instead; 0 if unconnected
         - contact: (1,) flag of a contact detector; 0 if unconnected
         output_ports:
         - packet: (38,) for the master
         - pose_to_slave: (7,) X_WS to follow
 
-    Arguments as for `_PassivityEndBlock`.
+    Arguments as for `PassivityAtMaster`.
     """
 
     __slots__ = ()
@@ -196,7 +193,7 @@ class PassivityAtSlave(_PassivityEndBlock):
 
     def _advance(self, context: Context, results: list[Array]) -> None:
         ends, pose, port_energies, _, packet = results
-        (*values, saturated, contact), *received = self._inputs_and_packet(context)
+        (*values, saturated, contact), *received = self._evaluate_inputs_and_packet(context)
         flags = bool(saturated[0] > 0.5), float(contact[0])
         states = *self._constants, ends, pose, port_energies, packet
         steps.step_slave_end(self._method, *values, *flags, *received, *states)

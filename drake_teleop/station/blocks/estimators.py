@@ -1,4 +1,4 @@
-"""Load estimator and contact detector with a port for each signal of the wrist sensor."""
+"""Blocks of load estimator and contact detector with one input port per sensor signal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
-class _SamplePorts:
+class _SampleInputPorts:
     def __init__(self, system: LeafSystem) -> None:
         sizes = list(regressor.signal_sizes_of_sample(0).items())[:-1]
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
@@ -44,12 +44,12 @@ class LoadEstimator(DoubleOnlySystem, load_estimator.LoadEstimator):
         - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
         output_ports:
         - load_estimate: (16,) [offsets; phi]
-        - load_state: (1,) 0 learning, 1 settled, 2 disturbed, 3 another load
+        - load_state: (1,) 0 learning, 1 settled, 2 disturbed, 3 load changed
 
     Args:
         noise_std: (6,) standard deviations of the wrench [N, N m].
         motion_std: (9,) standard deviations of specific force, angular velocity and angular
-            acceleration, for method "rtls" and `watch`.
+            acceleration, for `config.method` "rtls" and `config.watch`.
         period: sampling period [s].
         initial: (16,) initial estimate.
         config: settings; default: recursive least squares from the start.
@@ -73,11 +73,11 @@ class LoadEstimator(DoubleOnlySystem, load_estimator.LoadEstimator):
         super().__init__(config, noise, motion, period, regressor.FIRST_JOINT_INDEX, start)
 
     def _declare_sample_ports(self, size: int) -> Any:
-        return _SamplePorts(self)
+        return _SampleInputPorts(self)
 
 
 class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
-    """Block that detects contact in the measured wrench without the load's part.
+    """Block that detects contact in the measured wrench minus offsets and the load's wrench.
 
     .. pydrake_system::
 
@@ -94,7 +94,7 @@ class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
         - contact: (1,) 1 in contact, else 0
 
     Args:
-        floor: noise floor of the wrench in free motion, fitted at the rate of this block.
+        floor: noise floor of the wrench, fitted to free motion sampled at this block's rate.
         period: sampling period [s].
         gravity_W: (3,) [m/s^2].
     """
@@ -115,7 +115,7 @@ class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
         self._orientation = self.DeclareVectorInputPort("R_WS", 9)
 
     def _declare_sample_ports(self, arm: Any) -> Any:
-        return _SamplePorts(self)
+        return _SampleInputPorts(self)
 
     def _next_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array

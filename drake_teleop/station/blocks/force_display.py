@@ -1,4 +1,4 @@
-"""Force display: motor torques J^T F for a wrench F, within the device's limits."""
+"""Block that converts a wrench F to motor torques J^T F within the device's limits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.station.stepped_block import SteppedBlock
 
 
 class ForceDisplay(SteppedBlock):
-    """Block that converts a wrench to motor torques of a haptic device, with a safe state.
+    """Block that converts a wrench to motor torques; invalid data fade the wrench to 0 in 50 ms.
 
     .. pydrake_system::
 
@@ -26,12 +26,12 @@ class ForceDisplay(SteppedBlock):
         output_ports:
         - joint_torque: (6,) J^T F + gravity compensation [N m]
         - force_to_master: (6,) displayed wrench F [N, N m]
-        - fault_at_hand: (1,) code of a `Fault`, 0 without fault
+        - fault_at_hand: (1,) `Fault` code, 0 without fault
 
     Args:
         device: device model, such as `Master().device(0.0, 0.0)`.
         period: sampling period [s].
-        start: (6,) joint positions before the first valid ones.
+        start: (6,) joint positions to use until valid ones arrive [rad].
     """
 
     __slots__ = ()

@@ -1,4 +1,4 @@
-"""Blocks for the wrench of a load and wrench scaling, for double, AutoDiffXd and Expression."""
+"""Blocks of load wrench and wrench scaling for double, AutoDiffXd and Expression."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
-def _compiled_or_python(function: Any, T: Any) -> Callable[..., None]:
+def _function_for_scalar(function: Any, T: Any) -> Callable[..., None]:
     return function if T is float else function.py_func
 
 
@@ -43,12 +43,12 @@ def NonContactWrench_(T: Any) -> Any:
             - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
             - angular_velocity_S: (3,) [rad/s]
             - angular_acceleration_S: (3,) [rad/s^2]
-            - load: (10,) inertial parameters phi; the argument phi if unconnected
+            - load: (10,) inertial parameters phi; if unconnected, argument `phi`
             output_ports:
             - non_contact_wrench_S: (6,) wrench on the load [N, N m]
 
         Args:
-            phi: (10,) inertial parameters of the load about So, in S; a parameter of the context.
+            phi: (10,) inertial parameters of the load about So, in S; a numeric parameter.
         """
 
         __slots__ = NO_EXTRA_SLOTS
@@ -73,7 +73,7 @@ def NonContactWrench_(T: Any) -> Any:
                 phi = context.get_numeric_parameter(self._parameter).CopyToVector()
             wrench = _zero_vector_of_type(T, 6)
             motion = [port.Eval(context) for port in self._motion]
-            _compiled_or_python(non_contact_wrench_into, T)(*motion, phi, wrench)
+            _function_for_scalar(non_contact_wrench_into, T)(*motion, phi, wrench)
             output.SetFromVector(wrench)
 
     return NonContactWrenchT
@@ -96,15 +96,15 @@ def WrenchScaling_(T: Any) -> Any:
             - angular_velocity_S: (3,) [rad/s]
             - angular_acceleration_S: (3,) [rad/s^2]
             - load_estimate: (16,) [offsets; phi]
-            - R_WS: (9,) orientation of S by rows, only for wrench_to_master and separate sigmas
+            - R_WS: (9,) orientation of S by rows, for wrench_to_master, sigma_weight, sigma_inertia
             output_ports:
             - contact_wrench_S: (6,) F_c [N, N m]
             - scaled_wrench_S: (6,) F' [N, N m]
             - wrench_to_master: (6,) F_E_B = -force_scale F', in the master's base B [N, N m]
 
         Args:
-            config: scales; default: contact and load are not scaled.
-            R_WB: (3, 3) alignment of the master's base with the world.
+            config: scales; by default sigma and gamma are 1.
+            R_WB: (3, 3) orientation of the master's base B in world W.
             gravity_W: (3,) [m/s^2].
         """
 
@@ -141,7 +141,7 @@ def WrenchScaling_(T: Any) -> Any:
             given, wrench = self._config.gripper_phi, _zero_vector_of_type(T, 6)
             gripper = estimate[6:] if given is None else np.asarray(given)
             parts = gripper, estimate[6:] - gripper
-            _compiled_or_python(scaled_wrench_into, T)(
+            _function_for_scalar(scaled_wrench_into, T)(
                 measured, estimate[:6], s, omega, alpha, *parts, *scales[:3], wrench
             )
             excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
@@ -150,7 +150,7 @@ def WrenchScaling_(T: Any) -> Any:
                     where = "WrenchScaling: gravity in S"
                     raise compensation.unknown_gravity_error(where, "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
-                _compiled_or_python(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
+                _function_for_scalar(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
 
         def _R_WS(self, context: Any) -> Any:
@@ -169,7 +169,7 @@ def WrenchScaling_(T: Any) -> Any:
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context, self._scales), self._R_WS(context)
-            to_master_into = _compiled_or_python(force_scaling.wrench_to_master_into, T)
+            to_master_into = _function_for_scalar(force_scaling.wrench_to_master_into, T)
             to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)
 

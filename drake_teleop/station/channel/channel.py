@@ -1,4 +1,4 @@
-"""Channel between master and slave: one compiled step of both ends."""
+"""Channel between master and slave: settings, and a compiled step of network and both ends."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def timeout_s(self, period: float) -> float:
-        """Return the silence [s] before an end's safe state, for a packet every `period` [s]."""
+        """Return the time without packets before the safe state [s], for steps of `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         lines = enumerate(self.networks_of_directions())
@@ -68,13 +68,13 @@ class Channel(NetworkConfig):
 _MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
 _ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_MONITOR_SIZES)
 _layout = slots.SlotAllocator(_ENDS_STATE_SIZE)
-_STEP_COUNT = _layout.number()  # number of the step
-# Last finite command (7); 1 if the newest command is not finite.
+_STEP_COUNT = _layout.number()
+# Last finite commanded pose (7); 1 if the newest one is not finite.
 _LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG = _layout.vector(8)
-_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG = _layout.vector(8)  # pose of the slave, likewise
+_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG = _layout.vector(8)  # the same of the slave's pose
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
-_TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
+_TIME_SINCE_INVALID_SLAVE_WRENCH = _layout.number()  # time since the last invalid wrench [s]
 _MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _MONITOR_SIZES)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = map(_layout.vector, [slots.MEMORY_SIZE] * 2)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
@@ -93,7 +93,7 @@ _ZERO_LOAD_WRENCH = np.zeros(6)
 def method_parameters_and_frame(
     passivity: PassivityConfig, R_WB: Array, scales: Array, force_scale: float
 ) -> tuple[Array, Array]:
-    """Return the method's parameters, and `frame` of `step_channel`."""
+    """Return the method's parameters (NUM_PARAMETERS,), and `frame` (11,) as in `step_channel`."""
     # A motion scale of zero transfers no energy; any unit is valid.
     scales = np.where(scales > 0.0, scales, 1.0)
     parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
@@ -105,7 +105,7 @@ def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array
     ends = np.zeros(_ENDS_STATE_SIZE)
     ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG][:7] = start
     ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG][:7] = start
-    ends[_TIME_WITH_VALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
+    ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -122,12 +122,12 @@ def step_channel(
     """Run one step of both ends and of both directions of the network.
 
     Args:
-        steps: addresses of the passivity method's compiled functions.
+        steps: result of `methods.step_addresses`.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
-        frame: (11,) R_WB by rows; motion of the slave over the master: translation, rotation.
+        frame: (11,) R_WB by rows; slave motion over master motion: translation, rotation.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
         ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
@@ -159,11 +159,11 @@ def step_master_end(
 ):  # fmt: skip
     """Run one step of the master's end; arguments are those of `step_channel`.
 
-    `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
-    hand is added to `work` (2,) [J].
+    `received` is the slave's newest packet, `fresh` is True if it is new, `packet` is written. The
+    hand's energy input by translation and rotation is added to `work` (2,) [J].
     """
     before, held = ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG], ends[_RENDERED_HAND_WRENCH]
-    watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
+    monitor, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
     valid = _update_pose_and_twist(pose_command, before, T, dx, twist)
     for g in range(2):
@@ -176,7 +176,7 @@ def step_master_end(
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
     safe_state.master_wrench_limits_into(
-        healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, watch, limits
+        healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, monitor, limits
     )
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
@@ -195,7 +195,7 @@ def step_slave_end(
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
     before, held = ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG], ends[_LAST_VALID_SLAVE_WRENCH]
-    watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
+    monitor, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
@@ -205,19 +205,19 @@ def step_slave_end(
     load = memory[slots.LOAD_WRENCH]
     if not (are_valid_port_values(wrench_B) and are_valid_port_values(load_B)):
         valid = False
-        ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
+        ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] = 0.0
     elif saturated:
-        ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
+        ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
         _convert_wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_WITH_VALID_SLAVE_WRENCH], T)
+        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_INVALID_SLAVE_WRENCH], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _convert_wrench_to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_TIME_WITH_VALID_SLAVE_WRENCH] += T
+        ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
@@ -228,7 +228,7 @@ def step_slave_end(
         packet[fields.SENDER_INPUTS_FINITE] = 0.0
     packet[fields.CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
-    safe_state.slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
+    safe_state.slave_command_into(healthy, fault, T, timeout, requested, monitor, pose_received)
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
     pose_difference_into(pose_received, left, dx)
     for g in range(2):
@@ -237,7 +237,10 @@ def step_slave_end(
 
 @njit(cache=True)
 def _update_pose_and_twist(pose, before, T, dx, twist):
-    """Write change (6,) and twist (6,), 0 unless both poses are valid; return whether `pose` is."""
+    """Write pose change `dx` (6,) and twist (6,), 0 if this or the last `pose` (7,) is invalid.
+
+    Return whether `pose` is valid.
+    """
     valid = are_valid_port_values(pose)
     if valid:
         pose_difference_into(pose, before, dx)
@@ -273,16 +276,16 @@ class TeleopChannel(SteppedBlock):
 
     While the wrist sensor is saturated, the last valid wrench is used.
 
-    Ports are those of `MakeChannel`; pose_received and wrench_received are outputs, contact (0 if
-    unconnected) is always an input, and load_wrench_B is used by the method `ledger` only.
-    `ports` (8,) contains the energy input of the hand (2) and of the slave's wrench (2), by
-    translation and rotation [J]; time without packets at master and slave (2) [s]; energy input of
-    the slave's wrench along the slave's command (2) [J].
+    Ports are those of `MakeChannel`, but the outputs to slave and master are pose_received and
+    wrench_received; contact is always an input, 0 if unconnected. Only `ledger` uses load_wrench_B.
+    `ports` (8,) contains energy inputs of hand (2) and slave's wrench (2), by translation and
+    rotation [J]; time without packets at master and slave (2) [s]; energy input of the slave's
+    wrench along the slave's command (2) [J].
 
     Args:
-        R_WB: (3, 3) alignment of the master's base with the world.
-        scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of the contact force, slave to master.
+        R_WB: (3, 3) orientation of the master's base B in world W.
+        scales: (2,) slave motion over master motion: translation, rotation.
+        force_scale: force at the master over contact force at the slave.
         start: (7,) pose X_WS of the slave at the start.
     """
 
@@ -328,10 +331,10 @@ class TeleopChannel(SteppedBlock):
         self._declare_output("contact_at_hand", 5, flag)
 
     def Restart(self, context: Context, command: Array, slave: Array, fill_time_s: float) -> None:
-        """Restart the channel in a running station, without packets, at a constant slave command.
+        """Start this channel, newly built, in a running station at the slave's present command.
 
-        `command` and `slave` (7,) are commanded and actual X_WS of the slave. During
-        `fill_time_s` the slave of method `wave` keeps its command.
+        `command` and `slave` (7,) are commanded and actual X_WS of the slave. Method `wave` keeps
+        the command for `fill_time_s`, in which packets fill the channel.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
         ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG][:7] = slave

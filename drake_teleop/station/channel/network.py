@@ -1,4 +1,4 @@
-"""Simulated network; it returns the newest packet at each step (docs/theory.md, (T26), (T27)).
+"""Simulated network whose receiver reads the newest packet (docs/theory.md, (T26), (T27)).
 
 Delays are independent, so jitter reorders packets. Losses follow a Gilbert-Elliott chain. Random
 numbers are hashes of (seed, direction, step).
@@ -23,7 +23,7 @@ from drake_teleop.station.passivity.packet import has_packet_arrived, move_pose_
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 MAX_DELAY_S = 10.0  # [s], bounds the memory
 MAX_TRACE_DURATION_S = 36000.0  # [s]
-MAX_POSE_EXTRAPOLATION_S = 0.1  # [s]; then the pose stands still
+MAX_POSE_EXTRAPOLATION_S = 0.1  # [s]; after it the pose is constant
 
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
@@ -46,23 +46,22 @@ class NetworkConfig:
     burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
     burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share that is lost in the bad state")
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
-    rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "packets per second at most; null: all")
-    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age of a packet that is used")
-    redundant: bool = plain(False, "packets repeat the samples that the playout buffer may await")
+    rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "largest packet rate; null: every step")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age at which packets are used")
+    redundant: bool = plain(False, "packets repeat the data of the last `playout` seconds")
     trace: str | None = plain(
         None,
-        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file, "
-        "from the scenario's folder, with the columns `time` [s], increasing, and `delay` [s], "
-        "one-way, empty if the packet was lost; between its rows the last one holds, after its end "
-        "it starts again",
+        "CSV file of a recorded delay, relative to the scenario's folder, instead of delay, jitter "
+        "and distribution; columns: `time` [s], increasing, and `delay` [s], one-way, empty if the "
+        "packet was lost. A row holds until the next; after the last row the file is repeated",
         is_path=True,
     )
     silence: str = choice(
         "hold",
         _SILENCE_POLICIES,
-        "what the receiver reads at steps without a new packet: the newest one's values; no "
-        "velocity and no wrench, the null packet of wave variables; or a pose that moves on with "
-        "its velocity for 0.1 s. Cumulative parts stay as they are",
+        "values at steps without a new packet; hold: the newest packet; zero: the same with zero "
+        "velocity and wrench; extrapolate: the same with a pose that keeps its velocity for 0.1 s. "
+        "Energies and integrals are always held",
     )
 
     def check(self, where: str = "network") -> None:
@@ -148,7 +147,7 @@ def network_parameters(
 
 
 def mean_delay(config: NetworkConfig) -> float:
-    """Return the mean one-way delay of arriving packets, at least the playout time [s]."""
+    """Return the mean one-way delay of arriving packets [s], but at least the playout time."""
     if config.trace is None:
         return max(config.delay, config.playout)
     delays = _read_delay_trace(Path(config.trace), _TRACE_STEP_S) * _TRACE_STEP_S
@@ -157,7 +156,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 
 def longest_delay(config: NetworkConfig) -> float:
-    """Return the largest age of an arriving packet when the receiver uses it [s]."""
+    """Return the largest one-way delay of an arriving packet [s], but at least the playout time."""
     longest = config.delay * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_delay_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
@@ -173,18 +172,18 @@ def _read_delay_trace(path: Path, period: float) -> Array:
     time = table.finite_numbers(["time"], 1, str(path))[:, 0]
     delay = table.single_column("delay", str(path))
     if len(delay) != len(time):
-        what = f"has {len(delay)} values, the column time has {len(time)}"
+        what = f"has {len(delay)} values, but column time has {len(time)}"
         raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
-    too_late = f"is more than {MAX_TRACE_DURATION_S:g} s after the first"
+    too_late = f"is more than {MAX_TRACE_DURATION_S:g} s after the first time"
     for column, values, bad, what in (
         ("time", time, np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
         ("time", time, age > MAX_TRACE_DURATION_S, too_late),
-        ("delay", delay, (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
+        ("delay", delay, (delay < 0) | (delay > MAX_DELAY_S), f"is outside 0 to {MAX_DELAY_S:g} s"),
     ):
         if bad.any():
             first = int(np.argmax(bad))
-            what = f"row {table.line_in_file(first)}, {values[first]:g}, {what}"
+            what = f"row {table.line_in_file(first)}: {values[first]:g} {what}"
             remedy = "give seconds, sorted by time; an empty delay is a lost packet"
             raise DrakeTeleopError(what, where=f"{path}:{column}", remedy=remedy)
     sent = np.arange(math.floor(age[-1] / period + 0.5) + 1) * period
@@ -199,7 +198,7 @@ def _random_uniform(p, k, draw):
 
 @njit(cache=True)
 def _draw_delay_steps(p, k, draw):
-    """Return the delay of packet k [steps] from random numbers `draw` to `draw` + 2; -1: lost."""
+    """Return the delay of packet k [steps] (-1: lost), by random numbers `draw` to `draw` + 2."""
     if p.shape[0] > _DELAY_TRACE_START:
         steps = p[_DELAY_TRACE_START + k % (p.shape[0] - _DELAY_TRACE_START)]
         return int(max(steps, p[_MIN_DELAY_STEPS])) if steps >= 0.0 else -1
@@ -220,7 +219,7 @@ def _draw_delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _draw_loss_and_delays(p, k, bad):
-    """Return the loss state (1: bad) at step k; delays of packet and copy [steps] (-1: none)."""
+    """Return loss state (1: bad) at step k, delays of packet and duplicate [steps] (-1: none)."""
     if p[_BAD_STATE_SHARE] > 0.0:
         likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
         bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
@@ -237,9 +236,9 @@ def _draw_loss_and_delays(p, k, bad):
 
 
 def initial_network_state(p: Array, initial_packet: Array) -> tuple[Array, Array]:
-    """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
+    """Return the initial state of one direction: receiver (4 + N,), and packets in transit.
 
-    `p` contains the network's parameters, `initial_packet` (N,) the values at the receiver before
+    `p` is the result of `network_parameters`, `initial_packet` (N,) what the receiver reads before
     the first packet.
     """
     slots = int(p[_NUM_TRANSIT_SLOTS])
@@ -302,7 +301,7 @@ def _apply_silence_policy(policy, silence_s, packet):
 
 @njit(cache=True)
 def packet_delay_steps(p, num_steps):
-    """Return the delays (num_steps, 2) of packets and their copies [steps]; -1: does not arrive."""
+    """Return the delays (num_steps, 2) of packets and of their duplicates [steps]; -1: none."""
     delays, bad = np.empty((num_steps, 2), np.int64), p[_BAD_STATE_SHARE]
     for k in range(num_steps):
         bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
@@ -312,7 +311,7 @@ def packet_delay_steps(p, num_steps):
 def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the number of the newest received packet at each step, (steps,); -1 for none."""
+    """Return the send step of the newest received packet at each step, (steps,); -1: none."""
     p = network_parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_STEPS])
     for travel in packet_delay_steps(p, steps).T:
@@ -324,7 +323,7 @@ def newest_packets(
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
-    """Return the longest time without a new packet in a simulated minute [s]; inf without any."""
+    """Return the longest time between new packets in a simulated minute [s]; inf without any."""
     steps = math.ceil((_SILENCE_SIMULATION_S + longest_delay(config)) / period)
     newest = newest_packets(config, _SILENCE_SIMULATION_SEED, direction, steps, period)
     fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)

@@ -26,23 +26,23 @@ class FloorStand(NamedTuple):
 class Environment(ABC):
     """Object that the tool can touch; subclasses are dataclasses.
 
-    Its bodies may be fixed or move, with any shape that Drake supports. The compiled contact law
-    is faster than Drake's; it supports boxes and one `moving_part`.
+    Its bodies may be fixed or move, with any shape that Drake supports. For boxes and one
+    `moving_part`, the station uses a faster, compiled contact law (`point_contact`).
     """
 
     @property
     @abstractmethod
     def slip_speed(self) -> float:
-        """Sliding speed of full friction [m/s]; the smallest of all objects applies to all."""
+        """Sliding speed of full friction [m/s]; the plant uses the smallest of all objects."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the object to a plant with the tool, as new model instances, before Finalize."""
+        """Add the object's bodies to a plant, as new model instances, before Finalize."""
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
     ) -> None:
-        """Change contact pairs and contact materials of object and `tool`, after Finalize."""
+        """Exclude contact pairs, or replace contact materials of the tool, after Finalize."""
         return
 
     def check(self, where: str) -> None:
@@ -50,7 +50,7 @@ class Environment(ABC):
 
     @property
     def parts(self) -> tuple[Environment, ...]:
-        """Objects of `SeveralObjects`; otherwise only this one."""
+        """Objects that a `SeveralObjects` consists of; for any other class, only this object."""
         return (self,)
 
     @property
@@ -108,7 +108,7 @@ def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
 
 
 def AddFreeJoint(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) -> None:
-    """Add a joint so that a body floats, with initial pose X_WBody, before Finalize."""
+    """Add a 6-DOF joint between world and body, with default pose X_WBody, before Finalize."""
     name, world = f"{body.name()}_floats", plant.world_frame()
     joint = plant.AddJoint(QuaternionFloatingJoint(name, world, body.body_frame()))
     turn = X_WBody.rotation().ToQuaternion().wxyz()
@@ -122,7 +122,7 @@ def BodiesWeldedToTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[geometry.GeometryId]]:
-    """Return the shapes with contact properties of `tool` and of each body welded to it."""
+    """Return the shapes with contact material, by body, of `tool` and the bodies welded to it."""
     inspector, shapes = scene_graph.model_inspector(), dict[BodyIndex, list[geometry.GeometryId]]()
     for index in BodiesWeldedToTool(plant, tool):
         own = plant.GetCollisionGeometriesForBody(plant.get_body(index))

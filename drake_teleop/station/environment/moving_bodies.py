@@ -1,4 +1,4 @@
-"""Compiled poses of moving bodies from the plant's state, for contact between plant steps.
+"""Compiled forward kinematics of moving bodies, for contact forces between plant steps.
 
 From parent P (joint frame F) to child B (joint frame M): X_WB = X_WP X_PF X_FM(q) X_MB.
 """
@@ -38,12 +38,10 @@ BODY_STATE_SIZE = 13
 def MakeJointTableAndRowBodies(
     plant: MultibodyPlant, bodies: Iterable[tree.BodyIndex]
 ) -> tuple[Array, list[int]]:
-    """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
-
-    Columns: 0 row of the parent body, or -1 if it is anchored; 1 type of joint; 2 and 3 first
-    index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored
-    parent) and 14-20 X_MB, a quaternion and a position each. Parents precede children.
-    """
+    """Return a table (m, 21) of the joints from world to `bodies`, and the child of each row."""
+    # Parents first. Columns: 0 row of the parent, -1 if it is anchored; 1 type of joint; 2 and 3
+    # first index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an
+    # anchored parent) and 14-20 X_MB, a quaternion and a position each.
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
     above, anchored, order = dict[int, tuple[int, int]](), set[int](), list[int]()
     for index in plant.GetJointIndices():
@@ -140,16 +138,16 @@ def _hermite_value_and_rate(h, u, a, a_dot, b, b_dot):
 
 
 @njit(cache=True)
-def _quaternion_rate(spin, turn):
-    return quaternion_product((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
+def _quaternion_rate(omega, q):
+    return quaternion_product((0.0, 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]), q)
 
 
 @njit(cache=True)
 def interpolate_joint_state(joints, h, u, start, end, out):
-    """Write the state [q; v] at the fraction u of a step of h [s] into `out` (Hermite cubics).
+    """Write the state [q; v] at the fraction u (0 to 1) of a step of h [s] into `out`.
 
-    `start` and `end` are the plant's states at both ends; `MakeJointTableAndRowBodies` returns
-    `joints`.
+    Hermite cubics connect the plant's states `start` and `end` of the step;
+    `MakeJointTableAndRowBodies` returns `joints`.
     """
     for row in joints:
         q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])

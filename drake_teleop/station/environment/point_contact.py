@@ -1,8 +1,9 @@
 """Compiled copy of Drake's compliant point contact, for spheres of the tool on boxes.
 
-With depth x, stiffness k, dissipation d, slip velocity v_t and slip speed v_s of full friction::
+With depth x, stiffness k, dissipation d, slip velocity v_t, friction coefficient mu, and slip speed
+v_s of full friction::
 
-    f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
+    f_n = k x (1 + d dx/dt) >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
 """
 
 from __future__ import annotations
@@ -43,15 +44,17 @@ class ShapePairs(NamedTuple):
     """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
-        compiled_pairs: (k, 28), pairs of a sphere and a box; columns: 0-2 centre of the sphere in
-            S [m], 3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead
-            of W if it moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
-            moves in W (zero if fixed), 22 stiffness [N/m], 23 dissipation [s/m], 24 and 25 static
-            and dynamic friction, 26 slip speed [m/s], 27 row of the body in the joint table, or -1.
-        monitored_pairs: (l, 40), bounding boxes of the other pairs. As above, with 0-2 centre of
-            the tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
+        compiled_pairs: (k, 28), pairs of a sphere of the tool and a box, with their contact law.
+        monitored_pairs: (l, 40), bounding boxes of the other pairs, which have no compiled law.
         monitoring_reason: why the first pair of `monitored_pairs` is not in `compiled_pairs`.
     """
+
+    # Columns: 0-2 centre of the sphere in S [m], 3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox
+    # at rest (in the body instead of W if it is in the joint table), 16-18 half the box's edges,
+    # 19-21 direction of the body's prismatic joint in W (zero without), 22 stiffness [N/m], 23
+    # dissipation [s/m], 24 and 25 static and dynamic friction, 26 slip speed [m/s], 27 row in the
+    # joint table, or -1. Monitored pairs: 0-2 centre, 28-36 R_SBox by rows and 37-39 half the edges
+    # of the tool's box; 3 and 22-25 are zero.
 
     compiled_pairs: Array
     monitored_pairs: Array
@@ -66,11 +69,12 @@ def FindContactPairs(
     slip_speed: float,
     row_bodies: Sequence[int] = (),
 ) -> ShapePairs:
-    """Return the pairs of a shape of the tool and one of the environment.
+    """Return the pairs of a shape of the tool and one of the environment, unless filtered.
 
     Args:
-        tool: pose X_SBody of its body, for each shape of the tool.
-        slip_speed: sliding speed of full friction [m/s], the plant's stiction tolerance.
+        tool: for each shape of the tool, the pose X_SBody of the shape's body.
+        environment: model instances of the objects to touch.
+        slip_speed: sliding speed above which friction is full [m/s].
         row_bodies: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
 
     Raises:
@@ -142,8 +146,8 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
     direction = np.zeros(3)
     for joint in map(plant.get_joint, plant.GetJointIndices()):
         if joint.child_body().index() == body.index() and isinstance(joint, PrismaticJoint):
-            R_WJ = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
-            direction = R_WJ @ joint.translation_axis()
+            R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
+            direction = R_WF @ joint.translation_axis()
     return direction
 
 
@@ -167,7 +171,7 @@ def _combined_contact_law(
 def depth_of_sphere_in_box(
     pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal_and_point: Array
 ) -> float:
-    """Return the depth of a sphere in a box [m]; below 0 if they are apart, not the distance.
+    """Return the depth of a sphere in a box [m], or any negative number if they do not touch.
 
     Args:
         pair: (28,) row of `ShapePairs.compiled_pairs`.
@@ -220,7 +224,8 @@ def lower_bound_of_box_distance(
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
     `pair` (40,) is a row of `ShapePairs.monitored_pairs`; `box` (28,) is its first part with the
-    present pose of the environment's box. The bound is the largest gap along an edge of either box.
+    present pose of the environment's box. The bound is the largest gap between the boxes'
+    projections on the directions of all edges.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
     between = plus(between, apply_matrix(R, vector_at(pair, 0)))

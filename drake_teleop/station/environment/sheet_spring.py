@@ -14,7 +14,7 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment import environment
 
-_BENCH_BASE_TO_LEAF_M = 0.15  # from the lower face of the model's bench to the leaf [m]
+_BENCH_BOTTOM_TO_LEAF_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
@@ -31,7 +31,7 @@ class SheetSpring(environment.Environment):
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
     damping_ratio: float = quantity(
-        0.03, "1", 0.0, 100.0, "of the first mode; above 1 the leaf creeps back"
+        0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 the leaf creeps back"
     )
     slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
@@ -62,7 +62,7 @@ class SheetSpring(environment.Environment):
     @property
     def floor_stand(self) -> environment.FloorStand:
         x, y, z = self.position
-        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BASE_TO_LEAF_M)
+        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BOTTOM_TO_LEAF_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""

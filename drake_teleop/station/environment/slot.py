@@ -56,7 +56,7 @@ class Slot(Environment):
 
     @property
     def width(self) -> float:
-        """Distance between the walls [m]."""
+        """Distance between the slot's walls [m]."""
         return 2 * PEG_RADIUS_M + self.clearance
 
     @property
@@ -65,7 +65,7 @@ class Slot(Environment):
 
     @property
     def floor_bottom_height(self) -> float:
-        """Height z_W of the floor's lower face [m]."""
+        """Height z_W of the lower face of the slot's floor [m]."""
         return self.position[2] - self.depth - _SLOT_FLOOR_THICKNESS_M
 
     @property
@@ -109,7 +109,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """Return a box on one side of the slot, from y `inner` outwards and z `top` down."""
+            """Return pose and shape of a box from y `inner` outwards and z `top` to the floor."""
             across, height = edge + c + _SIDE_BLOCK_WIDTH_M - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(SLOT_LENGTH_M, across, height)

@@ -32,20 +32,20 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 @settings
 @dataclass
 class Surface(Environment):
-    """Base class of objects with a contact surface, which Drake combines with that of the tool.
+    """Base class of objects with contact stiffness, dissipation and friction of their surface.
 
-    Stiffnesses are springs in series; friction is the harmonic mean. The tool's ball has stiffness
-    4e5 N/m and friction 0.2.
+    In contact, Drake combines the stiffnesses of surface and tool as springs in series, and takes
+    the harmonic mean of their frictions. The tool's ball has stiffness 4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(
-        1e4, "N/m", 1e2, 1e7, "of the surface, in series with the other body (E)"
+        1e4, "N/m", 1e2, 1e7, "stiffness of the surface, in series with the other body (E)"
     )
     dissipation: float = quantity(
         1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation d: damping k x d at depth x (E)"
     )
     friction: float = quantity(
-        0.2, "1", 0.0, 2.0, "of the surface; its mean with the tool's counts (E)"
+        0.2, "1", 0.0, 2.0, "friction coefficient; the harmonic mean with the tool's applies (E)"
     )
 
     @property
@@ -93,8 +93,8 @@ class Wall(Surface):
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:
-            what = "is the zero vector, which has no direction"
-            remedy = "point it to where the tool comes from, such as [0, 0, 1]"
+            what = f"the normal {self.normal} has no direction (its length is below 0.001)"
+            remedy = "set the direction out of the wall, towards the tool, such as [0, 0, 1]"
             raise DrakeTeleopError(what, where=f"{where}.normal", remedy=remedy)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -155,7 +155,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Let the tool touch only the block's box, and other bodies only its balls at corners."""
+        """Exclude contact of the tool with the block's corner balls, and of others with its box."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         blocks = [body for body in map(plant.get_body, bodies) if body.name() == _BLOCK_BODY_NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]

@@ -1,4 +1,4 @@
-"""Contact detection at the slave: the wrench without the load's part exceeds a noise floor."""
+"""Contact detection at the slave: the wrench minus the load's part exceeds a noise floor."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -42,9 +42,10 @@ def _update_flag_with_arm(memory, sample, estimate, arm, settings):
 
 @njit(cache=True)
 def update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings):
-    """Update the memory of a contact detector with a sample; return whether there is contact.
+    """Update a contact detector's `memory` with a sample; return whether there is contact.
 
-    `acceleration` (3,) is that of So, in S [m/s^2]; `settings` is `ContactDetector.settings`.
+    `sample` is that of `load.regressor`, `estimate` (16,) [offsets; phi], `acceleration` (3,) of So
+    in S [m/s^2]; `settings` is `ContactDetector.settings`.
     """
     if not (are_valid_port_values(sample) and are_valid_port_values(estimate)):
         return memory[CONTACT_INDEX] != 0.0
@@ -59,10 +60,10 @@ def update_contact_flag_with_sample(memory, sample, estimate, acceleration, sett
 class ContactDetection(LeafSystem):
     """Block that detects contact of the tool; `floor` is a noise floor fitted at the block's rate.
 
-    The flag keeps its value while the wrist sensor is saturated or the sensor's low-pass recovers.
+    The flag keeps its value while the wrist sensor is saturated and for `config.recovery` after.
 
-    Ports are those of `blocks.ContactDetector`, with one input `sample` of the wrist sensor, see
-    `drake_teleop.load.regressor`, in the place of its parts.
+    Ports are those of `blocks.ContactDetector`, but one input `sample`
+    (`drake_teleop.load.regressor`) replaces the separate signals of the wrist sensor.
     """
 
     __slots__ = NO_EXTRA_SLOTS

@@ -30,8 +30,8 @@ class LoadEstimatorConfig:
         False,
         "update with every sample; only for free motion: a contact wrench would count as load",
     )
-    forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
-    method: str = choice("rls", (), "least squares, or total: for noisy accelerations", METHODS)
+    forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor per sample; 1 = none")
+    method: str = choice("rls", (), "rls: least squares; rtls: total, for noisy motion", METHODS)
     settled_bound: float = quantity(
         0.05, "1", 1e-6, 10.0, "predicted uncertainty of a settled load relative to a natural value"
     )
@@ -51,16 +51,16 @@ class LoadEstimatorConfig:
 class LoadEstimator(LeafSystem):
     """Block with the estimate of load and offsets: constant, updated in every period or monitored.
 
-    Ports are those of `blocks.LoadEstimator`, with one input `sample` of the wrist sensor in the
-    place of its parts. load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
+    Ports are those of `blocks.LoadEstimator`, but one input `sample` replaces the separate signals
+    of the wrist sensor. load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
         motion_std: (9,) standard deviations of specific force [m/s^2], angular velocity [rad/s] and
             angular acceleration [rad/s^2], for "rtls" and for `watch`.
-        initial: (16,) initial estimate.
+        initial: (16,) initial estimate [offsets; phi], Eq. (7).
         covariance: (16, 16) covariance of `initial`; with it, monitoring begins at once.
-        fallback: (10,) phi to use after a change of load.
+        fallback: (10,) load parameters phi to use after a change of load; default: zeros.
     """
 
     __slots__ = NO_EXTRA_SLOTS

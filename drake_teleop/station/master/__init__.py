@@ -1,1 +1,1 @@
-"""Block "haptic device": dynamics of devices and leader arms, and their force display."""
+"""Block "haptic device": dynamics of haptic devices and leader arms, and force display."""

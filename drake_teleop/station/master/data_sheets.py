@@ -1,4 +1,4 @@
-"""Haptic devices by name: the Phantom of the paper, and others from data sheets."""
+"""Settings of the haptic device: the paper's Phantom, data sheets by name, or a leader arm."""
 
 import copy
 import dataclasses
@@ -39,7 +39,7 @@ class PhantomJointFriction:
 @settings
 @dataclass
 class DeviceFigures:
-    """Data sheet of a haptic device; x of its base frame points to the operator, z up."""
+    """Data sheet of a haptic device; in its base frame, x points to the operator and z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "apparent mass at the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "inertia about every axis")
@@ -49,7 +49,7 @@ class DeviceFigures:
     turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
     peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "about yaw, pitch and roll; 0: measured only"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; 0: none"
     )
     size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
@@ -64,9 +64,9 @@ class DeviceFigures:
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_SIZE_M = [0.11, 0.113, 0.113]
+_OMEGA_SIZE_M = [0.11, 0.113, 0.113]  # workspace
 _OMEGA_MAX_TURN_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
-_OMEGA_STEP_RAD = math.radians(0.09)
+_OMEGA_STEP_RAD = math.radians(0.09)  # rotation step of the encoders
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -84,9 +84,9 @@ _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_COLUMNS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
+_ROW_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
 _sheets = {
-    name: DeviceFigures(**dict(zip(_COLUMNS.split(), copy.deepcopy(row), strict=True)))
+    name: DeviceFigures(**dict(zip(_ROW_FIELDS.split(), copy.deepcopy(row), strict=True)))
     for name, row in _DATA_SHEETS.items()
 }
 #: Data sheets by name, for `Master.figures`.
@@ -146,25 +146,25 @@ class Master:
     def is_joint_leader(self) -> bool:
         return self.leader is not None and self.leader.leads == JOINT_MODE
 
-    def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
+    def check_pose_mode(self, caller: str) -> None:
+        """Raise a DrakeTeleopError, which names the `caller`, if a leader arm commands joints."""
         if self.is_joint_leader:
-            what = f"{what} cannot use a leader arm that commands joints"
-            remedy = "set it to pose: the rendered force is the same"
+            what = f"{caller} cannot use a leader arm that commands joints"
+            remedy = "set it to pose; the rendered force is the same"
             raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
 
     def encoder_steps(self) -> Array:
-        """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
+        """Return the encoder steps (6,), three [m] and three [rad]; 0 for an exact reading."""
         figures = self._data_sheet()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
     def sampling_period_if_slower_than_hand(self, hand_hz: float) -> float | None:
-        """Return the sampling period [s] of a device slower than `hand_hz` [Hz], else None."""
+        """Return the device's sampling period [s] if its rate is below `hand_hz`, else None."""
         rate = self._data_sheet().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction_and_encoder_steps(self) -> "Master":
-        """Return a copy without Coulomb friction and encoder steps."""
+        """Return a copy of the settings without Coulomb friction and encoder steps."""
         if self.model == PHANTOM_NAME:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -189,8 +189,8 @@ class Master:
             raise DrakeTeleopError(what, where=f"{where}.friction", remedy=remedy)
         if (self.leader is None) == (self.model == LEADER_NAME):
             word = "without" if self.leader is None else "with"
-            what = f"`model: {self.model}` {word} the settings `leader` is invalid"
-            remedy = "give both, with leader.file and leader.hand_frame, or none"
+            what = f"model: {self.model} {word} a block leader is invalid"
+            remedy = "set model: leader and a block leader with file and hand_frame, or neither"
             raise DrakeTeleopError(what, where=f"{where}.leader", remedy=remedy)
         if self.leader is not None:
             self.leader.check(f"{where}.leader")

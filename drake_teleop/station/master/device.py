@@ -36,7 +36,7 @@ def _advance_device(
 
 
 def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
-    """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
+    """Raise a DrakeTeleopError if q is outside limits, or the step `period` [s] is too long."""
     if not 0 < period <= _MAX_DEVICE_PERIOD_S:
         raise DrakeTeleopError(
             f"gives a period of {period:g} s (a simulated haptic device needs a positive one of at"
@@ -59,7 +59,7 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
 class MasterDevice(LeafSystem):
     """Haptic device or leader arm with n joints and the hand's passive mass, initially at rest.
 
-    Each period, at most 1 ms, is one classical Runge-Kutta step with held inputs.
+    Each period, at most 1 ms, is one classical Runge-Kutta step with constant inputs.
 
     .. pydrake_system::
 
@@ -67,7 +67,7 @@ class MasterDevice(LeafSystem):
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
         - drive: (27,) from the force display: motor torques (6) [N m; N] (of a leader arm: the
-          wrench F to display), the display's memory
+          wrench to display, [f; tau_z, tau_y, tau_x]), the display's memory
         output_ports:
         - state: (2 n,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
         - pose_master: (7,) X_BE of the stylus E in the device's base B
@@ -114,7 +114,7 @@ class MasterDevice(LeafSystem):
         self._advance(*self._constants, *states, *inputs, self._period)
 
 
-def AddHapticDevice(
+def AddDeviceAndForceDisplay(
     builder: DiagramBuilder, period: float, device: HapticDevice | LeaderDevice, q_initial: Array
 ) -> tuple[LeafSystem, LeafSystem]:
     block = builder.AddNamedSystem("master_device", MasterDevice(period, device, q_initial))

@@ -25,7 +25,7 @@ def jacobian_into(q, device, J):
 
 @njit(cache=True)
 def gravity_compensation_torque_into(q, device, out):
-    """Write joint torques or forces (6,) that cancel the weight into `out`; 0 in task space."""
+    """Write joint torques (6,) that cancel the device's weight into `out`; 0 in task space."""
     if device.in_task_space:
         out[:6] = 0.0
     else:
@@ -53,7 +53,7 @@ def twist_into(q, v, device, J, twist):
 
 @njit(cache=True)
 def add_runge_kutta_stage(i, period, slope, total, stage, state):
-    """Add the slope of stage i (0 to 3) to `total`; write the next stage, at last the new state."""
+    """Add the slope of stage i (0 to 3) to `total`; write the next `stage`, at last the `state`."""
     weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
     ahead = 1.0 if i == 2 else 0.5
     for k in range(state.shape[0]):
@@ -68,7 +68,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `motor` (6,) are the motor
-    torques or forces at the joints; `work` and `stages` are scratch.
+    torques or forces at the joints; `work` and `stages` are scratch arrays.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
     q, v, vdot = stage[:6], stage[6:], slope[6:]
@@ -129,7 +129,7 @@ class HapticDevice:
             task_space.check_limits(q, self.parameters)
 
     def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
-        """Return for each row of q (N, 6) whether an end stop is active."""
+        """Return flags (N,): True where an end stop acts at the row of q (N, 6)."""
         if self.is_phantom:
             return phantom.is_any_axis_at_end_stop(q)
         return task_space.is_any_axis_at_end_stop(q, self.parameters)
@@ -149,9 +149,9 @@ class HapticDevice:
         return M
 
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
-        """Return the damping matrix D (6, 6): the joint forces are -D dq/dt.
+        """Return the damping matrix D (6, 6) of the joint forces -D dq/dt.
 
-        With `include_coulomb_slope`, D includes the slope of the Coulomb friction at standstill.
+        With `include_coulomb_slope`, D includes the slope of Coulomb friction over speed at rest.
         """
         if self.is_phantom:
             slope = self.parameters.dry_friction / phantom.FRICTION_TANH_SPEED_RAD_S

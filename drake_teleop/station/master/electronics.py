@@ -13,7 +13,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 @njit(cache=True)
 def encoder_pose_into(q, q_start, steps, packed_device, pose):
-    """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
+    """Write the pose X_BE (7,) of q (6,) rounded to whole encoder steps from `q_start` (6,).
 
     `steps` (6,) are in m or rad; 0 disables rounding.
     """
@@ -25,7 +25,7 @@ def encoder_pose_into(q, q_start, steps, packed_device, pose):
 
 
 class Encoders(LeafSystem):
-    """Encoders of a haptic device, with whole `steps` (6,) [m, rad] of its axes; 0: no rounding.
+    """Encoders that round a device's joint positions to `steps` (6,) [m, rad]; 0: no rounding.
 
     Steps count from the joint positions `q_start` (6,).
 

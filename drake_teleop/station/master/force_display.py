@@ -83,7 +83,7 @@ def motor_torque_into(displayed, q, parameters, J, torque):
 def step_display(wrench, device, packed_parameters, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
+    `device` (27,) is output `for_display` of `MasterDevice`; its input `drive` (27,) is written.
     """
     parameters = packed_parameters[0]
     q, fault = device[_JOINT_POSITIONS_SLOTS], _NO_FAULT
@@ -128,8 +128,8 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    While data are invalid, the displayed wrench fades to zero in 50 ms; then it ramps up again. The
-    wrench of a leader arm is limited by motor torques after weight compensation.
+    While inputs are invalid, the displayed wrench fades to zero in 50 ms; after that it ramps up.
+    A leader arm displays what its motor torques permit beside weight compensation.
 
     .. pydrake_system::
 
@@ -139,7 +139,7 @@ class ForceDisplay(LeafSystem):
         - for_display: (27,) from the device: joint positions (6) [rad], this block's memory
         - state: (2 n,) [q; qdot] of the device (only of a leader arm)
         output_ports:
-        - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m] (leader: F), memory
+        - drive: (27,) for the device: J^T F + gravity compensation (6) [N m] (leader: F), memory
         - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
         - fault_at_hand: code of `blocks.Fault`
         - displayed_and_fault: (7,) the last two ports in one vector

@@ -43,7 +43,7 @@ _END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, motor, vdot):
     """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
-    `hand_wrench_minus_weight` (6,) is [f; tau] on E, in B; the weight is that of the hand.
+    `hand_wrench_minus_weight` (6,) is [f; tau] of the hand on E, in B, minus the hand's weight.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -80,7 +80,7 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
 
 @njit(cache=True)
 def limited_leader_motor_torques_into(leader, q, F, torque):
-    """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
+    """Write motor torques J^T F plus weight compensation (n,), each clipped to its limit.
 
     F (6,) is the wrench at E; `leader` is `LeaderDevice.compiled_constants`.
     """
@@ -101,7 +101,7 @@ def limited_leader_motor_torques_into(leader, q, F, torque):
 def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive, period):
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `leader` is `LeaderDevice.compiled_constants`. The operator carries the hand's weight [N].
+    `leader` is `LeaderDevice.compiled_constants`. The operator carries the hand's `weight` [N].
     """
     _, arm, joint_table = leader
     n = joint_table.shape[1]
@@ -132,7 +132,7 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
 
 @njit(cache=True)
 def limit_wrench_to_motor_torques(leader, q, wrench, shortened):
-    """Write a wrench (6,), shortened to the torque limits beside the weight, to `shortened`."""
+    """Write `wrench` (6,) into `shortened`, scaled so that motors and weight stay within limits."""
     _, arm, joint_table = leader
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
@@ -167,9 +167,9 @@ class LeaderDevice:
     Attributes:
         arm: dynamics of the chain from B to E, with the hand's mass.
         arm_without_hand: dynamics without the hand, for weight compensation.
-        joint_table: (8, n) Coulomb friction [N m], damping in addition to the model's [N m s/rad],
-            lower and upper limits [rad], stiffness and damping of end stops, torque limits [N m],
-            compensated share of the weight.
+        joint_table: (8, n) rows: Coulomb friction [N m], damping in addition to the model's
+            [N m s/rad], lower and upper limits [rad], stiffness and damping of end stops, torque
+            limits [N m], share of the weight that the motors compensate.
         home: (n,) joint positions where E has the axes of B [rad].
         packed_parameters: parameters for the force display, in an array (1,).
     """
@@ -200,7 +200,7 @@ class LeaderDevice:
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the arm without and with the mass of the hand, and `joint_table`."""
+        """Tables of the arm without and with the hand's mass, and `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:
@@ -208,7 +208,7 @@ class LeaderDevice:
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return joint positions (n,) for the pose X_BE (7,), by a search from home."""
+        """Return joint positions (n,) for the pose X_BE (7,), found by a search from home."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -230,13 +230,13 @@ class LeaderDevice:
         for k in np.flatnonzero((q < lower) | (q > upper)):
             joint, limits = self.arm.joint_names[k], f"{lower[k]:.3g} to {upper[k]:.3g} (rad or m)"
             what = f"leader joint {joint} would be at {q[k]:.3g}, outside its limits {limits}"
-            remedy = "start within the limits of its joints"
+            remedy = "choose leader.home and master.position within the joint limits"
             raise DrakeTeleopError(what, where="master.leader.home", remedy=remedy)
 
     def is_any_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
-        """Return flags (N,): True if a motor has `share` of its torque limit or more.
+        """Return flags (N,): True if a motor's torque is at least `share` of its limit.
 
-        The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
+        The motors compensate the weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         constants = self.compiled_constants
         return np.asarray(_flag_rows_with_motor_at_limit(constants, q.copy(), F.copy(), share))

@@ -26,11 +26,11 @@ JOINT_MODE = "joints"
 @settings
 @dataclass
 class Leader:
-    """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
+    """Settings of a leader arm, whose base is placed so that E is at `master.position` at home."""
 
     file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder", is_path=True)
     package_paths: list[str] = plain(
-        [], "folders for package:// addresses in it, from the scenario's folder", is_path=True
+        [], "folders for package:// addresses in file, from the scenario's folder", is_path=True
     )
     hand_frame: str = plain("", "name of the frame or link at the grip")
     home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start; default: 0 or middle of limits")
@@ -52,7 +52,7 @@ class Leader:
     leads: str = choice(
         "pose",
         ("pose", JOINT_MODE),
-        "pose: X_WS; joints: each joint commands that of an equal slave",
+        "pose: sets X_WS; joints: each joint commands that of an equal slave",
     )
 
     def check(self, where: str) -> None:
@@ -112,7 +112,7 @@ def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) ->
     serial_arm.forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
     table[0, serial_arm.TRANSLATION_COLUMN : serial_arm.PHI_COLUMN] += p_BE - p
-    # R rotates the hand's frame into B, so that E has B's axes at home.
+    # R rotates the hand's frame S into B, so that E has B's axes at home. L is the last link.
     R_LS = table[n, serial_arm.ROTATION_COLUMN : serial_arm.TRANSLATION_COLUMN].reshape(3, 3)
     table[n, serial_arm.ROTATION_COLUMN : serial_arm.TRANSLATION_COLUMN] = (R_LS @ R.T).ravel()
     phi = table[n, serial_arm.PHI_COLUMN : serial_arm.ROTOR_COLUMN]

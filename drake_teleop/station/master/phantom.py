@@ -7,7 +7,7 @@ downward vertical towards x_B (absolute); wrist yaw, pitch, roll.
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
 
-Sources: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer.
+Sources in comments: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drake_teleop.station.master.device_parameters import end_stop_force
 GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
 
 L1, L2, L3, L5, L6 = 0.215, 0.170, 0.0325, -0.0368, 0.0527  # m, P
-# Mass [kg]; moments of inertia [kg m^2] about x (the pitch axis), y and z of the source, P.
+# Mass [kg] and inertia [kg m^2] of P's segments a, c, be, df about x (the pitch axis), y and z.
 MASS_A, MASS_C, MASS_BE, MASS_DF = 0.0202, 0.0249, 0.2359, 0.1906
 INERTIA_A = (0.4864e-4, 0.001843e-4, 0.4864e-4)
 INERTIA_C = (0.959e-4, 0.959e-4, 0.0051e-4)
@@ -110,7 +110,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
-    """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
+    """Write the mass matrix (6, 6) with wrist, hand and motors into M; J (6, 6) is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
     for i in range(3):
         M[i, i] += _REFLECTED_MOTOR_INERTIAS[i]
@@ -187,7 +187,7 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
 def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Write the joint accelerations (6,) of device and hand into `vdot`.
 
-    `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `work` is scratch.
+    `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `work` is a scratch array.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
@@ -235,16 +235,16 @@ def inverse_kinematics(pose: Array) -> Array:
     q2 = math.atan2(z, reach) + math.atan2(L2 * math.sin(elbow), L1 + L2 * math.cos(elbow))
     q3 = q2 - elbow + math.pi / 2
     q1 = math.atan2(y, x)
-    R_BO = RotationMatrix.MakeZRotation(q1) @ RotationMatrix.MakeYRotation(-q3)
+    R_BOuter = RotationMatrix.MakeZRotation(q1) @ RotationMatrix.MakeYRotation(-q3)
     R_BE = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4])))
-    wrist = RollPitchYaw(R_BO.inverse() @ R_BE)
+    wrist = RollPitchYaw(R_BOuter.inverse() @ R_BE)
     q = np.array([q1, q2, q3, wrist.yaw_angle(), wrist.pitch_angle(), wrist.roll_angle()])
     check_limits(q)
     return q
 
 
 def serial_joint_angles(q: Array) -> Array:
-    """Return the joint angles of `phantom.sdf` for q (..., 6): the third is q3 - q2."""
+    """Return q (..., 6) as joint angles of the serial model `phantom.sdf`: the third is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
@@ -262,7 +262,7 @@ def check_limits(q: Array) -> None:
         if lower - 1e-9 <= angle <= upper + 1e-9:
             continue
         at, least, most = np.degrees([angle, lower, upper])
-        what = f"Phantom angle q2 - q3 would be {at:.1f} degrees, not -55 to 65"
+        what = f"Phantom angle q2 - q3 would be {at:.1f} degrees, its range is -55 to 65"
         if i < 6:
             limits = f"its range is {least:.1f} to {most:.1f}"
             what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, {limits}"

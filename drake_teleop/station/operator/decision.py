@@ -46,6 +46,7 @@ class OperatorTraining:
         translation_scale: displacement of the tool over displacement of the hand.
         force_gain: rendered force over true contact force.
         forward_delay_s, backward_delay_s: mean one-way delays [s].
+        seed: random seed of the operator's errors.
     """
 
     R_WB: Array
@@ -74,7 +75,7 @@ TaskParameters = namedtuple(
 def pack_operator_parameters(
     training: OperatorTraining, perception: Perception, movement: tasks.Movement
 ) -> OperatorParameters:
-    there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_END_TO_EFFECT_S
+    there_and_back = training.forward_delay_s + training.backward_delay_s + _STATION_RESPONSE_TIME_S
     delays = perception.vision_delay + there_and_back, perception.reaction_time + there_and_back
     # 53 bits of a key are exact in a float.
     key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM)
@@ -118,10 +119,10 @@ _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
 MEMORY_SIZE = PLAN_SLICE.stop
 
 _EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
-_MOVE_END_TO_EFFECT_S = 0.05  # s, without network and perception, estimate
+_STATION_RESPONSE_TIME_S = 0.05  # end of a move to its effect, without network, estimate
 _APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
-# Perceived depth without contact beyond which the operator gives up, estimate.
-_GIVE_UP_PENETRATION_M = 0.03
+# Largest perceived depth without contact; beyond, the operator gives up; estimate.
+_GIVE_UP_DEPTH_M = 0.03
 _MIN_CONTACT_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_ASSUMED_STIFFNESS, _MIN_ASSUMED_STIFFNESS, _MAX_ASSUMED_STIFFNESS = 2000.0, 200.0, 50000.0
@@ -160,7 +161,7 @@ def _draw_normal_number(person, step, draw):
 def observe_tool_into(person, step, displacement_W, seen_W):
     """Write the seen displacement of the tool from its start (3,), in W [m], into `seen_W`.
 
-    Its random error is constant for 50 steps, a fixation of the eyes.
+    It is the true `displacement_W` plus an error that is constant for 50 steps (an eye fixation).
     """
     for i in range(3):
         draw = _draw_normal_number(person, step // _EYE_FIXATION_STEPS, 4 + i)
@@ -187,7 +188,7 @@ def _contact_force_at_tool_along_approach(task, person, felt):
 
 
 @njit(cache=True)
-def _update_criterion_with_hysteresis(memory, time, good, still_good):
+def _update_and_check_criterion(memory, time, good, still_good):
     if memory[_CRITERION_MET_SINCE] < 0.0 and good:
         memory[_CRITERION_MET_SINCE] = time
     elif not still_good:
@@ -214,8 +215,8 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     Args:
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
         felt: (5,) output of `update_perception_into`, delayed by the reaction time.
-        state: (5,) phase; 1 done or -1 given up; 1 while contact is detected; detection threshold
-            [N]; trust (0.1 to 1) in detecting contact; updated.
+        state: (5,) updated: phase, as `PHASE_MOVING`; outcome: 1 done, -1 given up; 1 while contact
+            is detected; detection threshold [N]; trust (0.1 to 1) in detecting contact.
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
     """
     step = int(memory[_STEP_COUNT])
@@ -241,7 +242,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
         if task.kind == tasks.KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
-            _update_criterion_with_hysteresis(memory, time, True, True)
+            _update_and_check_criterion(memory, time, True, True)
             and time - memory[_CRITERION_MET_SINCE] >= task.dwell
         ):
             _finish_task(state, memory, time, 1.0)
@@ -276,7 +277,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
     error = _perceived_standoff_target(task, person) - seen_W
     off = math.sqrt(dot(error, error))
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
-    met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
+    met = _update_and_check_criterion(memory, time, inside, still_inside)
     if task.kind == tasks.KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
@@ -297,7 +298,7 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING
         _enter_phase(state, memory, phase, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_PENETRATION_M:
+    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_DEPTH_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
@@ -335,7 +336,7 @@ def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
     error = abs(task.force - force)
     good, still_good = error <= 0.5 * task.tolerance, error <= task.tolerance
-    met = _update_criterion_with_hysteresis(memory, time, good, still_good)
+    met = _update_and_check_criterion(memory, time, good, still_good)
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
@@ -345,7 +346,7 @@ def _control_press_force(task, person, step, time, felt, state, memory):
 
 
 @njit(cache=True)
-def _lateral_force_and_size(task, person, felt):
+def _lateral_contact_force_W_and_size(task, person, felt):
     lateral = _contact_force_at_tool_along_approach(task, person, felt) * task.approach_axis
     if person.force_gain > 0.0:
         for i in range(3):
@@ -357,14 +358,14 @@ def _lateral_force_and_size(task, person, felt):
 @njit(cache=True)
 def _is_tool_stuck(task, person, felt):
     limit = _STUCK_SHARE_OF_PUSH_FORCE * task.force
-    _, sideways = _lateral_force_and_size(task, person, felt)
+    _, sideways = _lateral_contact_force_W_and_size(task, person, felt)
     return _contact_force_at_tool_along_approach(task, person, felt) >= limit or sideways >= limit
 
 
 @njit(cache=True)
-def _spiral_coordinate(n, k):
-    radius = _SEARCH_SPIRAL_SCALE_M * math.sqrt(n)
-    return radius * math.cos(_GOLDEN_ANGLE_RAD * n - 0.5 * math.pi * k)
+def _search_spiral_coordinate(num_searches, axis):
+    radius = _SEARCH_SPIRAL_SCALE_M * math.sqrt(num_searches)
+    return radius * math.cos(_GOLDEN_ANGLE_RAD * num_searches - 0.5 * math.pi * axis)
 
 
 @njit(cache=True)
@@ -378,14 +379,14 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
     push = _displacement_to_set_force(task, memory, force)
-    move, sideways = _lateral_force_and_size(task, person, felt)
+    move, sideways = _lateral_contact_force_W_and_size(task, person, felt)
     if sideways >= state[FORCE_THRESHOLD_INDEX] / person.force_gain:
         move *= min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
     else:
         n = memory[_NUM_SLOT_SEARCHES]
         memory[_NUM_SLOT_SEARCHES] += 1.0
         for k in range(2):
-            move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
+            move[k] = _search_spiral_coordinate(n + 1, k) - _search_spiral_coordinate(n, k)
         move[2] = 0.0
     move += push * task.approach_axis
     duration = _plan_submovement(person, memory, step, time, move)

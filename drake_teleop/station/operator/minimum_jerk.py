@@ -31,7 +31,7 @@ def evaluate_plan(plan, time, i):
 
 @njit(cache=True)
 def add_planned_motion_into(memory, time, pose, twist):
-    """Add the plan's displacement and velocity at `time` [s] to a pose (7,) and twist (6,)."""
+    """Add the displacement and velocity of the plan in `memory` to a pose (7,) and twist (6,)."""
     for i in range(3):
         x, v, _ = evaluate_plan(memory[PLAN_SLICE], time, i)
         pose[4 + i] += x
@@ -42,8 +42,8 @@ def add_planned_motion_into(memory, time, pose, twist):
 def plan_move(memory, time, duration, change, end_speed):
     """Plan a minimum-jerk motion by `change` (3,) [m] in `duration` [s].
 
-    It continues the present motion and ends with the velocity `end_speed` (3,), without
-    acceleration.
+    It begins with position, velocity and acceleration of the present plan at `time` [s], and ends
+    with the velocity `end_speed` (3,) [m/s] without acceleration.
     """
     plan, h = memory[PLAN_SLICE], duration
     for i in range(3):
@@ -59,7 +59,7 @@ def plan_move(memory, time, duration, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plan a stop of the hand within `STOP_DURATION_S`."""
+    """Plan a stop of the hand from `time` [s] within `STOP_DURATION_S`."""
     change = np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP_DURATION_S * evaluate_plan(memory[PLAN_SLICE], time, i)[1]

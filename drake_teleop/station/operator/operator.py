@@ -55,7 +55,7 @@ GRIP_IMPEDANCES = {
 @settings
 @dataclass
 class MinimumJerk:
-    """Minimum-jerk move; its share at u = (t - t_start) / duration is 10 u^3 - 15 u^4 + 6 u^5."""
+    """Minimum-jerk move; at u = (t - t_start) / duration, 10 u^3 - 15 u^4 + 6 u^5 of it is done."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
@@ -98,28 +98,23 @@ class OperatorConfig:
     movement: Movement = field(default_factory=Movement)
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the ramps of an oscillation are longer than its duration."""
         for index, segment in enumerate(self.intent):
             if isinstance(segment, Sine) and segment.ramp > 0.5 * segment.duration:
                 raise DrakeTeleopError(
                     f"two ramps of {segment.ramp:g} s are longer than the duration,"
                     f" {segment.duration:g} s",
                     where=f"{where}.intent[{index}].ramp",
-                    remedy=f"set it to {0.5 * segment.duration:g} or less, or a longer duration",
+                    remedy=f"set it to {0.5 * segment.duration:g} or less, or increase duration",
                 )
 
     @property
     def hand(self) -> HandImpedance:
-        """Impedance of the hand for the configured grip."""
         return GRIP_IMPEDANCES[self.grip]
 
 
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> Array:
-    """Return the segments of the intended motion as an array (n, 12) for compiled functions.
-
-    Columns: start and length of the ramp in and of the ramp out, 2 pi frequency, phase,
-    translation (3), rotation (3).
-    """
+    """Return the segments of the intended motion as an array (n, 12) for compiled functions."""
+    # Columns: start, length of ramp in and ramp out, 2 pi frequency, phase, translation, rotation.
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
         if isinstance(segment, MinimumJerk):
@@ -147,8 +142,8 @@ def _minimum_jerk_ramp(time, length):
 def intended_motion_into(packed, start, t, pose, twist):
     """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
-    `start` (7,) is X_BE before the first segment. Translations add; rotations apply in the order of
-    the list, each about axes of B.
+    `packed` is from `pack_intent`, `start` (7,) is X_BE before the first segment. Translations
+    add; rotations apply in the order of the list, each about axes of B.
     """
     orientation = vectors.quaternion_at(start, 0)
     omega = (0.0, 0.0, 0.0)
@@ -178,7 +173,7 @@ def intended_motion_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def check_motion_and_normalize_pose_into(pose, twist, out):
-    """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
+    """Write the pose (7,) with unit quaternion into `out`; return False for invalid inputs."""
     square = 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -194,8 +189,8 @@ def check_motion_and_normalize_pose_into(pose, twist, out):
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B, at most 60 N and 2 N m.
 
-    f = K (x_intent - x) + B (v_intent - v); tau likewise. `impedance` (4,) is [K, B, rotational K,
-    rotational B].
+    f = K (x_intent - x) + D (v_intent - v); tau likewise. `impedance` (4,) is [K, D, rotational K,
+    rotational D].
     """
     intended = vectors.quaternion_at(intent_pose, 0)
     inverse = vectors.conjugate_quaternion(vectors.quaternion_at(pose, 0))
@@ -341,7 +336,7 @@ class Operator(LeafSystem):
         _perceive_and_decide(*self._task_parameters, context.get_time(), *stylus, slave_q, *state)
 
     def _intent_at_present(self, context: Context) -> tuple[Array, ...]:
-        """Return segments, their reference pose, the reference's twist, and the decisions."""
+        """Return segments, pose and twist relative to which they move, and the decision memory."""
         memory = self._no_memory
         if self._has_task:
             memory = context.get_discrete_state(self._groups[1]).value()

@@ -26,9 +26,9 @@ _NUM_MODEL_PARAMETERS = 6
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
-_MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_START = 12, 13, 14
-_COVARIANCE_START = _FORCE_MODEL_START + _NUM_MODEL_PARAMETERS
-MEMORY_SIZE = _COVARIANCE_START + _NUM_MODEL_PARAMETERS**2
+_MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_INDEX = 12, 13, 14
+_COVARIANCE_INDEX = _FORCE_MODEL_INDEX + _NUM_MODEL_PARAMETERS
+MEMORY_SIZE = _COVARIANCE_INDEX + _NUM_MODEL_PARAMETERS**2
 """Size of the memory of `update_perception_into`."""
 
 EXCESS_FORCE_START, DETECTION_THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
@@ -53,7 +53,7 @@ class Perception:
     aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's lateral place")
 
     def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N]; per `dt` [s] masking decay, low-pass gain."""
+        """Return (4,) Weber fraction, threshold [N]; masking decay, low-pass gain per `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
@@ -61,7 +61,7 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_COVARIANCE_START:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
+    memory[_COVARIANCE_INDEX:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
     return memory
 
 
@@ -72,9 +72,9 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     Args:
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
-        hand_force, velocity: (3,) force of the hand on the stylus [N], its velocity [m/s].
-        attentive: if false, update only the expectation and detect no contact.
-        out: (5,) written: force on the hand beyond the expected one (3) [N], threshold [N], 1 if
+        hand_force, velocity: (3,) force of the hand on the stylus [N], stylus velocity [m/s].
+        attentive: if false, detect no contact and only adapt the expected force.
+        out: (5,) written: force on the hand minus the expected one (3) [N], threshold [N], 1 if
             contact is detected.
     """
     weber, absolute, fade, smooth = parameters
@@ -82,7 +82,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     for i in range(3):
         if first:
             memory[i], memory[3 + i] = -hand_force[i], velocity[i]
-            memory[_FORCE_MODEL_START + 3 + i] = -hand_force[i]
+            memory[_FORCE_MODEL_INDEX + 3 + i] = -hand_force[i]
         memory[6 + i], memory[9 + i] = memory[i], memory[3 + i]
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
@@ -92,7 +92,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
-    theta, expected_square, excess_square = memory[_FORCE_MODEL_START:_COVARIANCE_START], 0.0, 0.0
+    theta, expected_square, excess_square = memory[_FORCE_MODEL_INDEX:_COVARIANCE_INDEX], 0.0, 0.0
     rows, excess = np.zeros((3, _NUM_MODEL_PARAMETERS)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
@@ -110,7 +110,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     noticed = attentive and math.sqrt(excess_square) >= out[DETECTION_THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        P = memory[_COVARIANCE_START:].reshape(_NUM_MODEL_PARAMETERS, _NUM_MODEL_PARAMETERS)
+        P = memory[_COVARIANCE_INDEX:].reshape(_NUM_MODEL_PARAMETERS, _NUM_MODEL_PARAMETERS)
         _update_force_model(theta, P, rows, excess, dt)
 
 
@@ -160,10 +160,10 @@ def perceive_contact(
         t: (N,) evenly spaced times [s].
         hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s].
         hand_mass: mass of the hand that moves with the stylus [kg].
-        attentive: start time of detection [s]; before, only the expectation is updated.
+        attentive: start time of detection [s]; before, only the expected force is adapted.
 
     Returns:
-        (N, 5) force on the hand beyond the expected one (3) [N], threshold [N], 1 while contact is
+        (N, 5) force on the hand minus the expected one (3) [N], threshold [N], 1 while contact is
             detected.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}

@@ -91,10 +91,10 @@ class Movement:
 
 
 def check_target_beyond_standoff(task: Task, where: str) -> None:
-    """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
+    """Raise a DrakeTeleopError if the tool starts nearer to the target than radius or standoff."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if (at := task.target_distance) <= least:
-        rule = f"{least:g} m (its radius or standoff)"
-        what = f"the target is {at:g} m from the tool's start, not above {rule}"
+        rule = f"within its radius or standoff of {least:g} m"
+        what = f"the target is {at:g} m from the tool's start, {rule}"
         remedy = "choose a target farther from the tool's start"
         raise DrakeTeleopError(what, where=f"{where}.translation", remedy=remedy)

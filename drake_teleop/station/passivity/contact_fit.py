@@ -15,9 +15,9 @@ _DAMPING_RIDGE_SHARE = 0.05
 
 @njit(cache=True)
 def update_contact_fit(sums, force_change, displacement, speed_change, kept_weight):
-    """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m], >= 0.
+    """Add one displacement [m] to the fit; return stiffness [N/m] and damping [N s/m], both >= 0.
 
-    `sums` (NUM_CONTACT_FIT_SUMS,) is updated; `kept_weight`, 0 to 1, is that of its old values.
+    First, `sums` (NUM_CONTACT_FIT_SUMS,) are multiplied by `kept_weight`, 0 to 1.
     """
     for i in range(NUM_CONTACT_FIT_SUMS):
         sums[i] *= kept_weight
@@ -38,9 +38,9 @@ def update_contact_fit(sums, force_change, displacement, speed_change, kept_weig
 def force_without_slip_steps(rendered, measured, explained_change, removed_share, max_difference):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    The last force, `rendered` [N], changes by `explained_change` [N], due to depth and speed. Then
-    `removed_share` of its difference from `measured` [N] is removed; at most `max_difference` [N]
-    remains.
+    The last rendered force, `rendered` [N], changes by `explained_change` [N], caused by depth and
+    speed. Then `removed_share` of its difference from the measured force [N] is removed; at most
+    `max_difference` [N] remains.
     """
     rendered += explained_change
     rendered += min(removed_share, 1.0) * (measured - rendered)
@@ -49,9 +49,9 @@ def force_without_slip_steps(rendered, measured, explained_change, removed_share
 
 @njit(cache=True)
 def force_change_by_slip(force_change, largest_change, max_change):
-    """Return the part of a force change [N] that slip may cause, at most `max_change`.
+    """Return the part of a force change [N] outside 0 to `largest_change`, limited to `max_change`.
 
-    `largest_change` [N] is the change that the largest stiffness would cause.
+    The largest stiffness causes `largest_change` [N]; slip may cause the rest.
     """
     rest = force_change - min(max(force_change, min(largest_change, 0.0)), max(largest_change, 0.0))
     return min(max(rest, -max_change), max_change)

@@ -1,4 +1,4 @@
-"""Energy through a port of the station, computed from recorded wrenches f and poses x."""
+"""Work at a port of the station, computed from recorded wrenches f and poses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
-#: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
+#: Value of `pair` -> weight of f_k; the weight of f_(k-1) is the rest to 1.
 WEIGHT_OF_PRESENT_WRENCH = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
@@ -19,7 +19,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
-        pair: wrench over the step to k: `held` f_(k-1), `backward` f_k or `mean` of both.
+        pair: wrench in the step from k-1 to k: `held` f_(k-1), `backward` f_k, `mean` of both.
     """
     if pair not in WEIGHT_OF_PRESENT_WRENCH:
         remedy = f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}"

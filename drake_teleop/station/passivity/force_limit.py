@@ -1,4 +1,4 @@
-"""Passivity method "force_limit": bounds force and torque rendered at the hand.
+"""Passivity method "force_limit": limits force and torque at the hand to small values.
 
 Without an energy balance, an unstable loop stays unstable, but its limit cycle is bounded.
 """

@@ -1,7 +1,4 @@
-"""Master's end of the passivity method "ledger", steps M1 to M7.
-
-docs/theory.md, "The energy ledger", has the equations of these steps.
-"""
+"""Master's end of method "ledger": steps M1 to M7 of docs/theory.md, "The energy ledger"."""
 
 import math
 from dataclasses import dataclass
@@ -34,7 +31,7 @@ _MAX_WALL_FORCE_N = 10.0
 _MAX_SAME_WALL_DISTANCE_M, _MIN_SAME_WALL_COSINE = 5e-3, 0.7
 _MAX_FORGET_WALL_DEPTH_M, _FORGET_WALL_FORCE_N, _MIN_FORGET_WALL_DEPTH_M = 3e-3, 1.0, 1e-3
 _MIN_WALL_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
-_HAND_INPUT_SENDING_RESERVE_SHARE = 0.5  # of the master's reserve
+_MIN_RESERVE_SHARE_TO_SEND_HAND_INPUT = 0.5  # of the master's reserve
 _UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_RATE = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
@@ -43,7 +40,8 @@ _MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED = 0.02  # m/s
 _FADE_TIME_AT_HAND_REST_S = 0.1
 _HAND_DEADBAND_ENCODER_STEPS = 1.1
-_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - shared.RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
+# Shares of a reserve below and above which the drag begins and ends.
+_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - shared.SLAVE_RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
 # Memory. The first places are those of `ledger_slave`, up to `CONTACT_DIRECTION`.
@@ -58,11 +56,11 @@ _MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE = _layout.vector(6), _layout.v
 _UNMODELLED_FRICTION, _FRICTION_COEFFICIENT = _layout.vector(6), _layout.vector(2)
 _HAND_RETREAT_DISTANCE = _layout.number()  # of the hand out of the wall since its last rest
 _LAST_SLAVE_POSE, _SLAVE_DISPLACEMENT = _layout.vector(7), _layout.vector(6)
-# Work on the hand since it last rested; withheld share of the wrench.
+# Work on the hand since its last rest; withheld share of the wrench.
 _WORK_ON_HAND_SINCE_REST, _WITHHELD_WRENCH_SHARE = _layout.vector(2), _layout.vector(2)
 _IS_DRAG_ACTIVE = _layout.vector(2)
 _HAND_MOTION_IN_DEADBAND, _HAND_STEP_BEYOND_DEADBAND = _layout.vector(6), _layout.vector(6)
-# Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
+# Number of the newest packet; 1 while the wrench cross-fades; wrench before the energy limit.
 _LAST_RECEIVED_PACKET_NUMBER, _IS_WRENCH_CROSS_FADING = _layout.number(), _layout.vector(2)
 _LAST_UNLIMITED_WRENCH = _layout.vector(6)
 
@@ -78,10 +76,10 @@ class LedgerConfig:
     )  # fmt: skip
     reserve: list[float] = quantity(
         [0.1, 0.01], "J", 1e-9, 1e3,
-        "reserve of the slave: scaled kinetic energy of its fastest motion",
+        "energy reserve of the slave: scaled kinetic energy of its fastest motion",
     )  # fmt: skip
     hand_reserve: list[float] = quantity(
-        [0.02, 1e-3], "J", 1e-9, 1e3, "reserve of the master, to push the hand back"
+        [0.02, 1e-3], "J", 1e-9, 1e3, "energy reserve of the master, to push the hand"
     )
     drag: list[float] = quantity(
         [0.28, 5e-3], "N, N m", 0.0, 10.0, "drag on the hand until both reserves are full"
@@ -105,7 +103,7 @@ class LedgerConfig:
 
 
 def initialize(p: Array, memory: Array) -> None:
-    """Write half of the initial energy, and the servo model's pose, into one end's memory."""
+    """Store half the initial energy, and the command as servo-model pose, in one end's memory."""
     memory[slots.STORED_ENERGY] = p[shared.INITIAL_LEDGER_ENERGY] / 2.0
     memory[shared.SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
 
@@ -115,7 +113,7 @@ def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
-    left = (1.0 - shared.UNUSED_RESERVE_SHARE) * np.asarray(config.reserve)
+    left = (1.0 - shared.UNUSED_SLAVE_RESERVE_SHARE) * np.asarray(config.reserve)
     return np.sqrt(2.0 * left / (shared.SLAVE_MASS_FACTOR * mass))
 
 
@@ -150,7 +148,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _limit_wrench_to_energy_of_group(g, dx, T, p, memory, wrench)
         level = p[shared.MASTER_RESERVE][g]
         if memory[shared.IN_CONTACT_FLAG] > 0.0:
-            level += shared.RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
+            level += shared.SLAVE_RESERVE_SHARE_AT_MASTER * p[shared.SLAVE_RESERVE][g]
         surplus = max(memory[slots.STORED_ENERGY][g] - level, 0.0)
         memory[slots.SENT_ENERGY][g] += surplus
         memory[slots.STORED_ENERGY][g] -= surplus
@@ -167,7 +165,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _store_hand_step_beyond_deadband(dx, p, memory):
-    """Write the hand's displacement beyond the dead band into memory (docs/theory.md, M2)."""
+    """Store the hand's displacement beyond the encoder dead band (docs/theory.md, M2)."""
     lost, steady = memory[_HAND_MOTION_IN_DEADBAND], memory[_HAND_STEP_BEYOND_DEADBAND]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
@@ -184,7 +182,7 @@ def _store_hand_step_beyond_deadband(dx, p, memory):
 def _update_hand_group_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g), memory[slots.STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
-    sending_level = _HAND_INPUT_SENDING_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
+    sending_level = _MIN_RESERVE_SHARE_TO_SEND_HAND_INPUT * p[shared.MASTER_RESERVE][g]
     if work < 0.0 and in_contact and ledger[g] > sending_level:
         memory[slots.SENT_ENERGY][g] -= work
     else:
@@ -193,7 +191,7 @@ def _update_hand_group_ledger(g, dx, in_contact, p, memory):
 
 @njit(cache=True)
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
-    """Write the predicted contact wrench (docs/theory.md, M2, M3) into `wrench`.
+    """Write the contact wrench predicted for the hand's pose (docs/theory.md, M2, M3) to `wrench`.
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
@@ -274,9 +272,10 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 @njit(cache=True)
 def _render_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the wall's friction, as rendered to the hand, into `wrench` (6,), docs/theory.md (T68).
+    """Write the friction to render at the hand into `wrench` (6,), docs/theory.md (T68).
 
-    It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
+    It is modelled friction at the hand plus (measured - modelled) friction at the slave. `size` and
+    `force` are normal forces at slave and hand [N].
     """
     near, far = memory[_MODEL_FRICTION_AT_HAND], memory[_MODEL_FRICTION_AT_SLAVE]
     rest, normal = memory[_UNMODELLED_FRICTION], memory[shared.CONTACT_DIRECTION]

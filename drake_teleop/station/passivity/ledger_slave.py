@@ -1,7 +1,4 @@
-"""Slave's end of the passivity method "ledger", steps S1 to S6.
-
-docs/theory.md, "The energy ledger", has the equations of these steps.
-"""
+"""Slave's end of method "ledger": steps S1 to S6 of docs/theory.md, "The energy ledger"."""
 
 from __future__ import annotations
 
@@ -18,11 +15,11 @@ from drake_teleop.station.passivity.packet import dot_of_group, length_of_group,
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 #: For translation and rotation: angle that equals a unit length, torque that equals a unit force.
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
-UNUSED_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never used
-RESERVE_SHARE_AT_MASTER = 0.7  #: of the slave's reserve, which the master may hold in contact
+UNUSED_SLAVE_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never used
+SLAVE_RESERVE_SHARE_AT_MASTER = 0.7  #: of the slave's reserve, which the master may hold in contact
 _MIN_KEPT_SLAVE_RESERVE_SHARE = 0.05
 _SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1.05
-_MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # over the reserve
+_MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # in multiples of the reserve
 _SLAVE_MEASUREMENT_FILTER_S = 3e-3
 _SLAVE_REST_SPEED = 0.05  # m/s
 _ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 5.0, 50.0  # 1/s
@@ -31,9 +28,9 @@ _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
 _HAND_PRESSING_SPEED = 0.06  # m/s
 _MIN_FIT_SAMPLE_LENGTH_M, _MIN_FAST_FIT_SAMPLE_LENGTH_M = 2e-4, 2e-3
 _MIN_FIT_SPAN_M, _MAX_FIT_SPAN_M = 1e-3, 1e-2
-_FAST_FIT_SPEED = 0.15  # m/s
+_MIN_FAST_FIT_SPEED = 0.15  # m/s
 _STIFFNESS_SHARE_FILTER_S, _STIFFNESS_SHARE_DEADBAND = 0.02, 0.1
-_MIN_REMOVED_WALL_FORCE_N = 0.3
+_MIN_LOST_FORCE_OF_REMOVED_WALL_N = 0.3
 _CONTACT_DIRECTION_FILTER_S = 3.0
 _SLIP_FORCE_FADE_S, _FRICTION_DECAY_S = 0.6, 1.0
 _STIFFNESS_GAIN_RISE_S, _STIFFNESS_GAIN_FALL_S = 0.5, 1.0
@@ -47,16 +44,16 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-_indices = range(fields.METHOD_INTEGRAL.start, fields.METHOD_INTEGRAL.stop)
+_indices = range(fields.METHOD_VALUES.start, fields.METHOD_VALUES.stop)
 PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _indices[:3]
-NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _indices[-1], fields.SECOND_ENERGY_COUNTER
+NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _indices[-1], fields.SENDER_ENERGY
 
 # Parameters, in the master's power units.
 _layout = slots.own_parameters()
 INITIAL_LEDGER_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
 DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
-# Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
+# Memory. Filtered velocity; 1 in contact; mean contact wrench and its direction; servo model.
 _layout = slots.own_memory()
 FILTERED_OWN_VELOCITY, IN_CONTACT_FLAG = _layout.vector(6), _layout.number()
 MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
@@ -96,13 +93,13 @@ def is_in_contact(wrench, p):
 
 @njit(cache=True)
 def wrench_component_along(a, b, p):
-    """Return the component of the wrench `a` (6,) along the unit wrench `b` (6,) [N]."""
+    """Return the component [N] of wrench `a` (6,) along unit wrench `b` (6,) in `WRENCH_METRIC`."""
     return p[WRENCH_METRIC][0] * dot_of_group(a, b, 0) + p[WRENCH_METRIC][1] * dot_of_group(a, b, 1)
 
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return wrench (6,) times displacement (6,): work [J]; a length [m] for unit wrenches."""
+    """Return wrench (6,) times displacement (6,): work [J], or a length [m] for a unit wrench."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 
@@ -201,8 +198,8 @@ def _update_group_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     free, returned = ledger[g] - kinetic, 0.0
     needed = missing = hold - received[PACKET_LEDGER_LEVEL][g]
     if in_contact and speed < _SLAVE_REST_SPEED * ANGLE_PER_LENGTH[g]:
-        keep, rate = (1.0 - RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
-        needed += RESERVE_SHARE_AT_MASTER * reserve
+        keep, rate = (1.0 - SLAVE_RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
+        needed += SLAVE_RESERVE_SHARE_AT_MASTER * reserve
         returned = min(free - _MIN_KEPT_SLAVE_RESERVE_SHARE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
@@ -270,7 +267,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     memory[_FIT_SAMPLE_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
     tip_speed = length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
-    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _FAST_FIT_SPEED
+    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _MIN_FAST_FIT_SPEED
     length_m = abs(memory[_FIT_SAMPLE_LENGTH])
     if length_m > (_MIN_FIT_SAMPLE_LENGTH_M if slow else _MIN_FAST_FIT_SAMPLE_LENGTH_M):
         memory[_FIT_SPAN] = min(memory[_FIT_SPAN] + length_m, _MAX_FIT_SPAN_M)
@@ -309,7 +306,7 @@ def _is_wall_removed(dx, memory):
     speed_change = work_along(normal, memory[FILTERED_OWN_VELOCITY]) + memory[_LAST_SPEED_INTO_WALL]
     explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
     explained += abs(memory[_CONTACT_DAMPING] * speed_change)
-    return memory[_RENDERED_FORCE] > max(_MIN_REMOVED_WALL_FORCE_N, 2.0 * explained)
+    return memory[_RENDERED_FORCE] > max(_MIN_LOST_FORCE_OF_REMOVED_WALL_N, 2.0 * explained)
 
 
 @njit(cache=True)
@@ -343,7 +340,7 @@ def _generate_command(received, connected, T, p, memory, error):
             error[i] *= rate
             if feeds_forward:
                 error[i] += feed[i] + compliance * inward_speed * p[WRENCH_METRIC][g] * normal[i]
-        unused, mass = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], p[slots.SLAVE_MASS][g]
+        unused, mass = UNUSED_SLAVE_RESERVE_SHARE * p[SLAVE_RESERVE][g], p[slots.SLAVE_MASS][g]
         available = max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
         fields.limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * mass)))
         for i in range(3 * g, 3 * g + 3):
@@ -355,7 +352,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_command_to_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) towards `pose` until the motors' energy suffices; return if moved."""
+    """Move the command (7,) towards `pose` until the motor energy suffices; return if it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     fields.pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
@@ -384,7 +381,8 @@ def _limit_motor_wrench_of_group(g, damping, twist, p, memory):
     size, speed = length_of_group(motor_wrench, g), length_of_group(twist, g)
     mass = SLAVE_MASS_FACTOR * p[slots.SLAVE_MASS][g]
     stands = length_of_group(velocity, g) < _SLAVE_STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
-    margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_AVAILABLE_MOTOR_ENERGY][g]
+    margin = UNUSED_SLAVE_RESERVE_SHARE * p[SLAVE_RESERVE][g]
+    balance = memory[_AVAILABLE_MOTOR_ENERGY][g]
     pushes = dot_of_group(motor_wrench, twist, g) > 0.0
     pushes = pushes or dot_of_group(motor_wrench, velocity, g) > 0.0
     changed = False

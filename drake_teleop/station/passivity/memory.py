@@ -1,4 +1,4 @@
-"""Layout of the float64 vectors that contain memory and parameters of one end of the channel."""
+"""Layout of the float64 vectors with memory and parameters of one end of the channel."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ NUM_PARAMETERS = 28  #: length of the parameter vector, which `method_parameters
 
 
 class SlotAllocator:
-    """Allocator of consecutive places in a vector of `size` numbers, from index `first`.
-
-    A full vector raises an IndexError.
-    """
+    """Allocator of consecutive places in a vector of `size` numbers, from index `first`."""
 
     def __init__(self, size: int, first: int = 0) -> None:
         self._size, self._next = size, first
@@ -36,7 +33,7 @@ class SlotAllocator:
 _layout = SlotAllocator(MEMORY_SIZE)
 STEP_COUNT = _layout.number()  #: number of steps so far; also the number of the next packet
 STORED_ENERGY = _layout.vector(2)  #: energy that this end may still release, by group [J]
-RECEIVED_ENERGY = _layout.vector(2)  #: energy from the other end that is credited here [J]
+RECEIVED_ENERGY = _layout.vector(2)  #: counter of energy received from the other end [J]
 SENT_ENERGY = _layout.vector(2)  #: this end's counter of sent energy [J]
 DISSIPATED_ENERGY = _layout.vector(2)  #: energy that the method removed from the loop here [J]
 LAST_PORT_WRENCH = _layout.vector(6)  #: wrench at this port since the last step
@@ -65,10 +62,10 @@ _METHOD_PARAMETER_SLICE = _parameter_layout.rest()
 
 
 def own_memory() -> SlotAllocator:
-    """Return an allocator for a method's own part of the memory, which starts with zeros."""
+    """Return an allocator of the memory places of a method; they are 0 at the start."""
     return SlotAllocator(MEMORY_SIZE, _METHOD_MEMORY_SLICE.start)
 
 
 def own_parameters() -> SlotAllocator:
-    """Return an allocator for a method's own part of the parameters."""
+    """Return an allocator of the parameter places of a method."""
     return SlotAllocator(NUM_PARAMETERS, _METHOD_PARAMETER_SLICE.start)

@@ -54,11 +54,11 @@ class PassivityMethod(NamedTuple):
     Attributes:
         master_step, slave_step, record_command: compiled functions with the arguments of those of
             this module except `steps`.
-        initialize: `initialize(p, memory)` of one channel end before its first step.
+        initialize: function of `p` and `memory` of one end, called before its first step.
         config: settings dataclass of a registered method with `pack_into(p)`, or None.
         balance_at_motors: the energy balance is at the slave's motors, not at its command.
         needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.
-        needs_load_apart: the ends need the load's part of the wrench separately.
+        needs_load_apart: the ends need the load's part of the wrench as a separate input.
         speed_limit: function of config and slave mass: largest speed of the slave [m/s, rad/s].
     """
 
@@ -73,7 +73,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _method_functions(module: Any) -> tuple[Any, Any, Any, Any]:
+def _functions_of_module(module: Any) -> tuple[Any, Any, Any, Any]:
     return module.master_step, module.slave_step, module.record_command, module.initialize
 
 
@@ -85,8 +85,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(*_method_functions(two_layer), balance_at_motors=True),
-        "pspm": PassivityMethod(*_method_functions(pspm), balance_at_motors=True),
+        "two_layer": PassivityMethod(*_functions_of_module(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_functions_of_module(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -103,7 +103,6 @@ METHODS = Registry(
     PassivityMethod,
 )
 """All methods by name."""
-
 
 _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
@@ -126,7 +125,7 @@ class PassivityConfig:
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
         [0.1, 1.0], "m/s, rad/s", 1e-3, 1e3,
-        "speed of the hand along the wrench where it starts to fade; zero at twice this speed",
+        "hand speed along the wrench from which the wrench fades, to zero at twice the speed",
     )  # fmt: skip
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
@@ -137,8 +136,8 @@ class PassivityConfig:
     )  # fmt: skip
     slave_mass: list[float] | None = quantity(
         None, "kg, kg m^2", 1e-6, 1e6,
-        "mass of arm and tool at the tool, in the slave's units; null: 15.13, 0.5 (E), with ledger"
-        " mass and servo of the station's arm at the start", length=2,
+        "mass of arm and tool at the tool, in the slave's units; null: with ledger, mass and servo"
+        " of the station's arm at the start; else 15.13, 0.5 (E)", length=2,
     )  # fmt: skip
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
     wave: WaveConfig = field(default_factory=WaveConfig)
@@ -160,9 +159,9 @@ class PassivityConfig:
         if schema is None:
             if self.registered:
                 raise DrakeTeleopError(
-                    f"method '{self.method}' takes no parameters here (only registered methods do)",
+                    f"built-in method '{self.method}' has no registered parameters",
                     where=f"{where}.registered",
-                    remedy="leave them out; a shipped method has its own block of parameters",
+                    remedy="remove this field; a built-in method has its own block of fields",
                 )
             # The number `force_limit` is a limit of all methods.
             name = "local_force_limit" if self.method == "force_limit" else self.method
@@ -254,13 +253,14 @@ def master_step(
     """Compute the wrench to render at the hand and the packet of one step at the master's end.
 
     Args:
+        steps: result of `step_addresses`.
         received: (PACKET_SIZE,) newest packet of the slave; zeros before the first.
         fresh: True if the packet is new.
         pose: (7,) commanded pose X_WS, after kinematic scaling, before the channel.
         twist: (6,) twist of this command [v; omega], in W.
         dx: (6,) increment of this command since the last step [dp; log(R_k R_(k-1)^T)], in W.
         hand: (6,) wrench of the hand on the device, in W; only `four_channel` uses it.
-        limits: (2,) largest force and torque [N, N m].
+        limits: (2,) largest wrench to render: force, torque.
         T: time between steps [s].
         p, memory: parameters and memory of this end; memory is updated.
         wrench: (6,) written: wrench to render; 0 if an input is not finite.
@@ -283,12 +283,12 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
     """Compute the slave's command and the packet of one step at the slave's end.
 
     Args:
-        received, fresh, T, p, memory, packet: as for `master_step`, with the master's packet.
+        steps, received, fresh, T, p, memory, packet: as for `master_step`, from the master.
         pose, twist: (7,) and (6,) actual pose X_WS and twist [v; omega] of the slave, in W.
         dx: (6,) increment of this pose since the last step, in W.
         wrench: (6,) wrench on the slave from contact and the rendered part of the load, in W.
-        command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
-            finite, it is the last pose with zero twist.
+        command: (13,) written: pose (7,) and twist (6,) to command; if an input is not finite, the
+            last pose and zero twist.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = are_vectors_finite((received, pose, twist, dx, wrench))
@@ -306,7 +306,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 def record_command(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
-    `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
-    the method may change; other arguments as for `slave_step`.
+    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state; `ledger`
+    may change it. Other arguments: see `slave_step`.
     """
     _call_record(steps[2], requested, command, pose, twist, p, memory)

@@ -1,4 +1,4 @@
-"""Passivity method "none": wrench and pose are passed on unchanged, a baseline for comparisons."""
+"""Passivity method "none": passes on pose and wrench (within the force limit), as a baseline."""
 
 from __future__ import annotations
 

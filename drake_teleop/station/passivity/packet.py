@@ -1,4 +1,4 @@
-"""Layout of a packet, (38,) float64, and vector operations of all passivity methods.
+"""Layout of a packet (38,), and vector operations of all passivity methods.
 
 Vectors (6,) have two *groups* g of three: 0 is translation, 1 rotation.
 """
@@ -20,9 +20,9 @@ SENDER_INPUTS_FINITE = _layout.number()
 POSE = _layout.vector(7)  #: X_WS [qw qx qy qz px py pz] of the sender
 VELOCITY = _layout.vector(6)  #: twist of the sender [v; omega], in W
 WRENCH = _layout.vector(6)  #: wrench at the sender [f; tau], in W, in the master's power units
-METHOD_INTEGRAL = _layout.vector(6)  #: numbers of the method, such as a cumulative integral
+METHOD_VALUES = _layout.vector(6)  #: values that the method defines, such as a wave integral
 CUMULATIVE_ENERGY = _layout.vector(2)  #: cumulative energy that the receiver may use, by group [J]
-SECOND_ENERGY_COUNTER = _layout.vector(2)  #: second energy counter, by group [J]
+SENDER_ENERGY = _layout.vector(2)  #: energy stored at the sender, by group [J]
 CONTACT_FLAG = _layout.number()  #: 1 while the slave's detector reports contact
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
 #: field, because only `ledger` uses it; with other methods it is not transmitted.
@@ -41,7 +41,7 @@ def has_packet_arrived(received):
 
 @njit(cache=True)
 def count_newly_received_energy(g, received, memory):
-    """Return the energy of group `g` received since the last call [J]; credit it in `memory`."""
+    """Return the energy of group `g` received since the last call [J]; count it as received."""
     new = max(received[CUMULATIVE_ENERGY][g] - memory[RECEIVED_ENERGY][g], 0.0)
     memory[RECEIVED_ENERGY][g] += new
     return new
@@ -74,7 +74,6 @@ def scale_group(vector, g, factor):
 
 @njit(cache=True)
 def limit_group(vector, g, max_length):
-    """Shorten group `g` of a vector (6,) to at most `max_length`."""
     size = length_of_group(vector, g)
     if size > max_length:
         scale_group(vector, g, max_length / size)

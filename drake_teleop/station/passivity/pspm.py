@@ -1,6 +1,7 @@
-"""Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
+"""Passivity method "pspm": passive set-position modulation, docs/theory.md, (T38).
 
-A spring pulls each end to a set position as near to the requested one as the energy permits.
+A spring pulls each end to a set position, as near to the requested one as the energy permits
+(Lee and Huang, T-RO 26(2), 2010).
 """
 
 import math
@@ -20,7 +21,7 @@ from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, pos
 _layout = slots.own_parameters()
 _INITIAL_ENERGY, _MAX_STORED_ENERGY = _layout.vector(2), _layout.vector(2)
 _SPRING_STIFFNESS, _HAND_DAMPING = _layout.vector(2), _layout.vector(2)
-# Memory: set position minus actual position; requested value of this offset.
+# Memory: set position minus actual position; requested value of this difference.
 _layout = slots.own_memory()
 _SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.vector(6)
 
@@ -33,7 +34,7 @@ class PspmConfig:
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
         [0.015, 3e-4], "J", 0.0, 1e6,
-        "largest E; the master sends the rest to the slave, the slave discards it",
+        "largest E; the master sends any excess to the slave, the slave discards it",
     )  # fmt: skip
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"
@@ -53,7 +54,7 @@ def initialize(p, memory):
 
 
 @njit(cache=True)
-def _modulate_set_position_of_group(received, g, stiffness, dx, before, shuffle, p, memory, packet):
+def _modulate_set_position_of_group(received, g, stiffness, dx, before, sends, p, memory, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
     damped = -dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
@@ -67,7 +68,7 @@ def _modulate_set_position_of_group(received, g, stiffness, dx, before, shuffle,
         offset[i] = share * requested[i]
     energy -= 0.5 * stiffness * (dot_of_group(offset, offset, g) - stored)
     surplus = max(energy - p[_MAX_STORED_ENERGY][g], 0.0)
-    if shuffle:
+    if sends:
         memory[slots.SENT_ENERGY][g] += surplus
     else:
         memory[slots.DISSIPATED_ENERGY][g] += surplus

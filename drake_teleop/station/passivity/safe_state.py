@@ -1,7 +1,7 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
-An end is *silent* without new packets of a healthy sender for `timeout` seconds, or if data of
-either end are not finite or beyond 1e6 in SI units.
+A sender is *healthy* while its inputs are finite and at most 1e6 in SI units. An end is *silent* if
+no new packet of a healthy sender came for `timeout` seconds, and at once if an end is not healthy.
 """
 
 from __future__ import annotations
@@ -36,53 +36,52 @@ _LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
 
 
 def initial_master_monitor(device_limits: Array | None = None) -> Array:
-    """Return the silence monitor (MASTER_MONITOR_SIZE,) of the master before the first packet.
+    """Return the silence monitor's state (MASTER_MONITOR_SIZE,) of a silent master.
 
-    With `device_limits` (2,), the device's largest force and torque [N, N m], return that of normal
-    operation instead.
+    With `device_limits` (2,), the device's largest force and torque [N, N m], return the state in
+    normal operation instead.
     """
-    watch = np.zeros(MASTER_MONITOR_SIZE)
+    state = np.zeros(MASTER_MONITOR_SIZE)
     if device_limits is None:
-        watch[SILENCE_TIME] = np.inf
+        state[SILENCE_TIME] = np.inf
     else:
-        watch[_PRESENT_HAND_WRENCH_LIMITS] = device_limits
-        watch[_CONNECTED_TIME] = RESUME_TIME_S
-    return watch
+        state[_PRESENT_HAND_WRENCH_LIMITS] = device_limits
+        state[_CONNECTED_TIME] = RESUME_TIME_S
+    return state
 
 
 def initial_slave_monitor(pose: Array) -> Array:
-    """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
-    watch = np.zeros(SLAVE_MONITOR_SIZE)
-    watch[SILENCE_TIME] = np.inf
-    watch[_COMMAND_AT_STOP_START] = watch[_LAST_COMMAND] = watch[_COMMAND_BEFORE_LAST] = pose
-    return watch
+    """Return the silence monitor's state (SLAVE_MONITOR_SIZE,) of a slave at rest at `pose`."""
+    state = np.zeros(SLAVE_MONITOR_SIZE)
+    state[SILENCE_TIME] = np.inf
+    state[_COMMAND_AT_STOP_START] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
+    return state
 
 
 @njit(cache=True)
-def _update_silence_time(healthy, fault, T, watch):
+def _update_silence_time(healthy, fault, T, state):
     if fault:
-        watch[SILENCE_TIME] = np.inf
+        state[SILENCE_TIME] = np.inf
     else:
-        watch[SILENCE_TIME] = 0.0 if healthy else watch[SILENCE_TIME] + T
+        state[SILENCE_TIME] = 0.0 if healthy else state[SILENCE_TIME] + T
 
 
 @njit(cache=True)
-def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, displayed, watch, limits):
-    """Write the limits (2,) of the rendered wrench [N, N m]; they fall to zero during silence.
+def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, displayed, state, limits):
+    """Write `limits` (2,) of rendered force and torque; during silence they fall to zero.
 
-    `healthy`: a new packet of a healthy sender came; `fault`: data of either end are
-    not finite. `timeout` [s] is the time without packets until the end is silent,
-    `displayed` (6,) the displayed wrench. `watch` is the silence monitor, updated.
+    `healthy`: a new packet of a healthy sender came. `fault`: an end is not healthy. `timeout` [s]:
+    longest time without packets. `displayed` (6,): last displayed wrench. `state` is updated.
     """
-    _update_silence_time(healthy, fault, T, watch)
-    connected = watch[SILENCE_TIME] <= timeout
-    watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
-    present, fall = watch[_PRESENT_HAND_WRENCH_LIMITS], watch[_WRENCH_LIMIT_FALL_RATE]
+    _update_silence_time(healthy, fault, T, state)
+    connected = state[SILENCE_TIME] <= timeout
+    state[_CONNECTED_TIME] = min(state[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
+    present, fall = state[_PRESENT_HAND_WRENCH_LIMITS], state[_WRENCH_LIMIT_FALL_RATE]
     for g in range(2):
         size, limit = length_of_group(displayed, g), present[g]
         if connected:
             fall[g] = 0.0
-            start = size if watch[_CONNECTED_TIME] < RESUME_TIME_S else limit
+            start = size if state[_CONNECTED_TIME] < RESUME_TIME_S else limit
             limit = min(device_limits[g], start + device_limits[g] * T / RESUME_TIME_S)
         else:
             if fall[g] == 0.0:
@@ -93,35 +92,35 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
 
 
 @njit(cache=True)
-def slave_command_into(healthy, fault, T, timeout, requested, watch, command):
-    """Write the command X_WS (7,) that is sent to the slave; during silence the slave brakes.
+def slave_command_into(healthy, fault, T, timeout, requested, state, command):
+    """Write the slave's command X_WS (7,): `requested`, or during silence a braking motion.
 
-    `requested` (7,) is the pose from the passivity method, `watch` from `initial_slave_monitor`.
-    Healthy, fault, T and timeout: as for `master_wrench_limits_into`.
+    `requested` (7,) is the passivity method's command. Other arguments are those of
+    `master_wrench_limits_into`.
     """
-    _update_silence_time(healthy, fault, T, watch)
-    last, before = watch[_LAST_COMMAND], watch[_COMMAND_BEFORE_LAST]
-    start, velocity = watch[_COMMAND_AT_STOP_START], watch[_COMMAND_VELOCITY_AT_STOP_START]
+    _update_silence_time(healthy, fault, T, state)
+    last, before = state[_LAST_COMMAND], state[_COMMAND_BEFORE_LAST]
+    start, velocity = state[_COMMAND_AT_STOP_START], state[_COMMAND_VELOCITY_AT_STOP_START]
     step = np.empty(6)
-    if watch[SILENCE_TIME] <= timeout:
-        watch[_TIME_SINCE_RESUME_BEGAN] = min(watch[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
-    elif watch[_TIME_SINCE_RESUME_BEGAN] > 0.0:
+    if state[SILENCE_TIME] <= timeout:
+        state[_TIME_SINCE_RESUME_BEGAN] = min(state[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
+    elif state[_TIME_SINCE_RESUME_BEGAN] > 0.0:
         fields.pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         copy_into(start, 0, last, 0, 7)
-        watch[_TIME_SINCE_STOP_BEGAN] = watch[_TIME_SINCE_RESUME_BEGAN] = 0.0
-    if watch[_TIME_SINCE_RESUME_BEGAN] == RESUME_TIME_S:
+        state[_TIME_SINCE_STOP_BEGAN] = state[_TIME_SINCE_RESUME_BEGAN] = 0.0
+    if state[_TIME_SINCE_RESUME_BEGAN] == RESUME_TIME_S:
         copy_into(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
-        watch[_TIME_SINCE_STOP_BEGAN] += T
-        u = min(watch[_TIME_SINCE_STOP_BEGAN] / STOP_TIME_S, 1.0)
+        state[_TIME_SINCE_STOP_BEGAN] += T
+        u = min(state[_TIME_SINCE_STOP_BEGAN] / STOP_TIME_S, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
             step[i] = velocity[i] * STOP_TIME_S * u * (1.0 - u * u * (1.0 - 0.5 * u))
         move_pose_into(start, step, command)
-        u = watch[_TIME_SINCE_RESUME_BEGAN] / RESUME_TIME_S
+        u = state[_TIME_SINCE_RESUME_BEGAN] / RESUME_TIME_S
         if u > 0.0:
             fields.pose_difference_into(requested, command, step)
             for i in range(6):
@@ -133,10 +132,10 @@ def slave_command_into(healthy, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def fade_retreat_wrench(twist, T, p, memory, wrench):
-    """Reduce and store a wrench (6,) that pushes the hand, so that a stylus stays slow if let go.
+    """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow.
 
-    It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this, but not
-    below `SLAVE_MASS` times the hand's deceleration.
+    It falls to 0 for hand speeds along it from `RETREAT_SPEED` to twice this, but not below
+    `SLAVE_MASS` times the hand's deceleration. `memory` stores it.
     """
     velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):

@@ -1,7 +1,7 @@
-"""Time-domain passivity approach (TDPA) of a delayed two-port, docs/theory.md, (T31), (T32), (T44).
+"""Passivity methods "tdpa" and "charged_tdpa": time-domain passivity approach (TDPA) with delay.
 
-`charged_tdpa` adds a drag on the hand that stores energy (Franken et al. 2011) and a filter of the
-slave's wrench.
+docs/theory.md, (T31), (T32), (T44). `charged_tdpa` adds a drag on the hand, whose energy is stored
+(Franken et al. 2011), and a filter of the slave's wrench.
 """
 
 import math
@@ -29,8 +29,8 @@ _STIFFNESS_AVERAGING_TRAVEL = (1e-3, 1e-2)
 _FULL_DRAG_HAND_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET = fields.METHOD_INTEGRAL.start
-_PACKET_SLAVE_ENERGY = fields.SECOND_ENERGY_COUNTER
+_NEWEST_MASTER_PACKET = fields.METHOD_VALUES.start
+_PACKET_SLAVE_ENERGY = fields.SENDER_ENERGY
 
 # Parameters; reserve, drag and stiffness in the master's power units.
 _layout = slots.own_parameters()
@@ -40,7 +40,7 @@ _MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _layout = slots.own_memory()
 _WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
-# Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
+# Memory of the slave: work in and out at the actual and the commanded motion; withheld motion;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _layout = slots.own_memory()
 _SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
@@ -68,10 +68,10 @@ class TdpaConfig:
     )  # fmt: skip
     speed: list[float] = quantity(
         [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
-        "largest speed of the slave's command; its kinetic energy may be created at an impact",
+        "largest speed of the slave's command; an impact may create its kinetic energy",
     )  # fmt: skip
     reserve: list[float] = quantity(
-        [2e-3, 1e-4], "J", 0.0, 1e3, "part of the hand's input that the master keeps"
+        [2e-3, 1e-4], "J", 0.0, 1e3, "energy from the hand that the master keeps"
     )
     drag: list[float] = quantity(
         [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than the reserve"
@@ -91,7 +91,7 @@ class TdpaConfig:
 
 
 def charged_tdpa_config() -> TdpaConfig:
-    """Return the parameters of `charged_tdpa`, for a medium grip."""
+    """Return the default parameters of `charged_tdpa`, for a hand of medium stiffness."""
     return TdpaConfig(reserve=[0.06, 1e-3], drag=[0.28, 3e-3], hand_stiffness=[300.0, 1.5])
 
 
@@ -117,7 +117,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * drained
         fields.scale_group(wrench, g, share)
         _add_group_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
-        _charge_hand_work_to_ledger_of_group(g, dot_of_group(wrench, dx, g), p, memory)
+        _update_ledger_by_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
             ledger[g] -= surplus
@@ -139,7 +139,7 @@ def _add_group_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _charge_hand_work_to_ledger_of_group(g, drained, p, memory):
+def _update_ledger_by_hand_work_of_group(g, drained, p, memory):
     ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)

@@ -1,6 +1,6 @@
-"""Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
+"""Passivity method "two_layer": control with an energy tank at each end; docs/theory.md, (T37).
 
-The tank of each end must contain the energy that the wrench can use until the next step.
+Franken et al., T-RO 27(4), 2011. A wrench may use no more energy in a step than the tank contains.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class TwoLayerConfig:
         "level below which a damper on the hand fills the master's tank",
     )  # fmt: skip
     capacity: list[float] = quantity(
-        [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; the rest is discarded"
+        [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; any excess is discarded"
     )
     damper: list[float] = quantity(
         [500.0, 100.0], "N s/m/J, N m s/rad/J", 0.0, 1e6, "damping of the hand for each J missing"

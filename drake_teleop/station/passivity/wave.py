@@ -1,7 +1,7 @@
-"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
+"""Passivity method "wave": wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
 
-docs/theory.md, (T33) to (T36). The receiver filters the integral of the wave within the received
-energy, so jitter and loss create no energy.
+docs/theory.md, (T33) to (T36). Packets contain the integral of the wave. The receiver filters it
+and uses at most the received energy, so jitter and loss create no energy.
 """
 
 import math
@@ -48,7 +48,7 @@ class WaveConfig:
         "silence after which the slave keeps its command until the next packet",
     )  # fmt: skip
     drift_rate: float = quantity(
-        2.0, "1/s", 0.0, 1e3, "rate of the drift correction where it takes no work"
+        2.0, "1/s", 0.0, 1e3, "rate of the correction of pose drift, where it needs no energy"
     )
 
     def pack_into(self, p: Array) -> None:
@@ -60,7 +60,7 @@ class WaveConfig:
 @njit(cache=True)
 def _filter_received_wave(received, T, p, memory):
     ledger, played = memory[slots.STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
-    wave, integral = memory[_FILTERED_WAVE], received[fields.METHOD_INTEGRAL]
+    wave, integral = memory[_FILTERED_WAVE], received[fields.METHOD_VALUES]
     for g in range(2):
         ledger[g] += fields.count_newly_received_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
@@ -99,7 +99,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
         memory[slots.SENT_ENERGY][g] += max(left, 0.0)
-    copy_into(packet, fields.METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
+    copy_into(packet, fields.METHOD_VALUES.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
     copy_into(packet, fields.CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
     fill_packet(pose, twist, wrench, packet)
 
@@ -138,7 +138,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     else:
         step[:] = 0.0
         _reflect_wave_during_silence(wrench, T, p, memory)
-    copy_into(packet, fields.METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
+    copy_into(packet, fields.METHOD_VALUES.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
     copy_into(packet, fields.CUMULATIVE_ENERGY.start, memory, slots.SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
@@ -187,7 +187,7 @@ def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
             integral[i] -= T * wave[i]
-            played[i] = received[fields.METHOD_INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
+            played[i] = received[fields.METHOD_VALUES][i] - p[_WAVE_FILTER_TIME] * wave[i]
         memory[slots.SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
         ledger[g] = 0.5 * (T + p[_WAVE_FILTER_TIME]) * dot_of_group(wave, wave, g)
 

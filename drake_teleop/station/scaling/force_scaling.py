@@ -1,4 +1,4 @@
-"""Force scaling, slave to master, of contact and load's wrench (Figs. 2 and 4 of the paper)."""
+"""Scaling of contact wrench and load wrench, slave to master (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import weakref
@@ -52,7 +52,7 @@ class Scales(NamedTuple):
 @settings
 @dataclass
 class ForceScalingConfig:
-    """Settings of the force scaling: sigma, gamma, eta of the paper, scale from slave to master."""
+    """Settings of the force scaling: sigma, gamma, eta of the paper; scale from slave to master."""
 
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
@@ -75,7 +75,7 @@ class ForceScalingConfig:
         """Return the scales of gripper, object and contact.
 
         Raises:
-            DrakeTeleopError: for eta with other scales or without gripper_phi, or a negative mass.
+            DrakeTeleopError: eta with other scales, eta without gripper_phi, or negative mass.
         """
         if self.gripper_phi is not None and self.gripper_phi[0] < 0.0:
             what = f"a mass of {self.gripper_phi[0]:g} kg is negative"
@@ -107,7 +107,7 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
 
 @njit(cache=True)
 def blend_scales_at(ramp, time, scales):
-    """Write the scales at `time` [s] to `scales` (6,): a minimum-jerk blend from old to new ones.
+    """Write the scales at `time` [s], a minimum-jerk blend from old to new ones, to `scales` (6,).
 
     `ramp` (14,) contains old scales (6), new scales (6), start of the ramp [s], duration [s].
     Scales are sigma of gripper and object, gamma, force scale, weights of gripper and object.
@@ -142,7 +142,7 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
 def find_sample_fault(sample, estimate, time, sample_limits):
     """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
-    `sample_limits` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
+    `sample_limits` (7,): largest wrench [N, N m] (6), largest age of a sample [s].
     """
     if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= sample_limits[6]:
         return _STALE_SAMPLE_FAULT
@@ -205,21 +205,21 @@ def _rendered_wrench_into(
 
 
 class ForceScaling(LeafSystem):
-    """Block that scales contact wrench and load's wrench, and transforms them to the hand.
+    """Block that scales contact wrench and load wrench, and transforms their sum to the hand.
 
-    F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
-    phi_gr `config.gripper_phi` (if null, all is gripper), and phi_obj the rest of the estimate.
+    F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj), with contact wrench F_c, regressor V;
+    phi_gr is `config.gripper_phi` (null: the whole estimate), phi_obj the estimate minus phi_gr.
 
     .. pydrake_system::
 
         name: ForceScaling
         input_ports:
         - sample: sample of the wrist sensor, see `drake_teleop.load.regressor`
-        - load_estimate: (16,) load estimate of Eq. (7), [offsets; phi]
+        - load_estimate: (16,) [offsets; phi], Eq. (7)
         output_ports:
         - scaled_wrench_S: scaled wrench F' of Fig. 2
         - contact_wrench_S: contact wrench F_c of Eq. (13)
-        - fault: code of a `Fault` of sample or estimate, 0 without fault
+        - fault: `Fault` code of sample or estimate, 0 without fault
         - scaled_contact_and_fault: the three above in one vector
         - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
@@ -227,7 +227,7 @@ class ForceScaling(LeafSystem):
 
     Args:
         config: initial scales.
-        R_WB: (3, 3) alignment of the master's base with the world.
+        R_WB: (3, 3) orientation of the master's base B in world W.
         largest_wrench: (6,) largest valid reading [N, N m]; None for no limit.
         oldest: largest valid age of a sample [s].
     """
@@ -291,9 +291,9 @@ class ForceScaling(LeafSystem):
         sigma_weight: float | None = None,
         duration: float = 0.25,
     ) -> None:
-        """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
+        """Change the scales on a minimum-jerk ramp of `duration` [s] that starts now.
 
-        `sigma_weight` scales the weight of gripper and object; None: the other sigmas do.
+        `sigma_weight` scales both weights; None: sigma_gripper and sigma_object do.
         """
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)

@@ -20,7 +20,7 @@ from drake_teleop.station.slave.arm import ArmModel, pose_into
 @settings
 @dataclass
 class KinematicScalingConfig:
-    """Settings of the kinematic scaling: scales, alignment of the master's base with the world."""
+    """Settings of the kinematic scaling: scales, and orientation of the master's base."""
 
     translation_scale: float = quantity(1.0, "1", 0.0, 100.0, "slave over master translation")
     rotation_scale: float = quantity(1.0, "1", 0.0, 10.0, "slave over master angle")
@@ -30,12 +30,12 @@ class KinematicScalingConfig:
 
     @property
     def R_WB(self) -> Array:
-        """Alignment (3, 3) of the master's base B with the world."""
+        """Orientation (3, 3) of the master's base B in world W."""
         return RollPitchYaw(self.alignment).ToRotationMatrix().matrix()
 
     @property
     def scales(self) -> Array:
-        """Scales (2,) of translation and rotation, slave over master."""
+        """Scales (2,), slave over master: translation, rotation."""
         return np.array([self.translation_scale, self.rotation_scale])
 
 
@@ -53,8 +53,8 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
 
-    `pose` is X_BE of the master now, `master` and `command` are X_BE and X_WS at the closing of
-    the clutch, `alignment` is the quaternion of R_WB.
+    `pose` (7,) is X_BE of the master now; `master` and `command` (7,) are X_BE and X_WS when the
+    clutch closed; `alignment` (4,) is the quaternion of R_WB.
     """
     R_WB, R_BE = quaternion_at(alignment, 0), quaternion_at(pose, 0)
     offset = vectors.rotate_vector(R_WB, vectors.minus(vector_at(pose, 4), vector_at(master, 4)))
@@ -80,16 +80,16 @@ def _pose_command_into(pose, references, alignment, translation_scale, rotation_
 class KinematicScaling(DoubleOnlySystem, LeafSystem):
     """Block that scales the master's motion into the slave's commanded pose, with a clutch.
 
-    While the clutch is open the command is constant. When it closes, the master's present pose is
-    the new reference, so the command does not jump. The clutch keeps its state while the
-    master's pose is not finite.
+    While the clutch is open, the command is constant. When it closes, the master's present pose is
+    the new reference, so the command does not jump. While the master's pose is not finite, the
+    clutch keeps its state.
 
     .. pydrake_system::
 
         name: KinematicScaling
         input_ports:
         - pose_master: (7,) pose X_BE of the master
-        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        - clutch: (1,) closed if above 0.5 or unconnected
         output_ports:
         - pose_command: (7,) commanded pose X_WS of the slave
 
@@ -141,20 +141,20 @@ class KinematicScaling(DoubleOnlySystem, LeafSystem):
 class JointCoupling(LeafSystem):
     """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open the command is constant. When it closes the command jumps to
-    start + (leader's joints - home), and follows it.
+    While the clutch is open, the command is constant. While it is closed, the command is start +
+    (leader's joints - home), so it jumps when the clutch closes.
 
     .. pydrake_system::
 
         name: JointCoupling
         input_ports:
         - master_state: (2 n,) [q; dq/dt] of the leader [rad, rad/s]
-        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        - clutch: (1,) closed if above 0.5 or unconnected
         output_ports:
         - leader_joints: (n,) commanded joint positions of the slave [rad]
         - pose_command: (7,) X_WS for these joints
 
-    The command is `start` (n,) [rad] when the leader is at `home` (n,) [rad].
+    `start` and `home` (n,) [rad] are matching joint positions of slave and leader.
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -164,7 +164,7 @@ class JointCoupling(LeafSystem):
         if len(home) != len(start):
             numbers = f"{len(home)} joints, but the slave {len(start)}"
             what = f"the leader has {numbers} (they must agree)"
-            remedy = "set leads: pose, or give arms of the same kinematics"
+            remedy = "set leads: pose, or choose arms of the same kinematics"
             raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
         self._state = self.DeclareVectorInputPort("master_state", 2 * n)

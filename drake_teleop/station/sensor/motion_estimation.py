@@ -68,7 +68,7 @@ _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 @settings
 @dataclass
 class MotionEstimationConfig:
-    """Settings of the motion estimation of the sensor frame S."""
+    """Settings of the estimation of the motion of the sensor frame S."""
 
     source: str = choice("accelerometer", _MOTION_SOURCES, "source of omega and accelerations")
     encoder_bandwidth_hz: float = quantity(
@@ -97,9 +97,9 @@ class PathDelays(NamedTuple):
 def steady_state_kalman_gains(
     position_std: float, acceleration_std: float, drift: float, period: float
 ) -> Array:
-    """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
+    """Return Kalman gains (3,) from innovation to position [1], rate [1/s], acceleration [1/s^2].
 
-    The Kalman filter has a measured position, and a measured acceleration with a drifting error.
+    The filter has a measured position, and a measured acceleration with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -139,7 +139,7 @@ def path_delays(
 def fusion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[Array, Array]:
-    """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
+    """Return the Kalman gains (3,) of source `fused` for rotation and for displacement of S."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std = _sensor_rotation_std_by_encoders(sensor, num_joints)
     linear_std = angle_std * _RMS_SENSOR_DISPLACEMENT_M_PER_RAD
@@ -151,7 +151,7 @@ def fusion_gains(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> Array:
-    """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
+    """Return standard deviations (9,) of specific force, omega (0: exact), alpha [SI units]."""
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
         return np.concatenate([s_std, np.zeros(3), alpha_std])
@@ -230,8 +230,8 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
     Args:
         constants, memory: results of `initialize_motion_estimator`; memory is updated.
-        arm: `ArmModel.table`. Without rows, the first three of the n "joint angles" are the
-            measured angular velocity of S, in S [rad/s] (source `accelerometer`).
+        arm: `ArmModel.table`. If it has no rows, the first three of the n "joint angles" are the
+            measured angular velocity of S, in S [rad/s] (only source `accelerometer`).
         reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
@@ -255,10 +255,10 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memory, sample):
-    """Measure true values by sensor chain and motion estimator; flag an implausible sample.
+    """Convert true values to a sample by sensor chain and motion estimator.
 
-    `sensor` is (constants of the chain, constants of the estimator, ideal); the others are
-    arguments of `read_sensor_into` and `estimate_sample_into`.
+    Implausible values flag the last sample instead. `sensor` is (constants of the chain, constants
+    of the estimator, ideal). Others: see `read_sensor_into`.
     """
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX

@@ -1,7 +1,7 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-If the plant's output ports are sampled, reaction and acceleration belong to the state before a
-step; the block holds pose and velocity of this state to pair them.
+If the plant samples its output ports, reaction and acceleration belong to the state before a step.
+The block stores pose and velocity of that state, so that a sample has the values of one instant.
 """
 
 from __future__ import annotations
@@ -80,11 +80,11 @@ def AddWristSensor(
     Args:
         joint_or_frame: weld between arm and tool; S is then its frame on the arm. Or S itself, a
             frame on a body of the arm with exactly one weld to a body beyond it.
-        config: errors of the sensor; without it the sensor is ideal.
+        config: errors of the sensor; None for an ideal sensor.
         period: sampling period [s]; a multiple of a discrete plant's time step, by default equal
             to it, or 1 ms for a continuous plant.
         model_instance: source of `joint_position`; all joints of the plant by default.
-        name: name of the block; its noise source is named "<name>_noise".
+        name: name of the block; "<name>_noise" is its noise source.
 
     Raises:
         DrakeTeleopError: for a plant that is not finalized or in another builder, a missing weld, a
@@ -107,9 +107,9 @@ def AddWristSensor(
 
 
 class PlantWristSensor(DoubleOnlySystem, LeafSystem):
-    """Sensor of force, torque and motion of S at a weld of a plant, see `AddWristSensor`.
+    """Block of the wrist sensor at a weld of a plant, see `AddWristSensor`.
 
-    The outputs hold the last sample, which belongs to the instant `sample_time`.
+    The outputs hold the last sample, taken at `sample_time`.
 
     .. pydrake_system::
 
@@ -124,10 +124,10 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         output_ports:
         - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
-        - angular_velocity_S: (3,) [rad/s], of an ideal gyroscope with the encoders' delay
+        - angular_velocity_S: (3,) [rad/s], with delay, low-pass and rounding of the encoders
         - angular_acceleration_S: (3,) [rad/s^2]
-        - status: 0 valid; 1 a channel is saturated; 2 and above no sample yet, or an impossible one
-        - joint_position: (n,) positions q
+        - status: 0 valid; 1 a channel is saturated; 2 and above: no sample yet, or implausible
+        - joint_position: (n,) positions q in `state`
         - sample_time: instant of the sample [s]
         - sample: the outputs above in one vector, for `ForceScaling`
     """
@@ -321,10 +321,10 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
 def _weld_properties(
     plant: MultibodyPlant, S: Frame, joint: WeldJoint
 ) -> tuple[int, int, tuple[Array | float, ...]]:
-    """Return the indices of the weld's reaction and of the body B of S, and the geometry.
+    """Return reaction index and body index (body B of S) in the plant's ports, and geometry.
 
-    The indices are those of the plant's output ports. The geometry contains p_BoSo_B, R_BS, R_SJc
-    (Jc: frame of the reaction), p_SoJc_S, gravity in W, and the sign of the reaction.
+    The geometry is p_BoSo_B, R_BS, R_SJc (Jc: frame of the reaction), p_SoJc_S, gravity in W, and
+    the sign from the reaction to the load's wrench.
     """
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:

@@ -56,9 +56,9 @@ PRESET_NAMES = (
 _LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
 _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_TOLERANCE = 1e-6
-_PLAUSIBLE_RANGES_UNSATURATED = 10.0  # overload limit in ranges
+_OVERLOAD_LIMIT_IN_RANGES = 10.0
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
-_PLAUSIBLE_RANGES_SATURATED = 1.5
+_MAX_SATURATED_READING_IN_RANGES = 1.5
 
 
 @settings
@@ -77,11 +77,11 @@ class WristSensorConfig:
             "in_python": "set wrist_sensor = drake_teleop.station.sensor.presets.PRESETS[name]",
         },
     )
-    ideal: bool = plain(False, "true values at the sampling instant, at So in S, without all parts")
+    ideal: bool = plain(False, "true values at the sampling instant, at So in S, without errors")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
     cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest cross-talk in ranges per full range")
-    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
+    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the real wrench axes")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
     acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
     unit: int = quantity(0, "1", 0, 2**32 - 1, "seed of the calibration errors within their bounds")
@@ -131,27 +131,27 @@ class WristSensorConfig:
         return np.repeat([getattr(self, name) for name in SENSOR_PARTS["noise"]], 3)
 
     def random_walk(self) -> Array:
-        """Return the standard deviations (12,) of random walks after 1 s, ordered as `ranges`."""
+        """Return standard deviations (12,) of random walks after 1 s, ordered as `ranges`."""
         return np.repeat([getattr(self, name) for name in SENSOR_PARTS["random_walk"]], 3)
 
     def ranges(self) -> Array:
-        """Return the ranges (12,) of force, torque, specific force, angular acceleration in SI."""
+        """Return ranges (12,) of force, torque, specific force, angular acceleration [SI units]."""
         motion = [self.acceleration_range] * 3 + [self.angular_acceleration_range] * 3
         return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
     def largest_plausible_wrench(self) -> Array:
         """Return the largest plausible absolute readings (6,) of force and torque [N, N m]."""
         limited = self.saturates and not self.ideal
-        factor = _PLAUSIBLE_RANGES_SATURATED if limited else _PLAUSIBLE_RANGES_UNSATURATED
+        factor = _MAX_SATURATED_READING_IN_RANGES if limited else _OVERLOAD_LIMIT_IN_RANGES
         return factor * self.ranges()[:6]
 
     def wrench_std(self) -> Array:
-        """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""
+        """Return standard deviations (6,) of noise and quantisation of the wrench [N, N m]."""
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> Array:
-        """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
+        """Return standard deviations (9,) of specific force, omega (0: exact), alpha [SI units]."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
@@ -237,16 +237,16 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> Array:
 
 
 def group_delay_samples(section: Array) -> float:
-    """Return the delay of a section [b0, b1, b2, a1, a2] at low frequencies, in samples."""
+    """Return the low-frequency delay of a filter section [b0, b1, b2, a1, a2] in samples."""
     b0, b1, b2, a1, a2 = section
     return float((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2))
 
 
 def calibration_matrices(config: WristSensorConfig) -> tuple[Array, Array, Array]:
-    """Return matrices from true values to values with calibration errors; seed: `config.unit`.
+    """Return random matrices from true values to values with calibration errors.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
-    in A.
+    in A. The seed is `config.unit`.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -287,7 +287,7 @@ def initialize_sensor_chain(
 ) -> tuple[Records, Array]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
-    `constants[0].offset[:6]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
+    `constants[0].offset[:6]` is the wrench's offset [N, N m]; `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
@@ -314,7 +314,7 @@ def initialize_sensor_chain(
         latency_samples=latencies,
         encoder_quantum=config.encoder_resolution,
         is_ideal=config.ideal,
-        overload_limits=_PLAUSIBLE_RANGES_UNSATURATED * ranges[:6],
+        overload_limits=_OVERLOAD_LIMIT_IN_RANGES * ranges[:6],
     )
     rows = 0 if config.ideal else latencies.max() + 1
     memory = np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
@@ -399,7 +399,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
 
 @njit(cache=True)
 def shift_delay_line(line):
-    """Shift the rows of the delay line by one; the newest is first."""
+    """Shift the rows of the delay line by one; row 0 becomes free."""
     for k in range(line.shape[0] - 1, 0, -1):
         copy_into(line[k], 0, line[k - 1], 0, line.shape[1])
 

@@ -2,8 +2,8 @@
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-The state at each sampling instant is interpolated within an integration step. With contact from
-Drake (`ToolContactModel.drake_contact_reason`) each sample is an event at the end of a step.
+The state at each sampling instant is interpolated within an integration step. If Drake calculates
+the contact (`ToolContactModel.drake_contact_reason`), each sample is an event at a step's end.
 """
 
 from __future__ import annotations
@@ -158,10 +158,11 @@ def take_due_samples(
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         surroundings: [deflection and rate of the sheet, plant's state if other bodies move] now.
-        held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
+        held: motor torque (n,) now [N m], and its rate (n,) in these steps, or (0,) if constant.
         applied_W: (6,) additional wrench on the tool.
         memory: [last two samples (16 + n each) | sensor chain | motion estimator | `tail`:
             number of samples, number of queued steps, time and state of each queued step's end].
+        until_now: True to include a sample at `time`.
         touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
             calculate it with `physics`.
         result: written: [last sample before now (16 + n) | its time [s] | memory].
@@ -227,7 +228,7 @@ def take_due_samples(
 
 
 class WristSensor(LeafSystem):
-    """Sensor of force, torque, motion of S and joint angles at its own rate.
+    """Block of the station's wrist sensor: force, torque, motion of S and joint angles.
 
     .. pydrake_system::
 
@@ -236,7 +237,7 @@ class WristSensor(LeafSystem):
         - slave_state: state [q; v] of the arm
         - joint_torque: (n,) present torque of the motors [N m]
         - torque_rate: (n,) rate of joint_torque [N m/s] (only with `ramps`)
-        - slave_acceleration: acceleration vdot of the arm, to detect forces that no input contains
+        - slave_acceleration: (n,) vdot of the arm, to detect forces that no input contains
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         - contact_results: contact results of the plant (only with surroundings)
@@ -249,7 +250,7 @@ class WristSensor(LeafSystem):
     A force that no input contains raises a DrakeTeleopError during simulation.
 
     Args:
-        hold_time: time for which the motors hold a torque, or with `ramps` its rate [s].
+        hold_time: period of changes of the motor torque, or with `ramps` of its rate [s].
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -349,8 +350,8 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        """Take the due samples, and store them in the context."""
-        self._take_samples(context, False, self._result)
+        """Take the samples that are due before now, and store them in the context."""
+        self._take_samples_into(context, False, self._result)
         context.SetDiscreteState(self._result[self._memory_slice])
 
     def reset_queue(self, context: Context) -> None:
@@ -383,9 +384,9 @@ class WristSensor(LeafSystem):
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        self._take_samples(context, True, output.get_mutable_value())
+        self._take_samples_into(context, True, output.get_mutable_value())
 
-    def _take_samples(self, context: Context, until_now: bool, result: Array) -> None:
+    def _take_samples_into(self, context: Context, until_now: bool, result: Array) -> None:
         seen = self._states_of_arm_and_environment(context)
         near, touching_W = self._tool_proximity(*seen), _NO_DRAKE_CONTACT_WRENCH
         if until_now and near == PROXIMITY_FAR:

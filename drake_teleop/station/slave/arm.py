@@ -1,8 +1,8 @@
 """Compiled kinematics and dynamics of a serial arm with revolute and prismatic joints.
 
-For prismatic joints, read m for rad, N for N m, kg for kg m^2. The state ``x`` of a frame L has 21
-numbers in W: ``[s(3), omega(3), alpha(3), p_WL(3), R_WL(9, by rows)]`` with the specific force
-``s = a - g`` of its origin [m/s^2]. Arguments `table` are `ArmModel.table`."""
+For prismatic joints, the units rad, N m and kg m^2 become m, N and kg. The state ``x`` of a frame L
+has 21 numbers in W: ``[s(3), omega(3), alpha(3), p_WL(3), R_WL(9, by rows)]``. The specific force
+of its origin is ``s = a - g`` [m/s^2]. Arguments `table` are `ArmModel.table`."""
 
 from __future__ import annotations
 
@@ -48,18 +48,19 @@ SENSOR_MOTION_SIZE = 21
 class ArmModel:
     """Serial arm of n joints from the world to the sensor frame S, as numeric arrays.
 
-    Link frame L_j moves about or along its z axis and coincides with joint frame J_j at q_j = 0;
-    L_0 is the world. Welded bodies belong to their link; bodies beyond S belong to the load.
+    Frame L_j of link j rotates about its z axis, or slides along it. At q_j = 0 it coincides with
+    the joint frame J_j, which is fixed to the previous link; L_0 is the world. Bodies welded to a
+    link belong to it. Bodies beyond S are the load. phi (10,) are inertial parameters about a
+    frame's origin, in its axes: mass, mass times centre (3,), inertia xx, xy, xz, yy, yz, zz.
 
     Attributes:
         joint_names: names from the base outwards.
         table: (n+1, 26), a row for each joint and a last row for S, fixed to L_n. Columns: 0-8
-            rotation from the joint's frame to the previous link's, by rows; 9-11 origin of the
-            joint's frame in the previous link's [m]; 12-21 phi of the link about the origin of L_j,
-            in L_j (last row: of the load, in S); 22 rotor inertia [kg m^2]; 23 damping
+            R_PJ by rows, with the previous link's frame P; 9-11 p_PJ [m]; 12-21 phi of the link, in
+            L_j (last row: of the load, in S); 22 rotor inertia at the joint [kg m^2]; 23 damping
             [N m s/rad]; 24 dry friction [N m]; 25 is 1 for a prismatic joint. Last row, 22-24:
-            gravity [m/s^2].
-        lower, upper: (n,) joint limits [rad], -inf and inf for joints that turn without end.
+            gravity in W [m/s^2].
+        lower, upper: (n,) joint limits [rad], -inf and inf for joints without limits.
         velocity_limit, acceleration_limit, effort_limit: (n,) [rad/s, rad/s^2, N m] or inf.
         position_index, velocity_index: (n,) indices in the plant's positions and velocities.
     """
@@ -80,7 +81,7 @@ class ArmModel:
 
     @property
     def middle_positions(self) -> Array:
-        """Middles (n,) of the joint ranges; for open ranges the permitted position nearest 0."""
+        """Middles (n,) of the joint ranges; for an infinite range its point nearest to 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
         with np.errstate(invalid="ignore"):  # inf - inf
             middle = (self.lower + self.upper) / 2
@@ -92,7 +93,7 @@ class ArmModel:
 
     @property
     def phi_load_view(self) -> Array:
-        """Inertial parameters phi (10,) of the load about So, in S; changes also change `table`."""
+        """Writable view into `table`: inertial parameters phi (10,) of the load about So, in S."""
         return self.table[-1, PHI_COLUMN:ROTOR_COLUMN]
 
     def pose(self, q: Array) -> Array:
@@ -111,7 +112,7 @@ class ArmModel:
 def _advance_pose_over_joint(
     table: Array, row: int, q: float, x: Array
 ) -> tuple[float, float, float]:
-    """Replace the pose of the previous link P in the state x by that of link L; return p_PL_W."""
+    """Advance the pose in the state x from link P to the next link L; return p_PL_W."""
     joint = table[row]
     p_PL_P = vector_at(joint, TRANSLATION_COLUMN)
     if joint[IS_PRISMATIC_COLUMN] != 0.0:
@@ -143,7 +144,7 @@ def _advance_motion_over_joint(
 
 
 def accelerations_from_specific_forces(arm: ArmModel, q: Array, s: Array) -> Array:
-    """Return accelerations s + g (N, 3) of So from specific forces s (N, 3), in S, at q (N, n)."""
+    """Return accelerations s + g of So, in S, from specific forces s (N, 3), in S, at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
         acceleration_from_specific_force_into(arm.table, q[k], s[k], out[k])
@@ -188,7 +189,7 @@ def jacobian(table: Array, q: Array, J_out: Array) -> None:
 
 @njit(cache=True)
 def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
-    """Write the Jacobian to J_out, p_WS [m] to x[9:12] and R_WS, by rows, to x[12:21]."""
+    """Write the `jacobian` to J_out, p_WS [m] to x[9:12] and R_WS, by rows, to x[12:21]."""
     n = table.shape[0] - 1
     x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
@@ -211,7 +212,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 
 @njit(cache=True)
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write specific force s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows, to out (21,)."""
+    """Write the motion of S to out (21,): s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows."""
     n = table.shape[0] - 1
     _write_motion_of_world_at_rest(table, out)
     for row in range(n + 1):
@@ -224,7 +225,7 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the state [s, omega, alpha, p_WL, R_WL] of each link, and of S, to out (n+1, 21)."""
+    """Write the states [s, omega, alpha, p_WL, R_WL] in W of all links and S to out (n+1, 21)."""
     n = table.shape[0] - 1
     _write_motion_of_world_at_rest(table, out[0])
     for row in range(n + 1):
@@ -236,7 +237,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 @njit(cache=True, inline="always")
 def _write_joint_axis_and_inertial_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Write z axis, origin, inertial force and moment about Wo of a link, in W, to `link[row]`."""
+    """Write [z_L, p_WL, f, tau] in W to `link[row]`: wrench f, tau about Wo causes the motion x."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     s, omega = apply_matrix(R_LW, vector_at(x, 0)), apply_matrix(R_LW, vector_at(x, 3))
@@ -273,7 +274,7 @@ def _project_wrenches_on_joints(table: Array, link: Array, tau: Array) -> None:
 def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Array) -> None:
     """Write joint torques (n,) [N m] by recursive Newton-Euler (Luh, Walker, Paul 1980).
 
-    They include rotors, joint damping, gravity and load, but neither contact nor dry friction.
+    The torques include rotors, damping, gravity and load, but neither contact nor dry friction.
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -296,7 +297,6 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 
 @njit(cache=True, inline="always")
 def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Array) -> None:
-    """Add inertial parameters phi (10,) of a link about Wo, in W, to `inertia` (10,)."""
     phi, p = table[row, PHI_COLUMN:], vector_at(x, 9)
     h = apply_matrix(matrix_at(x, 12), vector_at(phi, 1))
     m, about_Lo = phi[0], symmetric_matrix_at(phi, 4)
@@ -318,7 +318,7 @@ def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Arr
 
 @njit(cache=True)
 def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array) -> None:
-    """Write the lower half of the mass matrix to M (n, n) and overwrite `link`.
+    """Write the lower half of the mass matrix to M (n, n); overwrite `link` and `inertia`.
 
     Composite rigid bodies: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
     """
@@ -349,7 +349,7 @@ def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array)
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
-    """Return the friction torque [N m] at a speed [rad/s]; `coulomb` is its limit [N m]."""
+    """Return the torque [N m] of dry friction against a speed [rad/s]; its limit is `coulomb`."""
     return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
 
 
@@ -357,10 +357,10 @@ def dry_friction(coulomb: float, speed: float) -> float:
 def forward_dynamics(
     table: Array, q: Array, v: Array, tau: Array, wrench_W: Array, vdot_out: Array
 ) -> None:
-    """Write joint accelerations vdot of M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
+    """Write joint accelerations vdot, from M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
-    tau_friction is joint damping and dry friction, F the wrench `wrench_W` on the load, about the
-    world's origin [N, N m].
+    tau_friction is joint damping and dry friction; h is the torque of gravity, Coriolis and
+    centrifugal effects. F is the wrench `wrench_W` on the load, about the world's origin [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -386,7 +386,6 @@ def forward_dynamics(
 
 @njit(cache=True)
 def pose_into(table, q, pose):
-    """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose` (7,)."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R, p)
     pose[0], pose[1], pose[2], pose[3] = quaternion_of_matrix(R)
@@ -411,14 +410,14 @@ class ForwardKinematics(LeafSystem):
 
 
 @njit(cache=True)
-def _friction_into(coulomb, index, state, force):
+def _write_friction_force(coulomb, index, state, force):
     force[:] = 0.0
     for i in range(coulomb.shape[0]):
         force[index[i]] = dry_friction(coulomb[i], state[coulomb.shape[0] + i])
 
 
 class JointFriction(LeafSystem):
-    """Block that applies dry friction, which Drake's joints do not have, to the whole plant.
+    """Block that outputs dry friction of the arm's joints as generalized force on the whole plant.
 
     `index` contains the joints' indices in the plant's `num_velocities` velocities.
     """
@@ -433,4 +432,6 @@ class JointFriction(LeafSystem):
         self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
 
     def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
-        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
+        _write_friction_force(
+            *self._constants, self._state.Eval(context), output.get_mutable_value()
+        )

@@ -30,8 +30,8 @@ from drake_teleop.station.slave.arm import (
 
 _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
-# Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
-_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD = 8 * np.pi
+# A larger range of a revolute joint may be in degrees [rad].
+_MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
 _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4
 _DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
@@ -44,8 +44,8 @@ def ArmModelFromPlant(
 ) -> ArmModel:
     """Return the arm between the world and the sensor frame of a finalized plant.
 
-    A DrakeTeleopError is raised unless all its joints are revolute, prismatic or welds, and no
-    other joint moves on its links. Joints beyond S are at their default positions.
+    A DrakeTeleopError is raised if a joint between them is not revolute, prismatic or a weld, or if
+    another joint moves a body on these links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         what = f"{plant.GetModelInstanceName(model_instance)} has no frame {sensor_frame_name!r}"
@@ -98,7 +98,7 @@ def ArmModelFromPlant(
 def _joint_limits(
     joint: tree.RevoluteJoint | tree.PrismaticJoint,
 ) -> tuple[float, float, float, float]:
-    """Return limits of position (lower, upper), speed and acceleration, infinite for none."""
+    """Return lower, upper, speed and acceleration limit of a joint; infinite for no limit."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     limit = _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M
     # Exporters write 0 to 0 for unknown limits.
@@ -120,7 +120,7 @@ def _moving_joints_to_sensor(
             remedy = "weld the arm's base to the world; up to the sensor, use joints of one axis"
             raise DrakeTeleopError(what, where=joint.name(), remedy=remedy)
     if not joints:
-        what = f"no moving joint is between the world and {frame_S.name()}"
+        what = f"no joint moves {frame_S.name()}: all joints between it and the world are fixed"
         remedy = "name a frame or link that the arm moves"
         raise DrakeTeleopError(what, where="sensor_frame", remedy=remedy)
     return joints
@@ -129,7 +129,7 @@ def _moving_joints_to_sensor(
 def _bodies_moved_by_joints(
     plant: MultibodyPlant, joints: list[tree.Joint], sensor_body: tree.RigidBody
 ) -> list[list[tree.BodyIndex]]:
-    """Return the bodies that move with each joint, without those of the next, then the load."""
+    """Return, per joint, bodies that move with it but not with the next; last the load."""
     outboard = [set(plant.GetBodiesKinematicallyAffectedBy([j.index()])) for j in joints]
     load = {body.index() for body in chain_joints.bodies_carried_by(plant, sensor_body)}
     rows = [inner - outer - load for inner, outer in pairwise([*outboard, set()])]
@@ -147,7 +147,7 @@ def _bodies_moved_by_joints(
 def values_per_joint(
     arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
 ) -> Array:
-    """Return one value per joint (n,) from n values; with a `default`, also from one or none."""
+    """Return one value per joint (n,) from n values; a `default` also permits one value or none."""
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
@@ -162,8 +162,8 @@ def fill_missing_joint_limits(
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
 
-    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
-    about accelerations.
+    `acceleration` has 1 or n limits [rad/s^2], which replace the model's; `hint` is appended to the
+    text about accelerations.
     """
     assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
@@ -174,7 +174,7 @@ def fill_missing_joint_limits(
         unit = "m" if slides[immovable][0] else "rad"
         name, limit = np.array(arm.joint_names)[immovable][0], arm.lower[immovable][0]
         what = f"{name} cannot move: both of its limits are {limit:g} {unit}"
-        remedy = "correct the limits, or make the joint a fixed one"
+        remedy = "correct the limits, or make the joint fixed"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     reach = np.where(slides, _DEFAULT_JOINT_HALF_RANGE_M, np.pi)
     lower = np.where(unlimited & slides, -reach, arm.lower)
@@ -191,14 +191,15 @@ def fill_missing_joint_limits(
     limit = np.where(_is_positive_and_finite(specified), specified, default)
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
-    plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
-    half_range, only_limit = _DEFAULT_JOINT_HALF_RANGE_M, "a range of one turn from the only limit"
+    plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_JOINT_RANGE_RAD)
+    half_range = _DEFAULT_JOINT_HALF_RANGE_M
+    only_limit = "a range of 360 degrees from the only limit"
     turning_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s"
     sliding_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s"
-    in_rad = f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,"
+    in_rad = f"limits in rad, though more than {_MAX_PLAUSIBLE_JOINT_RANGE_RAD:.4g} apart,"
     rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
-        (unlimited, "turns without end", f"a range of +-{half_range:g} m"),
+        (unlimited, "unlimited rotation", f"a range of +-{half_range:g} m"),
         (half_limited, only_limit, f"a range of {2 * half_range:g} m"),
         (~_is_positive_and_finite(arm.velocity_limit), turning_speed, sliding_speed),
         (~_is_positive_and_finite(specified), rate_text, rate_text),
@@ -221,7 +222,7 @@ _MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0
 
 
 def check_arm_lengths(arm: ArmModel, where: str) -> None:
-    """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
+    """Raise DrakeTeleopError for implausible arm length, or distance of a mass from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum())
     rule = f"{_MIN_ARM_LENGTH_M:g} to {_MAX_ARM_LENGTH_M:g} m are plausible"
     remedy = f"give lengths in m ({rule}), and inertias in kg m^2"

@@ -1,6 +1,6 @@
 """Search and edits of joints in a parsed plant: welds, motors, and sticks for arms without shapes.
 
-The chain is the list of joints that carry the sensor, also welds, from the base outwards.
+The chain is the list of joints from the base outwards to the sensor, welds included.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def joints_by_child(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
 
 
 def chain_to_body(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
-    """Return the joints that carry a body, also welds, from the base outwards."""
+    """Return the joints between the base and a body, welds included, from the base outwards."""
     inboard, chain = joints_by_child(plant), list[Joint]()
     while body.index() in inboard:
         chain.append(inboard[body.index()])
@@ -56,14 +56,13 @@ def chain_to_body(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
 
 
 def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
-    """Return the bodies that a body carries through joints, the nearest first."""
+    """Return all bodies outboard of a body in the tree of joints, the nearest first."""
     joints = joints_by_child(plant).values()
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
     return near + [far for each in near for far in bodies_carried_by(plant, each)]
 
 
 def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
-    """Raise DrakeTeleopError unless the joints form a tree; Drake aborts on loops."""
     parents: dict[BodyIndex, Joint] = {}
     world = plant.world_body().index()
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -72,7 +71,7 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
             other, name = parents.get(child.index()), joint.name()
             parent = name if other is None else f"two joints, {other.name()} and {name}"
             what = f"link {child.name()} is the child of {parent}"
-            remedy = "an arm is a tree: make each link the child of one joint, the world of none"
+            remedy = "make each link the child of one joint, and the world the child of none"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         parents[child.index()] = joint
     for start in parents:
@@ -81,7 +80,7 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
             index = parents[index].parent_body().index()
             if index in passed:
                 what = f"its joints form a loop through {plant.get_body(index).name()}"
-                remedy = "an arm is a tree: cut the loop, or model the chain to the sensor alone"
+                remedy = "remove a joint of the loop, or model only the chain to the sensor"
                 raise DrakeTeleopError(what, where=where, remedy=remedy)
             passed.add(index)
 
@@ -89,7 +88,7 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
 def weld_base_and_find_chain(
     plant: MultibodyPlant, frame: Frame, X_WBase: RigidTransform | None, where: str
 ) -> list[Joint]:
-    """Weld a free base to the world at `X_WBase`; return the chain to `frame`.
+    """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
     A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
     """
@@ -117,12 +116,12 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
 
 
 def check_chain(chain: list[Joint], dependence_reasons: dict[str, str], where: str) -> None:
-    """Raise DrakeTeleopError if a joint of the chain has several axes or moves with another."""
+    """Raise DrakeTeleopError if a joint of the chain has several axes or depends on another."""
     for joint in chain:
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependence_reasons:
                 what = f"{name} {dependence_reasons[name]}"
-                remedy = "the arm up to the sensor has to be a chain of independent joints"
+                remedy = "make the joints up to the sensor independent of each other"
                 raise DrakeTeleopError(what, where=where, remedy=remedy)
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)) and joint.num_velocities() > 0:
             what = f"{joint.name()} is a {joint.type_name()} joint, which has several axes"
@@ -133,7 +132,7 @@ def check_chain(chain: list[Joint], dependence_reasons: dict[str, str], where: s
 def weld_held_joints(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld the joints named in `hold` at its positions [rad, m]; return notes for the user."""
+    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint."""
     known = {j.name(): j for j in map(plant.get_joint, joints) if j.num_velocities() > 0}
     for name, position in hold.items():
         joint = known.get(name)
@@ -143,7 +142,7 @@ def weld_held_joints(
             raise DrakeTeleopError(what, where="slave.hold", remedy=remedy)
         if joint.num_velocities() != 1:
             what = f"{name} is a {joint.type_name()} joint, which has no single position"
-            raise DrakeTeleopError(what, where="slave.hold", remedy="leave it out")
+            raise DrakeTeleopError(what, where="slave.hold", remedy="remove it from hold")
         lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         if lower < upper and not lower <= position <= upper:
             what = f"{name} at {position:g} is outside its limits, {lower:g} to {upper:g}"
@@ -156,7 +155,10 @@ def weld_held_joints(
 def weld_joints_outside_chain(
     plant: MultibodyPlant, joints_before: set[JointIndex], chain: list[Joint]
 ) -> list[str]:
-    """Weld moving joints in neither `joints_before` nor `chain`; return notes for the user."""
+    """Remove constraints, and weld moving joints outside `chain`; return notes for the user.
+
+    Joints in `joints_before`, which the plant had before the model was parsed, remain.
+    """
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     kept, names = joints_before | {joint.index() for joint in chain}, list[str]()
@@ -171,10 +173,10 @@ def weld_joints_outside_chain(
 def weld_load_of_link_to_sensor_frame(
     plant: MultibodyPlant, frame: Frame, chain: list[Joint]
 ) -> list[str]:
-    """Weld the other bodies on a link to a massless sensor body at the link's origin.
+    """Weld the other bodies on the sensor's link to the sensor body, so that they become load.
 
-    They become the load, as if the link were the sensor frame. If the sensor body is elsewhere on
-    the link, they remain on the robot's side; the returned list then has a note on them.
+    This applies if the sensor body is massless and welded to the link. If its origin is not that of
+    the link, the bodies remain part of the robot; the returned list then has a note on them.
     """
     X_LS = frame.GetFixedPoseInBodyFrame()
     for inboard in reversed(chain):
@@ -193,8 +195,8 @@ def weld_load_of_link_to_sensor_frame(
         if others and np.linalg.norm(X_LS.translation()) > _MAX_FRAME_OFFSET_M:
             names = join_names(sorted(joint.child_body().name() for joint in others))
             mass = sum(_carried_mass(plant, joint.child_body()) for joint in others)
-            what = f"on the robot's side of {frame.name()}: {names} of the model, {mass:.4g} kg"
-            return [f"{what} (beyond the sensor with sensor_frame {link.name()})"]
+            what = f"not part of the load at {frame.name()}: {names} of the model, {mass:.4g} kg"
+            return [f"{what} (part of the load with sensor_frame {link.name()})"]
         for joint in others:
             name, frame_M = joint.name(), joint.frame_on_child()
             X_SM = X_LS.inverse() @ joint.frame_on_parent().GetFixedPoseInBodyFrame() @ joint.X_FM()
@@ -237,9 +239,9 @@ def _default_joint_pose(joint: Joint) -> RigidTransform:
 def set_one_actuator_per_joint(
     plant: MultibodyPlant, moving: list[Joint], limits: dict[str, float] | None
 ) -> None:
-    """Give each of the joints `moving` one actuator, in this order.
+    """Give each of the joints `moving` exactly one actuator, in this order.
 
-    `limits` contains effort limits by joint; joints without an entry are unlimited. None keeps
+    `limits` maps joint names to effort limits; joints without an entry are unlimited. None keeps
     the limits of existing actuators. Actuators of other joints remain.
     """
     data = {joint.index(): (np.inf, 0.0, 1.0) for joint in moving}
@@ -260,7 +262,6 @@ def set_one_actuator_per_joint(
 def set_torque_limits(
     plant: MultibodyPlant, arm: ModelInstanceIndex, limits: dict[str, float]
 ) -> None:
-    """Replace the effort limits of the named joints; raise DrakeTeleopError for an unknown one."""
     motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     known = {each.joint().name(): each for each in motors if each.model_instance() == arm}
     for name, limit in limits.items():
@@ -276,7 +277,7 @@ def add_rotor_inertias(
 ) -> list[str]:
     """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
 
-    Links beyond the next joint count too if only `auxiliary_bodies`, not of the model, are between.
+    Its links extend to the next joint that is not on `auxiliary_bodies`, which the repair added.
     """
     inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(chain, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -314,8 +315,8 @@ def _length_of_moving_chain_m(chain: list[Joint], frame: Frame) -> float:
     joints = list(dropwhile(lambda joint: joint.num_velocities() == 0, chain))
     length, ends = 0.0, [*(joint.frame_on_parent() for joint in joints[1:]), frame]
     for joint, end in zip(joints, ends, strict=False):
-        way = _origin_in_body(end) - _origin_in_body(joint.frame_on_child())
-        length += float(np.linalg.norm(way))
+        segment = _origin_in_body(end) - _origin_in_body(joint.frame_on_child())
+        length += float(np.linalg.norm(segment))
         if isinstance(joint, WeldJoint):
             length += float(np.linalg.norm(joint.X_FM().translation()))
     return length
@@ -326,7 +327,7 @@ def _origin_in_body(frame: Frame) -> Array:
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
-    """Add a stick as visual shape to links without visuals, from joint to joint or to S."""
+    """Add a visual stick to each arm link without visuals, from its joint to the next or to S."""
     p_BEnd = _origin_in_body(sensor_frame)
     for joint in reversed(chain_to_body(plant, sensor_frame.body())):
         start, frame = _origin_in_body(joint.frame_on_child()), joint.frame_on_parent()

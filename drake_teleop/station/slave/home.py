@@ -1,4 +1,4 @@
-"""Start posture of the arm, with the tool down."""
+"""Start posture of the arm, by default with the tool pointing down."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def q_with_tool_down(
     arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[Array, IkStatus]:
-    """Return joints (n,) [rad, m] for p_WS = `position` [m] and `R_WS`, and the `IkStatus`."""
+    """Return q (n,) [rad, m] for p_WS = `position`, `R_WS` (default: tool down), and `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _ELBOW_UP_POSTURE_RAD, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
@@ -47,9 +47,9 @@ def home_posture(arm: ArmModel, position: list[float]) -> Array:
     q, status = q_with_tool_down(arm, np.array(position))
     if status != IkStatus.OK:
         what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
-        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
+        remedy = "change it, or give joint positions of a reachable posture in slave.home"
         if has_closed_form(arm):
-            remedy = "move it nearer to (0.55, 0, 0.45)"
+            remedy = "choose a position nearer to (0.55, 0, 0.45)"
         raise DrakeTeleopError(what, where="slave.position", remedy=remedy)
     return q
 
@@ -69,7 +69,7 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
 
 
 def check_inertia_and_holding_torque(arm: ArmModel, q: Array) -> None:
-    """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
+    """Raise DrakeTeleopError if the mass matrix is singular or a motor cannot hold posture q."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
         what = "the mass matrix is singular: the links have too little inertia"
         remedy = "give masses and inertias of the links, or rotor inertias of the joints"

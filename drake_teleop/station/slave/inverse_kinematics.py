@@ -1,7 +1,7 @@
 """Closed-form inverse kinematics of the Staubli RX90 (Pieper 1968).
 
-At q = 0 the arm points up and S is parallel to W. With the wrist centre at (x, y, z) above the
-shoulder and rho its signed distance from the first axis:
+At q = 0 the arm points up and S is parallel to W. The wrist centre is at (x, y, z) above the
+shoulder, at the signed distance rho from the first axis. With arm lengths l2 and l3:
 
     rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
     R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6)."""
@@ -31,11 +31,12 @@ _JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 
 
 class IkStatus(IntEnum):
-    """Status of an inverse kinematics, whose search starts at the reference posture.
+    """Status of an inverse kinematics solution near a reference posture.
 
-    The numeric method reports a singularity only if it misses the pose: WRIST_SINGULAR if the last
-    three axes are nearly coplanar, otherwise SHOULDER_SINGULAR. With fewer than 6 joints it is
-    WRIST_SINGULAR, or OUT_OF_REACH if the position is missed by more than 1 mm.
+    The texts of the members describe the closed form. The numeric method reports a singularity only
+    if it misses the pose: WRIST_SINGULAR if the last three axes are nearly coplanar, otherwise
+    SHOULDER_SINGULAR. With fewer than 6 joints, a missed pose is WRIST_SINGULAR, or OUT_OF_REACH if
+    the position error exceeds 1 mm.
     """
 
     OK = 0
@@ -65,11 +66,11 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 def _ik_status_and_all_solutions_into(
     R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array
 ) -> int:
-    """Write all eight solutions for pose R, p to q (8, 6); return the `IkStatus`.
+    """Write all eight solutions for S at R, p to the rows of q (8, 6); return the `IkStatus`.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
-    q5 <= 0. Out of reach they are those of the nearest reachable wrist centre. At a singularity of
-    shoulder or wrist, `q1_kept` or `q4_kept` replaces the undetermined angle.
+    q5 <= 0. A wrist centre out of reach is replaced by the nearest reachable one. At a singularity
+    of shoulder or wrist, `q1_kept` or `q4_kept` replaces the undetermined angle.
     """
     status = _OK
     x = p[0] - WRIST_TO_S_M * R[0, 2]
@@ -128,7 +129,7 @@ def _ik_status_and_all_solutions_into(
 
 @njit(cache=True)
 def _wrap_angle_into_limits(angle: float, near: float, lower: float, upper: float) -> float:
-    """Return the angle plus full turns that is nearest to `near` within the limits, or nan."""
+    """Return the angle plus whole turns, nearest to `near` within the limits, or NaN if none is."""
     full_turn = 2.0 * np.pi
     angle += full_turn * np.round((near - angle) / full_turn)
     if angle > upper + _JOINT_LIMIT_TOLERANCE_RAD:
@@ -177,7 +178,7 @@ def _nearest_branch_into(
 def solve_pose_command(
     pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """Write the solution q (6,) for a pose X_WS (7,) nearest to `reference`; return `IkStatus`."""
+    """Write the solution of `nearest_branch` for pose X_WS (7,) to q (6,); return `IkStatus`."""
     w, x, y, z = pose[0], pose[1], pose[2], pose[3]
     norm = w * w + x * x + y * y + z * z
     k = 2.0 / norm if norm > 0.0 else np.nan
@@ -198,8 +199,9 @@ def nearest_branch(
 ) -> tuple[Array, IkStatus]:
     """Return the solution within the limits nearest to a reference (6,) [rad], and the `IkStatus`.
 
-    Each joint moves by `max_step` [rad] at most. Out of reach, the wrist centre is the nearest one
-    in reach. Without a solution the reference is returned, within the limits.
+    Solutions in which a joint is over `max_step` [rad] from the reference are discarded. A wrist
+    centre out of reach is replaced by the nearest one in reach. Without a solution, the reference,
+    clipped to the limits, is returned.
     """
     q = np.empty(6)
     # Drake's matrices are stored by columns; one layout avoids a second compilation.
@@ -223,7 +225,8 @@ def has_closed_form(arm: ArmModel) -> bool:
 class InverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions in closed form.
 
-    At a joint limit the command stays and does not jump to another solution (`MAX_JOINT_JUMP_RAD`).
+    If each solution violates a joint limit or is over `MAX_JOINT_JUMP_RAD` from the measured
+    positions, it outputs the measured positions, clipped to the limits.
 
     .. pydrake_system::
 
@@ -232,7 +235,7 @@ class InverseKinematics(LeafSystem):
         - pose_command: (7,) X_WS
         - joint_position: (n,) measured positions [rad]
         output_ports:
-        - joint_command: (n,) nearest solution [rad]
+        - joint_command: (n,) solution nearest to joint_position [rad]
         - ik_status: an `IkStatus`
     """
 

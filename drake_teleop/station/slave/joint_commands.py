@@ -39,7 +39,7 @@ _JOINT_RANGE_TOLERANCE_SHARE = 0.01
 
 
 def used_ik_method(name: str, arm: ArmModel) -> str:
-    """Return the key in `IK_METHODS` for setting `name`; DrakeTeleopError if the arm has none."""
+    """Return the `IK_METHODS` key of setting `name`; raise DrakeTeleopError if the arm lacks it."""
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
@@ -89,7 +89,7 @@ class LeaderJointFollower(LeafSystem):
 
 
 class ExcitationCommand(LeafSystem):
-    """Block that commands one period of an excitation trajectory from `start` [s], else rest."""
+    """Block that commands one period of a trajectory from `start` [s], and holds its ends."""
 
     __slots__ = NO_EXTRA_SLOTS
 
@@ -105,9 +105,9 @@ class ExcitationCommand(LeafSystem):
 
 
 class JointRangeMonitor(LeafSystem):
-    """Block that raises DrakeTeleopError if a joint is over 1 % of its range beyond its limit.
+    """Block that raises DrakeTeleopError if a joint exceeds its limit by over 1 % of its range.
 
-    Its output `ik_status` is the input at the last sample.
+    The output `ik_status` is the input `ik_status` at the last sample.
     """
 
     __slots__ = NO_EXTRA_SLOTS

@@ -1,7 +1,7 @@
 """Joint control of the slave: computed torque (paper, VI-A), or the position interface of an arm.
 
 Position interface (docs/station.md):
-command --[dead time, held]--> target --[generator]--> reference r --[drives]--> torque
+command --[dead time, hold]--> target --[generator]--> reference r --[drives]--> torque
 
 d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))
 d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
@@ -24,26 +24,26 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 # Memory of a position interface: periods since the last command, index of the oldest command in
 # the queue; then target, r and dr/dt (n each), and the queue of commands.
 _PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
-_TWICE_DECELERATION_SHARE = 2 * 0.8  # braking v^2 = 2 a d with 80 % of the largest acceleration
+_BRAKING_ACCELERATION_SHARE = 0.8  # of the limit a, in the braking speed v^2 = 2 a d
 COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 
 
 @settings
 @dataclass
 class PositionInterface:
-    """Settings of the position interface of an arm; m instead of rad for prismatic joints."""
+    """Settings of an arm's interface for position commands; prismatic joints have m, not rad."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
-    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time; whole periods of command_hz")
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time, rounded to periods of command_hz")
     acceleration_per_error: float = quantity(
         300.0, "1/s^2", 1.0, 1e7, "acceleration per position error"
     )
-    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a steady motion")
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "delay behind a command of constant speed")
     max_speed: float = quantity(
         math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
     )
     max_acceleration: float = quantity(
-        40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
+        40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit of each joint, unless the model's is lower"
     )
     drive_bandwidth_hz: float = quantity(
         30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"
@@ -55,7 +55,7 @@ class PositionInterface:
         if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
             commands = f"command_hz, {self.command_hz:g} Hz"
             what = f"rates.joint_control_hz, {rate:g} Hz, is no multiple of {commands}"
-            remedy = "choose a rate of the joint control that is a multiple of it"
+            remedy = "set rates.joint_control_hz to a multiple of command_hz"
             raise DrakeTeleopError(what, where=f"{where}.command_hz", remedy=remedy)
         damping = self.acceleration_per_error * self.lookahead / rate
         if damping + 0.5 * self.acceleration_per_error / rate**2 > 1.5:  # unstable from 2
@@ -99,7 +99,7 @@ class JointControlConfig:
         " position for the fields of `interface`",
     )
     interface: PositionInterface | None = plain(
-        None, "values in place of those of the servo; null: the servo's"
+        None, "position interface that replaces that of the servo; null: the servo's"
     )
 
     @property
@@ -126,8 +126,8 @@ class JointControlConfig:
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE_SERVO_NAME and self.interface is not None:
-            what = "the servo computed_torque has bandwidths, but no position interface"
-            remedy = "leave it out, or choose another servo, such as position"
+            what = "the servo computed_torque has no position interface, only bandwidths"
+            remedy = "remove this field, or choose another servo, such as position"
             raise DrakeTeleopError(what, where=f"{where}.interface", remedy=remedy)
         interface = self.position_interface
         if interface is not None:
@@ -142,7 +142,6 @@ class JointControlConfig:
                 raise DrakeTeleopError(what, where=f"{where}.{name}", remedy=remedy)
 
     def require_computed_torque(self, caller: str) -> None:
-        """Raise DrakeTeleopError unless the servo is computed torque; `caller` names the caller."""
         if self.servo != COMPUTED_TORQUE_SERVO_NAME:
             what = f"{caller} does not support the servo {self.servo}"
             hz = 1 / (2 * np.pi * self.tracking_delay_s)
@@ -155,9 +154,9 @@ class JointControlConfig:
 def computed_torque_into(table, command, state, kp, kv, speed_limit, effort_limit, scratch, torque):
     """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
 
-    ID is the inverse dynamics, `state` [q; v]; clip keeps within `speed_limit`, and tau is within
-    `effort_limit`. Invalid encoder readings give gravity compensation at the commanded posture; an
-    invalid command keeps the last torque.
+    ID is the inverse dynamics, `state` [q; v]. The joint speed kp (q_command - q) is clipped to
+    `speed_limit`, and tau to `effort_limit`. Invalid encoder readings give gravity compensation at
+    the commanded posture. An invalid command leaves the torque unchanged.
     """
     if not are_valid_port_values(command):
         return
@@ -178,14 +177,14 @@ def computed_torque_into(table, command, state, kp, kv, speed_limit, effort_limi
 def servo_gains_and_limits(
     arm: ArmModel, config: JointControlConfig
 ) -> tuple[float, float, Array, Array]:
-    """Return position and velocity gain [1/s] and (n,) limits of joint speed and torque."""
+    """Return position and velocity gain [1/s], and (n,) limits of joint speed and torque."""
     kp, kv = 2 * np.pi * config.position_bandwidth_hz, 2 * np.pi * config.velocity_bandwidth_hz
     return kp, kv, arm.velocity_limit, arm.effort_limit
 
 
 @njit(cache=True)
 def _advance_joint_reference(command, interface, limits, memory, reference):
-    """Accept the command (n,) [rad] if one is due, and advance the reference by one period.
+    """Read the command (n,) [rad] if one is due, and advance the reference by one period.
 
     Args:
         interface: (6,) period [s], acceleration per error [1/s^2], lookahead [s], drive bandwidth
@@ -194,29 +193,31 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
         memory: updated, see `_PERIODS_SINCE_COMMAND_INDEX`.
         reference: (3, n) output: reference position, velocity, acceleration.
     """
-    period, gain, lookahead, _, every, queued = interface
+    period, gain, lookahead, _, periods_per_command, queue_length = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
     if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and are_valid_port_values(command):
-        if queued > 0.0:
+        if queue_length > 0.0:
             place = 2 + 3 * n + int(memory[_OLDEST_QUEUED_INDEX]) * n
             copy_into(target, 0, memory, place, n)
             copy_into(memory, place, command, 0, n)
-            memory[_OLDEST_QUEUED_INDEX] = (memory[_OLDEST_QUEUED_INDEX] + 1.0) % queued
+            memory[_OLDEST_QUEUED_INDEX] = (memory[_OLDEST_QUEUED_INDEX] + 1.0) % queue_length
         else:
             copy_into(target, 0, command, 0, n)
-    memory[_PERIODS_SINCE_COMMAND_INDEX] = (memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0) % every
+    periods = memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0
+    memory[_PERIODS_SINCE_COMMAND_INDEX] = periods % periods_per_command
     for i in range(n):
-        away = target[i] - r[i]
-        fastest = min(limits[0, i], math.sqrt(_TWICE_DECELERATION_SHARE * limits[1, i] * abs(away)))
-        towards = min(max(away / lookahead, -fastest), fastest)
-        wanted = gain * lookahead * (towards - speed[i])
-        wanted = min(max(wanted, -limits[1, i]), limits[1, i])
-        faster = min(max(speed[i] + period * wanted, -limits[0, i]), limits[0, i])
+        error = target[i] - r[i]
+        braking = math.sqrt(2.0 * _BRAKING_ACCELERATION_SHARE * limits[1, i] * abs(error))
+        max_speed = min(limits[0, i], braking)
+        setpoint = min(max(error / lookahead, -max_speed), max_speed)
+        acceleration = gain * lookahead * (setpoint - speed[i])
+        acceleration = min(max(acceleration, -limits[1, i]), limits[1, i])
+        next_speed = min(max(speed[i] + period * acceleration, -limits[0, i]), limits[0, i])
         reference[0, i], reference[1, i] = r[i], speed[i]
-        reference[2, i] = (faster - speed[i]) / period
-        speed[i] = faster
-        r[i] += period * faster
+        reference[2, i] = (next_speed - speed[i]) / period
+        speed[i] = next_speed
+        r[i] += period * next_speed
 
 
 @njit(cache=True)
@@ -225,23 +226,24 @@ def position_servo_torque_into(
 ):  # fmt: skip
     """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
 
-    `state` is [q; v], `scratch` (6, n). An invalid command is replaced by the last one. If encoder
-    readings are invalid, the torque compensates gravity.
+    `state` is [q; v], `scratch` (6, n), other arguments as in `_advance_joint_reference`. An
+    invalid command is replaced by the last one. If encoder readings are invalid, the torque
+    compensates gravity at the reference.
     """
     n = torque.shape[0]
     _advance_joint_reference(command, interface, limits, memory, scratch)
-    q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
+    q, v, acceleration, w = scratch[3], scratch[4], scratch[5], interface[3]
     if are_valid_port_values(state):
         copy_into(q, 0, state, 0, n)
         copy_into(v, 0, state, n, n)
         for i in range(n):
-            wanted[i] = scratch[2, i]
-            wanted[i] += 2.0 * w * (scratch[1, i] - v[i]) + w * w * (scratch[0, i] - q[i])
+            acceleration[i] = scratch[2, i]
+            acceleration[i] += 2.0 * w * (scratch[1, i] - v[i]) + w * w * (scratch[0, i] - q[i])
     else:
         copy_into(q, 0, scratch[0], 0, n)
         v[:] = 0.0
-        wanted[:] = 0.0
-    inverse_dynamics(table, q, v, wanted, torque)
+        acceleration[:] = 0.0
+    inverse_dynamics(table, q, v, acceleration, torque)
     for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
@@ -249,7 +251,7 @@ def position_servo_torque_into(
 def _interface_constants_and_memory(
     arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
 ) -> tuple[tuple[Array, ...], Array]:
-    """Return the last arguments of `position_servo_torque_into`; `period` is the drives' [s]."""
+    """Return the constant arguments and the initial memory of `position_servo_torque_into`."""
     n, queued = arm.num_joints, round(interface.dead_time * interface.command_hz)
     gains = interface.acceleration_per_error, interface.lookahead
     drives = 2 * np.pi * interface.drive_bandwidth_hz
@@ -263,7 +265,7 @@ def _interface_constants_and_memory(
 
 
 class JointControl(LeafSystem):
-    """Block that controls joint positions by the servo of the settings, at a fixed period [s].
+    """Block that controls joint positions by the configured servo, at a fixed period [s].
 
     While encoder readings are invalid, the motors only compensate gravity. `q_start` is the posture
     held before the first sample.
@@ -307,7 +309,7 @@ class JointControl(LeafSystem):
 
 
 class HeldTorque(LeafSystem):
-    """Block that holds a requested motor torque for a period, within the limits.
+    """Block that samples a requested motor torque, clips it to limits, holds it for a period.
 
     An invalid request keeps the last torque; the first torque holds `q_start` against gravity.
     """
@@ -353,9 +355,9 @@ def servo_impedance(
 ) -> tuple[list[float], list[float], list[float]]:
     """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.
 
-    The servo is then the wrench K (x_command - x) - D v, for translation and rotation. Mass m and
-    inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is that of the
-    largest eigenvalues of its two blocks, their size the smallest possible.
+    The first number is for translation, the second for rotation. The servo acts as the wrench K
+    (x_command - x) - D v. Mass m and inertia J are the smallest that satisfy diag(m, m, m, J, J, J)
+    >= Lambda (`operational_inertia`) in the ratio of the largest eigenvalues of its two blocks.
     """
     config.require_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)

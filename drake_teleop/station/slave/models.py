@@ -26,7 +26,7 @@ from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRep
 from drake_teleop.station.slave.model.urdf_and_sdf_repair import repair_sdf, repair_urdf
 
 _XACRO_FAULT = "is a xacro file, not a model"
-_XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the URDF that comes out"
+_XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the resulting URDF"
 _UNUSED_XACRO_TAGS = ("xacro:property", "xacro:arg")  # of no effect without ${...} and $(...)
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 # Remedies for missing packages.
@@ -36,13 +36,12 @@ _SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
 _DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
 _PLACE_IN_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
+_MAX_SEPARATORS_LENGTH = 30  # " ... " and separators of the error line
 
 
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> tuple[list[ModelInstanceIndex], ModelRepair]:
-    """Repair a model file and parse it into a plant; return the added instances and the repair."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
@@ -125,7 +124,7 @@ def _remove_unused_xacro_elements(model: ModelRepair) -> None:
 
 
 class ParsedArm(NamedTuple):
-    """Arm that was parsed into a plant."""
+    """Arm in a plant; `assumptions` are texts about assumed or repaired data."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -142,9 +141,9 @@ def ParseModel(
 ) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    A free base is welded to the world at `X_WBase`, the joints `hold` at the given positions
-    [rad, m], and other joints, such as a gripper's, at their defaults. Unreadable or contradictory
-    models raise DrakeTeleopError.
+    S is `sensor_frame`. A free base is welded to the world at `X_WBase`. Joints in `hold` are
+    welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at their
+    defaults. Unreadable or contradictory models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
@@ -196,10 +195,10 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> None:
-    """Parse the surroundings of an arm."""
+    """Parse surroundings into a plant; raise DrakeTeleopError for mimic joints, floating links."""
     _, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():
-        remedy = "correct it; every object that the tool could touch must be readable"
+        remedy = "remove this dependence; surroundings need independent joints and links"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
 
 
@@ -221,7 +220,7 @@ def _find_sensor_frame(
 def translate_drake_errors(
     path: Path, folder: str = "", *, is_scene: bool = False
 ) -> Iterator[None]:
-    """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
+    """Convert Drake's exceptions in this context to a DrakeTeleopError that names the model file.
 
     Messages name the original files instead of repaired copies in `folder`.
     """
@@ -238,7 +237,7 @@ def translate_drake_errors(
         what = f"cannot be read as a {'scene' if is_scene else 'robot'}"
         packages = _SCENE_PACKAGE_REMEDY if is_scene else _ROBOT_PACKAGE_REMEDY
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {packages}"
-        room = MAX_ERROR_LINE_LENGTH - _NUM_SEPARATOR_CHARS - len(f"{path}{what}{remedy}")
+        room = MAX_ERROR_LINE_LENGTH - _MAX_SEPARATORS_LENGTH - len(f"{path}{what}{remedy}")
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None
@@ -246,7 +245,7 @@ def translate_drake_errors(
 
 @contextmanager
 def raise_logged_errors() -> Iterator[None]:
-    """Raise RuntimeError if Drake logs an error, or a warning about an inertia."""
+    """Raise RuntimeError at the end if Drake logged an error or a message about an inertia."""
     errors: list[str] = []
 
     def collect_error_message(record: logging.LogRecord) -> bool:

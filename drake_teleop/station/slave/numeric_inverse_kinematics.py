@@ -1,9 +1,10 @@
 """Numeric inverse kinematics of any serial arm within limits of position and speed.
 
-Levenberg-Marquardt steps minimize ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]``. Joints that the error
-pushes against a limit are fixed (active set). If the smallest singular value sigma of the Jacobian
-(rotations times L) is below ``s = MIN_SINGULAR_VALUE_M``, `follow_pose` adds damping
-``lambda^2 = s^2 - sigma^2`` (Chiaverini, Siciliano, Egeland 1994)."""
+Levenberg-Marquardt steps minimize ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]`` with the length L of
+`orientation_weight_m`. Joints that the error pushes against a limit are fixed (active set). If the
+smallest singular value sigma of the Jacobian (rotation rows times L) is below
+``s = MIN_SINGULAR_VALUE_M``, `follow_pose` adds damping ``lambda^2 = s^2 - sigma^2`` (Chiaverini,
+Siciliano, Egeland 1994)."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ _MIN_STEP_DAMPING_M2 = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-3, 100, 100
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_ZERO_GRADIENT_RATIO_M = 1e-3
+_MIN_GRADIENT_RATIO_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
 _MAX_POSE_ERROR_AT_SINGULARITY_M = 5e-6
 # The same for `find_posture`, which stops the search earlier [m].
@@ -56,7 +57,7 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 @njit(cache=True)
 def _pose_error_into(table, L, pose, q, x, J, e, Jt_e):
-    """Write Jacobian J (6, n), pose error e (6,) at q and J^T e (n,) to `Jt_e`; return |e|^2.
+    """Write Jacobian J (6, n), pose error e (6,) and J^T e (n,), to `Jt_e`, at q; return |e|^2.
 
     Rotations are multiplied by L.
     """
@@ -79,7 +80,8 @@ def _pose_error_into(table, L, pose, q, x, J, e, Jt_e):
 
 
 @njit(cache=True)
-def _smaller_gram_matrix_into(J, H):
+def _gram_matrix_of_size_into(J, H):
+    """Write J^T J or J J^T to H (m, m), whichever has this size."""
     n = H.shape[0]
     A = J if n == J.shape[1] else J.T
     for i in range(n):
@@ -118,10 +120,7 @@ def _is_joint_held_at_limit(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
-    """Write q plus a damped step to trial (n,); return the largest joint displacement.
-
-    Joints that would pass a limit are fixed there, and the step of the others is solved again.
-    """
+    """Write q plus a damped step to `trial` (n,); return the largest joint displacement."""
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):
@@ -166,7 +165,7 @@ def _wrist_or_shoulder_status(L, J):
 def follow_pose(
     table, L, pose, reference, lower, upper, max_step, posture, pull, min_singular_value, steps, q
 ):
-    """Write joint positions q (n,) near a reference that meet a pose; return the `IkStatus`.
+    """Write joint positions q (n,) near a reference that bring S to a pose; return the `IkStatus`.
 
     Args:
         table: `ArmModel.table`.
@@ -205,7 +204,7 @@ def follow_pose(
             q[i] = min(max(q[i] + step, low[i]), high[i])
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
     squared = _pose_error_into(table, L, pose, q, x, J, e, push)
-    _smaller_gram_matrix_into(J, B)
+    _gram_matrix_of_size_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, missed, expected_gain = np.inf, 0.0, 0.0
     limit = _MAX_POSITION_ERROR_WITH_FEW_JOINTS_M if n < 6 else _MAX_POSE_ERROR_AT_SINGULARITY_M
@@ -217,7 +216,7 @@ def follow_pose(
             if is_met or stalled_steps > 3 or relative_damping > 1e9:
                 break
             if better:
-                _smaller_gram_matrix_into(J, H)
+                _gram_matrix_of_size_into(J, H)
                 for i in range(n):
                     g[i] = damping * (anchor[i] - q[i]) + push[i]
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
@@ -262,7 +261,7 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        zero_gradient = _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared
+        zero_gradient = _MIN_GRADIENT_RATIO_M * _MIN_GRADIENT_RATIO_M * squared
         if min_singular_value > 0.0 and free > zero_gradient:
             return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before, missed = squared, vectors.dot(p, p) if n < 6 else squared
@@ -284,11 +283,10 @@ def follow_pose(
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
-    """Return joint positions (n,) that meet the pose X_WS (7,), and the `IkStatus`.
+    """Return joint positions (n,) that bring S to the pose X_WS (7,), and the `IkStatus`.
 
     The search starts at the reference (n,). Without a solution, the positions nearest to the pose
     are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the status of a singularity.
-    Rotation errors are multiplied by `orientation_weight_m`.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts

@@ -38,7 +38,7 @@ from drake_teleop.station.slave.surroundings import (
 )
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
-_SHARED_TIP_DISTANCE_M = 1e-3
+_TIP_END_TOLERANCE_M = 1e-3
 _NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
@@ -51,7 +51,7 @@ class SlavePlant:
     Attributes:
         plant: continuous MultibodyPlant, finalized.
         instance: model instance of the arm's joints.
-        tool: index of the tool's body on the sensor.
+        tool: index of the tool's body that is welded to the sensor.
         arm: arm up to S, with all bodies beyond S as its load.
         start: (n,) joint positions at the start [rad].
         X_WS_start: (7,) pose at the start [qw qx qy qz px py pz].
@@ -76,9 +76,9 @@ class SlavePlant:
     def physics_of_plant(self) -> tuple[Array, ...]:
         """Argument `physics` of `contact_and_plant_rates_into`.
 
-        It contains the arm's table with dry friction, and the load in this table, which a grasp
-        changes. Then follow pairs of shapes in contact, the sheet spring's leaf, joints of moving
-        bodies, and an empty array of given wrenches.
+        Its arrays are: `ArmModel.table` with dry friction; the load in this table, which a grasp
+        changes; compiled pairs of shapes; parameters of the sheet spring's leaf; joints of moving
+        bodies; an empty array of given wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, DRY_FRICTION_COLUMN] = self.joint_friction
@@ -88,7 +88,7 @@ class SlavePlant:
 
     @property
     def ports(self) -> dict[str, OutputPort]:
-        """Output ports of the plant by the names of the input ports of other blocks."""
+        """Output ports of the plant, keyed by the names of the input ports that they feed."""
         plant, leaf = self.plant, self.contact.leaf_instance
         ports = {
             "slave_state": plant.get_state_output_port(self.instance),
@@ -108,12 +108,11 @@ class SlavePlant:
 
     @property
     def compiled_sheet_instance(self) -> ModelInstanceIndex | None:
-        """`contact.leaf_instance` if the compiled law computes its contact, else None."""
+        """Model instance of the leaf if the compiled law computes its contact, else None."""
         return None if self.contact.drake_contact_reason else self.contact.leaf_instance
 
     @property
     def p_WTip_start(self) -> Array:
-        """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
         X_WS = RigidTransform(Quaternion(start[:4] / np.linalg.norm(start[:4])), start[4:])
         return X_WS @ self.tip
@@ -131,7 +130,7 @@ def NominalSlave(slave: Slave) -> SlavePlant:
 
 
 class HashableByValue:
-    """Hashable copy of settings, equal to copies with equal values and unchanged files."""
+    """Hashable copy of settings; copies with equal values and unchanged files are equal."""
 
     def __init__(self, value: Any, files: list[Path]) -> None:
         written = [path.stat().st_mtime_ns for path in files]
@@ -208,7 +207,7 @@ class ParsedSlave(NamedTuple):
     assumptions: tuple[str, ...]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
-        """Return the arm, after the plant is finalized, and the assumptions about its limits."""
+        """Return the arm of the finalized plant, with default limits, and texts about these."""
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
@@ -248,7 +247,6 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
 
 
 def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
-    """Finalize a continuous plant without Drake's warnings about joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
     for joint, (lower, upper) in zip(joints, limits, strict=True):
@@ -290,9 +288,9 @@ def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
 def hull_points_of(
     inspector: geometry.SceneGraphInspector, identifier: geometry.GeometryId
 ) -> Array:
-    """Return points (k, 3) on the convex hull of a shape, in its body's frame [m].
+    """Return points (k, 3) [m] whose convex hull approximates a shape, in its body's frame.
 
-    A half space has none, a round shape those of a polyhedron in it.
+    Points of a round shape are the vertices of an inscribed polyhedron; a half space has none.
     """
     shape = inspector.GetShape(identifier)
     if isinstance(shape, (geometry.Mesh, geometry.Convex)):
@@ -342,7 +340,7 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
     if not hulls:
         return arm.phi_load[1:4] / arm.phi_load[0]
     reach = max(hull[:, 2].max() for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_END_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
@@ -350,7 +348,7 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
 def read_arm_without_default_limits(
     model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()
 ) -> ArmModel:
-    """Return the arm in a model file, without default limits, or raise DrakeTeleopError."""
+    """Return the arm in a model file, with infinite limits where the file has none."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)

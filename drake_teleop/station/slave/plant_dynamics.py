@@ -1,7 +1,8 @@
 """Dynamics of arm, leaf and contact inside a time step: compiled, or with Drake's contact results.
 
-The state is x = [q, leaf deflection, v, its rate], then the plant's [q; v] if other bodies move.
-The compiled contact law covers spheres on boxes, Drake's all shapes and contact models."""
+The state x is [q, leaf deflection, v, leaf speed], then the plant's [q; v] if other bodies move.
+The compiled contact law covers spheres on boxes; Drake's law covers all shapes and contact models.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +95,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
 
 @njit(cache=True)
 def _place_box_at_body(pair, bodies, placed):
-    """Return a pair with its box at the present pose of the body, as `placed` (28,) if it moves."""
+    """Return the pair, with a moving box at its present pose; `placed` (28,) is memory for that."""
     if pair[BOX_BODY_ROW_COLUMN] < 0.0:
         return pair
     body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
@@ -110,7 +111,10 @@ def _place_box_at_body(pair, bodies, placed):
 
 @njit(cache=True)
 def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
-    """Return a code `PROXIMITY_...`; `pairs` and `monitored_pairs` are those of `ShapePairs`."""
+    """Return PROXIMITY_NEAR_MONITORED, PROXIMITY_TOUCHING or PROXIMITY_FAR, the first that applies.
+
+    The tool is near within 2 cm of one of `monitored_pairs`, and touches one of `pairs`.
+    """
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
@@ -137,7 +141,7 @@ def add_force_to_wrench(wrench_W, p_WC, force_W):
 class ToolContact(LeafSystem):
     """Block that outputs the environment's wrench (6,) on the tool about the world's origin.
 
-    Its ports sheet_state [z; v_z] and plant_state [q; v] exist only with a leaf or other moving
+    The port sheet_state [z; v_z] exists only with a leaf, plant_state [q; v] only with other moving
     bodies.
     """
 
@@ -167,7 +171,7 @@ class ToolContact(LeafSystem):
 
 @njit(cache=True)
 def assemble_plant_state_into(state, surroundings, x):
-    """Write x from `state` [q; v] and `surroundings` [leaf deflection, rate, plant's q; v]."""
+    """Write x from `state` [q; v] and `surroundings` [leaf deflection, its rate, plant's q; v]."""
     n = state.shape[0] // 2
     copy_into(x, 0, state, 0, n)
     copy_into(x, n + 1, state, n, n)
@@ -177,9 +181,10 @@ def assemble_plant_state_into(state, surroundings, x):
 
 @njit(cache=True)
 def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot (2 n + 2,) of the state x, and the contact wrench.
+    """Write the time derivative xdot (2 n + 2,) of the state x, and the contact wrench about Wo.
 
-    `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m].
+    `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m], `applied_W` (6,)
+    a wrench that is added, about So.
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
@@ -196,9 +201,10 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
 
 @njit(cache=True)
 def _copy_or_request_wrench(given, x, wrench_W):
-    """Copy the next wrench of `given` to `wrench_W` and return True; without one write a request.
+    """Copy the next given wrench to `wrench_W` and return True; if none is left, return False.
 
-    `given` is empty, or has a row [number given, number used, x of the request] and then wrenches.
+    `given` is empty, or a header and then wrenches (6,). The header contains the number of
+    wrenches, the number of calls, and the state x at which the first missing wrench is required.
     """
     if given.shape[0] == 0:
         return False
@@ -214,7 +220,7 @@ def _copy_or_request_wrench(given, x, wrench_W):
 
 @njit(cache=True)
 def plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write xdot under the contact wrench `wrench_W`, see `contact_and_plant_rates_into`."""
+    """Write xdot of `contact_and_plant_rates_into` for the given contact wrench `wrench_W` (6,)."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
@@ -253,7 +259,7 @@ def contact_wrench_W(
 
 
 class DrakeContact(LeafSystem):
-    """Block that outputs the contact wrench on the tool from the plant's contact results."""
+    """Block that outputs `contact_wrench_W` (6,) on the tool from the plant's contact results."""
 
     __slots__ = NO_EXTRA_SLOTS
 

@@ -1,8 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
-Collision shapes count, or visual shapes of a body without them; meshes count as convex hulls.
-As in MoveIt's setup assistant, bodies may overlap that a joint or a telescope connects, or that
-overlap in nearly all random postures; an assumption lists the latter.
+Collision shapes count, or visual shapes of a body without them; meshes count as convex hulls. As in
+MoveIt's setup assistant, overlaps are ignored if a joint or a telescope connects the bodies, or if
+nearly all random postures have them; an assumption lists the latter.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class PostureShapes:
     """Shapes of a slave and its surroundings in a plant, for overlaps at any joint positions.
 
     Args:
-        sticks: whether an arm without shapes gets sticks.
+        sticks: whether an arm without shapes gets sticks as shapes.
 
     Attributes:
         assumptions: texts about data that the models do not have.
@@ -105,7 +105,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
-        """Return pairs of overlapping bodies with their distance [m], negative by the depth.
+        """Return pairs of overlapping bodies with their signed distance [m] (minus the depth).
 
         Pairs that nearly always overlap are left out.
         """
@@ -118,7 +118,7 @@ class PostureShapes:
         return np.vstack([np.zeros((0, 3)), *hulls])
 
     def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return hull points (k, 3) in W [m] of a body's collision or, if any, `visual` shapes."""
+        """Return hull points (k, 3) in W [m] of each collision shape, or `visual` shape if any."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [hull_points_of(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -182,7 +182,7 @@ class PostureShapes:
 
 
 def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return joint limits (n,); +-pi replaces infinite ones, and both of a range beyond both."""
+    """Return finite lower and upper limits (n,): +-pi if infinite, or if beyond both -pi and pi."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -207,7 +207,7 @@ def _cached_overlap_texts(key: HashableByValue) -> tuple[tuple[str, ...], tuple[
 
 
 def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list[str]:
-    """Return a warning for each pair of overlapping bodies, with `slave_only` of the slave only."""
+    """Return a warning per pair of overlapping bodies; `slave_only` omits the surroundings."""
     found = []
     for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
@@ -224,7 +224,7 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
 def _complete_and_bound_collision_shapes(
     plant: MultibodyPlant, scene_graph: geometry.SceneGraph
 ) -> None:
-    """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
+    """Add visual shapes as missing collision shapes of bodies; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     """

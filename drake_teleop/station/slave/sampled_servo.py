@@ -31,7 +31,7 @@ _MIN_SERVO_EVENT_HZ = 2000.0
 
 
 def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
-    """Return how many servo samples an event may contain, with events at 2 kHz or more.
+    """Return the largest number of servo samples per event that keeps events at 2 kHz or more.
 
     Each sample of the haptic device remains an event. Arguments are rates [Hz].
     """
@@ -55,7 +55,8 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
         servo: gains and limits from `servo_gains_and_limits`.
         physics: `SlavePlant.physics_of_plant`.
         period: period of the servo [s].
-        line: (3 n,) output: torque now [N m], its rate [N m/s], torque of the last sample [N m].
+        line: (3 n,) output: torque now [N m], its rate [N m/s], torque at the last predicted
+            sample [N m].
     """
     n = command.shape[0]
     kp, kv, speed_limit, effort_limit = servo

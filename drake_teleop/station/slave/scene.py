@@ -29,9 +29,9 @@ class Scene(Environment):
     )
     position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "free roots' position in W")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of free roots of the file"
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W of free roots"
     )
-    fixed: bool = plain(True, "weld free roots of the file there; false: they float")
+    fixed: bool = plain(True, "weld free roots at this pose; false: they float")
     contact: str = choice(
         "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
     )

@@ -1,7 +1,4 @@
-"""Settings of the slave in a scenario: arm, base pose, start, tool and payload.
-
-The tool is the paper's, from a model file, or from mass, inertia and shapes.
-"""
+"""Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
 
 import math
 from dataclasses import dataclass, field
@@ -22,14 +19,14 @@ from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.models import ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
-_REPLAY_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
+_TOOL_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _TOOL_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
 
 @settings
 @dataclass
 class Ball:
-    """Ball of the tool, with contact."""
+    """Ball as collision shape of the tool."""
 
     radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "centre of the shape, in S")
@@ -46,7 +43,7 @@ class Ball:
 @settings
 @dataclass
 class Block:
-    """Box of the tool, with contact."""
+    """Box as collision shape of the tool."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "centre of the shape, in S")
@@ -58,7 +55,7 @@ class Block:
 
     @property
     def half_extent_along_z(self) -> float:
-        """Distance along z_S from the centre to the farthest corner [m]."""
+        """Distance along z_S from the box's centre to its farthest corner [m]."""
         return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
 
     @property
@@ -69,9 +66,9 @@ class Block:
 @settings
 @dataclass
 class Tool:
-    """Tool, by default the paper's; a model file or a mass replaces it."""
+    """Tool on the sensor: by default the paper's; `model` or `mass` replaces it."""
 
-    model: str = plain("", "file of a tool: its root link is put on S", is_path=True)
+    model: str = plain("", "file of a tool; its root link is welded to S", is_path=True)
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "mass of a tool without a file")
     com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
@@ -112,7 +109,7 @@ class Slave:
     """Slave: the arm, by default the paper's, with its tool."""
 
     position: list[float] = quantity(
-        [0.55, 0.0, 0.45], "m", -5.0, 5.0, "p_WS at the start, with z_S down; unless home is given"
+        [0.55, 0.0, 0.45], "m", -5.0, 5.0, "p_WS at the start, with z_S down; not used with home"
     )
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
@@ -126,7 +123,7 @@ class Slave:
         "", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90", is_path=True
     )
     package_paths: list[str] = plain(
-        [], "folders of package:// addresses, from the scenario's folder", is_path=True
+        [], "folders for package:// addresses, from the scenario's folder", is_path=True
     )
     base_pose: list[float] = quantity(
         [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
@@ -144,7 +141,7 @@ class Slave:
         {}, "N m, N", 1e-6, math.inf, "limits by joint instead of the model's; .inf: no limit"
     )
     friction: list[float] = quantity(
-        [], "N m, N", 0.0, 1e6, "dry friction, one for all joints or each; control ignores it"
+        [], "N m, N", 0.0, 1e6, "dry friction, one for all joints or one each; control ignores it"
     )
     tool: Tool | None = field(
         default_factory=Tool,
@@ -167,7 +164,6 @@ class Slave:
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def model_files(self) -> list[Path]:
-        """Return the existing files of arm and tool, with those that they include."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
         folders = self.package_folders
         return [file for path in paths for file in list_model_files(path, folders)]
@@ -191,7 +187,7 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
 
 
 def end_of_tool_shapes(tool: Tool) -> list[float] | None:
-    """Return the end p_STip [m] of the shape that reaches farthest along z_S, if there are any."""
+    """Return the end p_STip [m] of the shape that reaches farthest along z_S, None without any."""
     halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
     ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None
@@ -226,7 +222,7 @@ def _add_tool_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None
         if (length := float(np.linalg.norm(each.position))) > 0.0:  # a rod from S, without contact
             along = RotationMatrix.MakeFromOneVector(np.array(each.position), 2)
             middle = RigidTransform(along, np.array(each.position) / 2)
-            rod = Cylinder(_REPLAY_ROD_RADIUS_M, length)
+            rod = Cylinder(_TOOL_ROD_RADIUS_M, length)
             plant.RegisterVisualGeometry(body, middle, rod, f"{name}_rod", _TOOL_COLOUR)
 
 

@@ -31,11 +31,11 @@ from drake_teleop.station.environment.point_contact import (
 )
 
 _IDENTITY_POSE_TOLERANCE = 1e-12  # rounding of frames
-_MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
+_MIN_MASS_MATRIX_EIGENVALUE_SI = 1e-12  # kg or kg m^2, smallest valid eigenvalue
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an environment; `leaf_instance`: of a leaf or `moving_part`, or None."""
+    """Model instances of an environment; `leaf_instance` is that of its `moving_part`, or None."""
 
     instances: Collection[tree.ModelInstanceIndex]
     leaf_instance: tree.ModelInstanceIndex | None
@@ -89,7 +89,7 @@ def MakeToolContactModel(
     """Return the contact model of tool and environment, in a finalized plant.
 
     `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
-    a hydroelastic model without such shapes, or a moving body without mass.
+    hydroelastic contact without hydroelastic shapes, or a moving body without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes, context = ToolShapes(plant, scene_graph, tool), plant.CreateDefaultContext()
@@ -102,7 +102,7 @@ def MakeToolContactModel(
     )
     if contact.moving_bodies:
         inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
-        if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
+        if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE_SI:
             bodies = {name: plant.get_body(k) for name, k in contact.moving_bodies.items()}
             names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
             what = (
@@ -146,7 +146,7 @@ def MakeToolContactModel(
 def MovingBodiesExceptLeaf(
     plant: MultibodyPlant, added: AddedEnvironment
 ) -> dict[str, tree.BodyIndex]:
-    """Return the moving bodies of the environment, except the leaf, by unique name."""
+    """Return indices of the environment's moving bodies, except the leaf, by unique name."""
     instances = [each for each in added.instances if each != added.leaf_instance]
     indices = [index for instance in instances for index in plant.GetBodyIndices(instance)]
     moving = [body for body in map(plant.get_body, indices) if not plant.IsAnchored(body)]

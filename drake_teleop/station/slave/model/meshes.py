@@ -36,11 +36,11 @@ _STL_TRIANGLE_DTYPE = np.dtype(_STL_TRIANGLE_FIELDS)
 
 
 def remove_unusable_shapes(model: ModelRepair) -> None:
-    """Remove shapes that Drake cannot read, or all shapes if the plant has none.
+    """Remove shapes that Drake cannot read, or all shapes if the plant has no SceneGraph.
 
-    Relative addresses of meshes become absolute. STL meshes are converted to convex hulls, because
-    Drake does not read STL. A lost visual is reported only for links without shapes, a lost
-    collision shape only for links without a visual or with other collision shapes.
+    Relative mesh addresses become absolute. STL meshes are converted to convex hulls, because Drake
+    does not read STL. Removed shapes are reported for links without any remaining shape. Removed
+    collision shapes are also reported for links with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
     for link in model.root.iter("link"):
@@ -135,7 +135,7 @@ class Triangles(NamedTuple):
 
 
 def read_triangles(file: Path) -> Triangles:
-    """Return the triangles of an STL, OBJ or MSH file, or raise ValueError."""
+    """Return the triangles of an STL, OBJ or MSH file; raise ValueError if it is unreadable."""
     read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
     try:
         return check_triangle_vertices(read[file.suffix.lower()](file.read_bytes()))
@@ -144,7 +144,6 @@ def read_triangles(file: Path) -> Triangles:
 
 
 def check_triangle_vertices(triangles: Triangles) -> Triangles:
-    """Return `triangles`; raise ValueError unless all their vertices exist and are finite."""
     vertices, faces = triangles
     if not faces.size:
         raise ValueError("a mesh has no triangles")
@@ -162,7 +161,7 @@ def obj_text(triangles: Triangles) -> str:
 
 
 def convex_hull(vertices: Array) -> Triangles:
-    """Return the convex hull, with triangles that face outwards, or raise ValueError."""
+    """Return the convex hull of vertices (n, 3), with outward triangles, or raise ValueError."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:

@@ -1,4 +1,4 @@
-"""Bodies, joints and shapes of an MJCF file, in the body's axes and SI units: read and written."""
+"""Bodies, joints and shapes of an MJCF file in body axes and SI units, with reader and writer."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Joint:
 
 @dataclass(eq=False)
 class Geom:
-    """Shape of a body, with pose X_BG and, for type mesh, its `mesh`."""
+    """Shape of a body with pose X_BG; `mesh` is None unless the shape is of type mesh."""
 
     kind: str
     X_BG: RigidTransform
@@ -59,7 +59,7 @@ class Geom:
 
 @dataclass(eq=False)
 class Body:
-    """Body with pose X_PB in its parent; `generator_tags` are tags that are not supported."""
+    """Body with pose X_PB in its parent; `generator_tags` are unsupported tags that add bodies."""
 
     name: str
     X_PB: RigidTransform
@@ -76,7 +76,7 @@ class Body:
 
 
 class BodyReader:
-    """Reader of the bodies in an MJCF file; joints and bodies without names get one."""
+    """Reader of the bodies in an MJCF file; it names joints and bodies without names."""
 
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf, self.meshes = mjcf, mjcf_meshes.MeshLibrary(mjcf)
@@ -85,7 +85,7 @@ class BodyReader:
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
     def read_world(self) -> Body:
-        """Return the world with its shapes and all bodies."""
+        """Return the world body with its shapes, and with all bodies of the file as descendants."""
         world = Body("world", RigidTransform())
         for element in self._mjcf.root.findall("worldbody"):
             self._read_children(world, element, element.get("childclass", ""), RigidTransform())
@@ -183,7 +183,7 @@ class BodyReader:
         return about_centre.in_frame(self._mjcf.read_pose(given))
 
     def mass_properties_of_body(self, body: Body) -> mjcf_meshes.MassProperties:
-        """Return the body's mass properties from its `inertial` element, or from its shapes."""
+        """Return a body's mass properties from its `inertial` element or shapes, as in MuJoCo."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
@@ -217,9 +217,9 @@ class BodyReader:
 
 
 class MjcfWriter:
-    """Writer of MJCF text; in the text of a tool the top bodies float.
+    """Writer of MJCF text; bodies at the top of a tool get free joints.
 
-    Contact shapes are convex hulls, as in MuJoCo, except in a scene.
+    Contact meshes become convex hulls, as in MuJoCo, except in a scene.
     """
 
     def __init__(self, mjcf: Mjcf) -> None:
@@ -233,7 +233,7 @@ class MjcfWriter:
         self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
 
     def write(self, world: Body, moving: list[Joint]) -> str:
-        """Return the MJCF text of a world; the joints `moving` get actuators."""
+        """Return the MJCF text of a world body; the joints `moving` get motors."""
         top = SubElement(self._root, "worldbody")
         self._write_body_content(top, world)
         names = {body.name for body in world.with_descendants()}

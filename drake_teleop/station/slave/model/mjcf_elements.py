@@ -21,15 +21,15 @@ _MAX_ELEMENT_NESTING_DEPTH = 150  # largest depth of nested elements
 MIN_DIRECTION_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
-# A shorter list replaces only the first numbers of the default.
-_SHORT_LIST_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
+# A shorter list is completed by the last numbers of the default.
+_COMPLETED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
 _ACTUATOR_TAGS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
 _ACTUATOR_TAGS |= {"muscle", "adhesion", "dcmotor", "plugin"}
 _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
-    """Attributes of one XML element; `label` names it in the faults of `model`."""
+    """Attributes of one XML element; `label` names it in faults, which are added to `model`."""
 
     def __init__(self, values: dict[str, str], label: str, model: ModelRepair) -> None:
         super().__init__(values)
@@ -38,7 +38,7 @@ class Attributes(dict[str, str]):
     def numbers(
         self, name: str, default: tuple[float, ...], largest: float = math.inf
     ) -> list[float]:
-        """Return the numbers in attribute `name`; the end of `default` completes a short list."""
+        """Return the numbers in attribute `name`; the end of `default` supplies missing numbers."""
         values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
             fault = "is not a list of numbers"
@@ -50,7 +50,7 @@ class Attributes(dict[str, str]):
         return [*values, *default[len(values) :]][: len(default)]
 
     def vector(self, name: str, default: tuple[float, ...]) -> Array:
-        """Return the numbers in attribute `name`, or `default`; another count adds a fault."""
+        """Return the numbers in attribute `name`, or `default`; report a wrong count as a fault."""
         count, values = len(default), self.numbers(name, default)
         has_wrong_count = len(self.get(name, "").split()) not in (0, count)
         if has_wrong_count or max(map(abs, values)) > MAX_MODEL_VALUE_SI:
@@ -64,13 +64,13 @@ class Attributes(dict[str, str]):
 
     @property
     def has_contact(self) -> bool:
-        """Whether a shape with these attributes takes part in contacts."""
         return any(self.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
     def read_range(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
-        """Return the range in attribute `name`, or None if attribute `flag` switches it off.
+        """Return the limits (lower, upper) in attribute `name`, or None if they are switched off.
 
-        Without `flag`, `automatic` switches a range of nonzero width on.
+        Attribute `flag` switches them: true, false, or auto (the default). With auto, limits of
+        nonzero width apply if `automatic`.
         """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")
@@ -88,7 +88,7 @@ class Mjcf:
         self.model, self.root = model, model.root
         self._folders: dict[Element, Path] = {}  # of included elements
         if self.root.tag != "mujoco":
-            what = f"does not contain a mujoco tag, but {self.root.tag}"
+            what = f"does not contain a mujoco tag, but the root tag {self.root.tag}"
             raise DrakeTeleopError(what, where=str(model.path), remedy="give an MJCF file")
         self._insert_includes(self.root, model.path, {model.path.resolve()}, 0)
         self.compiler = Attributes({}, "compiler", model)
@@ -103,7 +103,7 @@ class Mjcf:
             self._add_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def find_file(self, element: Element, name: str, folder: str) -> Path | None:
-        """Return the file `name` in `folder`, beside the main or else the included MJCF file."""
+        """Return `folder`/`name` beside the main file or the element's included file, or None."""
         places = [self.model.path.resolve().parent, self._folders.get(element)]
         find = self.model.files.find_file
         found = (find(name, place / folder) for place in places if place)
@@ -119,7 +119,7 @@ class Mjcf:
         return math.radians(value) if degrees else value
 
     def attributes_of(self, element: Element, childclass: str, label: str) -> Attributes:
-        """Return the attributes of an element, with defaults of its class or else `childclass`."""
+        """Return an element's attributes, with defaults of its class, otherwise of `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
             self.model.add_fault(f"{label}: there is no class {name}")
@@ -129,7 +129,7 @@ class Mjcf:
         return Attributes(_merge_defaults(defaults, element.attrib), label, self.model)
 
     def read_pose(self, attributes: Attributes) -> RigidTransform:
-        """Return the pose of an element in its parent, from `pos` and its orientation."""
+        """Return an element's pose in its parent."""
         rotation = self._rotation_of_element(attributes)
         return RigidTransform(rotation, attributes.vector("pos", (0.0,) * 3))
 
@@ -200,7 +200,7 @@ def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, 
     merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATION_ATTRIBUTES)}
     for name, text in own.items():
         words = text.split()
-        rest = merged.get(name, "").split()[len(words) :] if name in _SHORT_LIST_ATTRIBUTES else []
+        rest = merged.get(name, "").split()[len(words) :] if name in _COMPLETED_ATTRIBUTES else []
         merged[name] = " ".join([*words, *rest]) if rest else text
     return merged
 
@@ -211,7 +211,6 @@ def _rotation_about_axis(axis: Array, angle: float) -> RotationMatrix:
 
 
 def smallest_rotation_of_z_to(z: Array) -> RotationMatrix:
-    """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))
     axis = axis if sine else np.array([1.0, 0.0, 0.0])

@@ -31,7 +31,7 @@ class MassProperties(NamedTuple):
     inertia: Array
 
     def in_frame(self, X_BG: RigidTransform) -> MassProperties:
-        """Return the properties, transformed from frame G to B."""
+        """Return the properties in frame B, from those in frame G."""
         R = X_BG.rotation().matrix()
         return MassProperties(self.mass, X_BG @ self.centre, R @ self.inertia @ R.T)
 
@@ -56,7 +56,7 @@ def combine_mass_properties(parts: list[MassProperties]) -> MassProperties:
 
 
 def unit_density_properties_of_primitive(kind: str, size: list[float]) -> MassProperties:
-    """Return the mass properties of a shape of density 1 in its own axes."""
+    """Return the mass properties of a shape such as a box, of density 1 kg/m^3, in its own axes."""
     a, b, c = size
     if kind == "sphere":
         b = c = a
@@ -76,9 +76,9 @@ def unit_density_properties_of_primitive(kind: str, size: list[float]) -> MassPr
 
 
 def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
-    """Return the mass properties of a mesh of density 1, by MuJoCo's rule in `mesh.inertia`.
+    """Return the mass properties of a mesh of density 1 kg/m^3, by MuJoCo's rule `mesh.inertia`.
 
-    The rule "legacy" counts all tetrahedra between triangles and centre as positive.
+    The rule "legacy" adds the absolute volumes of tetrahedra between the centre and each triangle.
     """
     triangles = mesh.triangles
     if mesh.inertia == "convex":
@@ -99,9 +99,9 @@ def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
 
 
 def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
-    """Return pose and size of the primitive, such as a box, that MuJoCo fits to a mesh.
+    """Return pose X_FG and size of the primitive, such as a box, that MuJoCo fits to a mesh.
 
-    Its size follows from the mesh's inertia, or with `by_box` from its bounding box (`fitaabb`).
+    The mesh's inertia determines its size, or with `by_box` the bounding box (`fitaabb`).
     """
     mass, centre, inertia = unit_density_properties_of_mesh(mesh)
     moments, axes = np.linalg.eigh(inertia)
@@ -128,7 +128,10 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
 def _mass_properties_of_simplices(
     corners: Array, weight: Array, centre: Array, count: int = 3
 ) -> MassProperties:
-    """Return mass properties of m triangles (count 3) or tetrahedra with the centre (count 4)."""
+    """Return mass properties of triangles (`count` 3) or tetrahedra with tips at `centre` (4).
+
+    `corners` (m, 3, 3) are relative to `centre`; `weight` (m,) are their masses.
+    """
     total = corners.sum(axis=1)
     second = np.einsum("nai,naj->nij", corners, corners) + np.einsum("ni,nj->nij", total, total)
     products = np.einsum("n,nij->ij", weight, second) / (count * (count + 1))
@@ -143,7 +146,7 @@ def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
 
 
 class Mesh:
-    """Mesh of an `asset` section, with its own scale and reference pose applied."""
+    """Mesh of an `asset` section, with its scale and reference pose applied."""
 
     def __init__(self, mjcf: Mjcf, attributes: Attributes, file: Path | None) -> None:
         self.name = attributes.get("name") or Path(attributes.get("file", "")).stem
@@ -171,13 +174,12 @@ class Mesh:
         return Triangles(moved, faces)
 
     def find_or_write_obj(self) -> Path:
-        """Return an .obj file for Drake, written if conversion is necessary."""
+        """Return the path of an .obj file of the mesh for Drake; write it if necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
         return self._write_triangles(self.triangles)
 
     def write_hull(self) -> Path:
-        """Write the convex hull, for contact, to an .obj file; return its path."""
         return self._write_triangles(convex_hull(self.triangles.vertices))
 
     def _write_triangles(self, triangles: Triangles) -> Path:
@@ -201,7 +203,7 @@ class MeshLibrary:
                 self._meshes[mesh.name] = fault or mesh
 
     def find(self, name: str) -> Mesh | str:
-        """Return a mesh, or a text about its fault."""
+        """Return the mesh with this name, or a text about its fault."""
         mesh = self._meshes.get(name, model_references.MESHES_NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:

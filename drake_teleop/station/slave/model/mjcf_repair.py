@@ -1,7 +1,7 @@
 """Repair of an MJCF text, so that Drake reads the arm in it as MuJoCo does.
 
-The text is written anew: poses as quaternions, angles in rad, masses as explicit inertias, one
-joint per body, and only the bodies that the arm carries.
+The new text has poses as quaternions, angles in rad, masses as explicit inertias, one joint per
+body, and only the bodies that the arm carries.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _DYNTYPES_WITH_UNBOUNDED_OUTPUT = ("integrator", "muscle", "user", "dcmotor")
 
 
 def repair_mjcf(model: ModelRepair) -> None:
-    """Write an MJCF text that Drake reads, with converted meshes.
+    """Set `model.text` to an MJCF text that Drake reads, with converted meshes.
 
-    A scene, or a file that model directives add, keeps all bodies and joints.
+    Only scenes, and files that model directives add, keep all bodies and joints.
     """
     purpose, mjcf = model.purpose, Mjcf(model)
     reader = BodyReader(mjcf)
@@ -70,10 +70,9 @@ def repair_mjcf(model: ModelRepair) -> None:
 
 
 def _read_world_with_only_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
-    """Return the world with only the tree of bodies that carries the sensor; report the others."""
     model, sensor = mjcf.model, mjcf.model.purpose.sensor_name
     worlds = mjcf.root.findall("worldbody")
-    tops = [pair for element in worlds for pair in _parents_and_top_bodies(element)]
+    tops = [pair for element in worlds for pair in _iterate_top_bodies_with_parents(element)]
     kind = "body" if any(sensor in _names_of_elements(top, "body") for _, top in tops) else "site"
     carriers = [top for _, top in tops if sensor in _names_of_elements(top, kind)]
     if len(carriers) != 1:
@@ -100,12 +99,12 @@ def _read_world_with_only_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
     return world
 
 
-def _parents_and_top_bodies(parent: Element) -> Iterator[tuple[Element, Element]]:
+def _iterate_top_bodies_with_parents(parent: Element) -> Iterator[tuple[Element, Element]]:
     for child in parent:
         if child.tag == "body":
             yield parent, child
         elif child.tag == "frame":
-            yield from _parents_and_top_bodies(child)
+            yield from _iterate_top_bodies_with_parents(child)
 
 
 def _names_of_elements(top: Element, tag: str) -> set[str]:
@@ -123,10 +122,10 @@ def _split_into_one_joint_bodies(body: Body) -> Body:
 
 
 def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site: bool) -> None:
-    """Add a massless body at the pose of a site on a child of `body`, as sensor frame.
+    """Add a massless body as sensor frame, at the pose of a site on a descendant of `body`.
 
-    The new body carries the site's body if a `force` or `torque` sensor measures there
-    (`is_force_sensor_site`). Otherwise the site's body carries it.
+    If a `force` or `torque` sensor measures at the site (`is_force_sensor_site`), the new body
+    becomes the parent of the site's body, otherwise its child.
     """
     for k, child in enumerate(body.children):
         X_BS = child.sites.pop(site, None)
@@ -144,10 +143,7 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site:
 def _weld_other_joints_and_list_moving(
     world: Body, chain: list[Body], model: ModelRepair
 ) -> list[Joint]:
-    """Weld free bodies and joints outside the chain; return the moving joints.
-
-    Held joints remain in the file, because they are welded after the parsing.
-    """
+    """Weld free bodies and joints outside the chain; return the moving joints without held ones."""
     moving = list[Joint]()
     for body in world.with_descendants():
         joints, body.joints = body.joints, []
@@ -167,7 +163,7 @@ def _weld_other_joints_and_list_moving(
 
 
 def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
-    """Report couplings between `joints` as faults; report other couplings as left out."""
+    """Report couplings that constrain `joints` as faults, and other couplings as left out."""
     model, moving = mjcf.model, {joint.name for joint in joints}
     # Moving body of the chain that carries each body.
     carriers = dict.fromkeys((body.name for body in arm.with_descendants()), "world")
@@ -199,7 +195,6 @@ def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mj
 
 
 def _report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
-    """Report all couplings and springs, which Drake does not read from MJCF."""
     for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()

@@ -23,10 +23,10 @@ _TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
 def repair_inertia_and_detect_missing(
     link: Element, model: ModelRepair, *, is_sdf: bool, is_fixed: bool
 ) -> bool:
-    """Replace physically impossible inertia of a link by the nearest possible one.
+    """Replace impossible inertia of a link by the nearest possible; return True if none is given.
 
-    Report changes and faults. A link that no joint moves (`is_fixed`) loses impossible
-    values. Return True if a link that joints may move has no inertia.
+    Changes and faults are reported. If no joint of the arm moves the link (`is_fixed`), impossible
+    inertia is removed, and zero inertia counts as given.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     mass_element = link.find("inertial/mass")
@@ -100,8 +100,8 @@ def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
     Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
-    parts, which is nearest in the Frobenius norm. The change is the largest of a principal moment,
-    relative to the largest moment; it is 0 for a possible tensor.
+    parts, which is nearest in the Frobenius norm. The change is the largest difference of a
+    principal moment, divided by the largest moment; it is 0 for a possible tensor.
     """
     given, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
     moments = np.maximum(given, 0.0)
@@ -144,7 +144,7 @@ def replace_commas_by_blanks(root: Element) -> None:
 
 
 def check_lengths_and_inertias(element: Element, where: str, model: ModelRepair) -> None:
-    """Report lengths, inertias or rotor inertias in an element that are too large or no numbers."""
+    """Report lengths and inertias in an element that are not finite or above 1e6 (SI) as faults."""
     for inner in element.iter():
         if inner.tag not in _QUANTITY_TAGS:
             continue
@@ -165,7 +165,6 @@ def check_lengths_and_inertias(element: Element, where: str, model: ModelRepair)
 
 
 def repair_joint(joint: Element, links: set[str], model: ModelRepair, *, in_chain: bool) -> None:
-    """Correct limits, friction and damping of a joint; report changes and faults."""
     name = joint.get("name", "")
     where, is_held = f"joint {name}", name in model.purpose.held_positions
     in_chain &= not is_held

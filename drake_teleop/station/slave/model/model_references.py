@@ -75,7 +75,7 @@ class ModelFiles:
         self._bases = {""}
 
     def merge_packages_with_map(self, known: PackageMap) -> None:
-        """Merge `packages` with Drake's map `known`, without the package that Drake downloads."""
+        """Merge `packages` and Drake's map `known` into both, without the downloaded package."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -98,12 +98,11 @@ class ModelFiles:
         return next(iter(_existing_raw_and_normalized_paths(path)), None)
 
     def may_read_file(self, path: Path) -> bool:
-        """Return whether a file is in the model's folder or a package, after resolving links."""
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
     def file_access_fault(self, path: Path, kind: str) -> str:
-        """Return the reason why a file of `kind`, such as meshes, must not be read, or nothing."""
+        """Return why a file of `kind`, such as meshes, must not be read, or an empty text."""
         if not self.may_read_file(path):
             where = f"{kind} in {path.resolve().parent}"
             what = f"{where} are outside the model's folder and its packages"
@@ -117,7 +116,7 @@ class ModelFiles:
     def check_referenced_files(self, path: Path) -> None:
         """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
 
-        Meshes of the model's own links are not checked.
+        Meshes of links in the model file itself are not checked, because unusable ones are removed.
         """
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
@@ -151,10 +150,7 @@ class ModelFiles:
         return self.sizes[real]
 
     def mesh_files(self) -> Iterator[Path]:
-        """Yield readable meshes of all links, and files that these reference.
-
-        Call `check_referenced_files` first.
-        """
+        """Yield readable meshes of all links, and their files, after `check_referenced_files`."""
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
         for mesh in [m for path in texts for m in self._referenced_files(path, with_meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):
@@ -171,8 +167,8 @@ class ModelFiles:
             for address in _mesh_addresses(path) if with_meshes else self._addresses_in_file(path):
                 if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     limit = f"(at most {_MAX_PATH_LENGTH})"  # Drake aborts on it
-                    what = f"references a file by {len(address)} characters {limit}"
-                    raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
+                    what = f"references a file by an address of {len(address)} characters {limit}"
+                    raise DrakeTeleopError(what, where=str(path), remedy="shorten the address")
                 named = {self.find_file(address, folder) for folder in folders}
                 found = set[Path]().union(*map(_existing_raw_and_normalized_paths, named))
                 yield from found - {path.parent}
@@ -204,7 +200,7 @@ class ModelFiles:
 
 
 def list_model_files(model: Path, package_paths: tuple[Path, ...]) -> list[Path]:
-    """Return the model file, files that it includes and meshes; none if it does not exist."""
+    """Return the model file, files that it includes and meshes; an empty list without the file."""
     if not os.path.isfile(model):
         return []
     try:

@@ -23,9 +23,9 @@ class ModelPurpose(NamedTuple):
         sensor_name: frame, link or site of the sensor; empty for tools and surroundings.
         held_positions: angles or positions [rad, m] of joints that do not move.
         is_tool: whether the model is a tool, whose joints are all fixed.
-        is_scene: whether the model is surroundings: all its shapes must be readable.
-        is_in_directives: whether model directives add the model, so that every link is kept.
-        plant_has_shapes: whether the plant has shapes.
+        is_scene: whether the model is surroundings; then shapes that are not readable are faults.
+        is_in_directives: whether another file adds or includes the model; then every link is kept.
+        plant_has_shapes: whether the plant has a SceneGraph.
     """
 
     sensor_name: str = ""
@@ -37,14 +37,14 @@ class ModelPurpose(NamedTuple):
 
 
 class ModelRepair:
-    """Repair of one model file; functions for each format read it, and write its results.
+    """State of the repair of one model file: new text, reported changes and faults.
 
     Attributes:
         folder: folder of converted meshes and of repaired copies of included files.
         text: XML for Drake's parser, with absolute mesh paths; empty if a part was not repaired.
         effort_limits: torque or force limits [N m, N] by joint; joints without an entry have none.
-        dependence_reasons: by name, why mimic joints or floating links depend on others.
-        auxiliary_bodies: names of massless bodies, added between several joints of one body.
+        dependence_reasons: texts by name: why mimic joints or floating links depend on others.
+        auxiliary_bodies: names of massless bodies that the repair added.
     """
 
     def __init__(self, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path) -> None:
@@ -60,11 +60,11 @@ class ModelRepair:
 
     @cached_property
     def root(self) -> Element:
-        """Root element of the file, which the repair changes."""
+        """Root element of the file, which the repair changes in place."""
         return read_xml(self.path)
 
     def repair_part(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
-        """Repair a file that this one includes or adds; this repair has its results too."""
+        """Repair a file that this one includes or adds; return it and merge its results here."""
         purpose = self.purpose._replace(is_in_directives=True)
         part = ModelRepair(path, self.files, purpose, self.folder)
         repair(part)
@@ -75,7 +75,7 @@ class ModelRepair:
         return part
 
     def write_file(self, name: str, text: str) -> Path:
-        """Write a new file, whose name ends with `name`, to the folder; return its path."""
+        """Write a new file, with a number before `name`, to `folder`; return its path."""
         path = self.folder / f"{len(list(self.folder.iterdir()))}_{name}"
         path.write_text(text, encoding="utf-8")
         return path
@@ -85,7 +85,7 @@ class ModelRepair:
         self._names.setdefault(what, {})[name] = None
 
     def add_repair(self, what: str, name: str) -> None:
-        """Add a repair as an assumption; in a scene, where it may change contact, as a fault."""
+        """Add a repair as an assumption; in a scene add a fault, because contact may change."""
         if self.purpose.is_scene:
             self.add_fault(f"{what} {name}")
         else:
@@ -96,19 +96,18 @@ class ModelRepair:
 
     @property
     def assumptions(self) -> list[str]:
-        """Texts about assumptions and repairs: one of each kind, with names; of parts last."""
+        """Texts about assumptions and repairs, one per kind with names; of included files last."""
         own = [f"{what} {join_names(names)}" for what, names in self._names.items()]
         return list(dict.fromkeys([*own, *self._assumptions_of_parts]))
 
     def describe_frame_fault(self, count: int, known: set[str]) -> tuple[str, str]:
-        """Return fault and remedy if `count` frames, not one, have the name of the sensor frame."""
+        """Return fault and remedy if `count` frames, not one, have the sensor frame's name."""
         name = self.purpose.sensor_name
         near = get_close_matches(name, sorted(known), n=_MAX_JOINED_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
         return f"{count or 'no'} frames are named {name!r}", remedy
 
     def raise_faults(self) -> None:
-        """Raise one DrakeTeleopError about all faults, if there are any."""
         if not self._causes:
             return
         what, count = next(iter(self._causes)), len(self._causes)
@@ -123,7 +122,7 @@ class ModelRepair:
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Return the names as text, of more than twelve the first twelve and the number of others."""
+    """Return the names, separated by commas; after twelve, only the number of the others."""
     each = list(names)
     more = [f"and {len(each) - _MAX_JOINED_NAMES} more"] if len(each) > _MAX_JOINED_NAMES else []
     return ", ".join(each[:_MAX_JOINED_NAMES] + more)

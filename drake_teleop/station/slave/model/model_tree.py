@@ -7,7 +7,11 @@ from xml.etree.ElementTree import Element
 from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 WORLD_NAME = "world"  # name in URDF and SDF
-_CONSTRAINT_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
+_DRAKE_CONSTRAINT_TAGS = (
+    "drake:ball_constraint",
+    "drake:linear_bushing_rpy",
+    "drake:tendon_constraint",
+)
 
 
 def list_joints(scope: Element) -> list[Element]:
@@ -22,7 +26,7 @@ def joint_link(joint: Element, end: str) -> str:
 
 
 def link_of_frame(scope: Element, frame: str) -> str:
-    """Return the link that carries the frame, link or joint `frame`, or an empty text."""
+    """Return the name of the link that carries `frame` (frame, link or joint), or an empty text."""
     links = [link.get("name", "") for link in scope.findall("link")]
     frames = scope.findall("frame")
     carriers = {x.get("name", ""): x.get("link") or x.get("attached_to") or "" for x in frames}
@@ -37,11 +41,11 @@ def link_of_frame(scope: Element, frame: str) -> str:
 def reduce_to_chain(
     scope: Element, sensor_link: str, model: ModelRepair
 ) -> tuple[set[Element], dict[str, int]] | None:
-    """Keep the tree of links with the sensor; fix joints that are not between root and sensor.
+    """Keep only the tree of links with the sensor; fix joints that are not between root and sensor.
 
-    Other trees and joints that close a loop are removed. Held joints count as fixed. Return the
-    joints from the root to the sensor's link, also fixed ones, and the number of moving ones
-    between the root and each link; or None, with a fault of the model, if they are ambiguous.
+    Joints that close a loop are removed. Held joints count as fixed. Return the joints from root to
+    sensor link, including fixed ones. Return also, by link, the number of these joints that move
+    and are between root and link. Return None, and report a fault, if the joints are ambiguous.
     """
     joints = _joint_chain_to_link(scope, sensor_link, model)
     if joints is None:
@@ -52,13 +56,13 @@ def reduce_to_chain(
     for joint in list_joints(scope):
         if joint not in chain and joint.get("name") not in model.purpose.held_positions:
             make_joint_fixed(joint, model)
-    for element in [child for child in scope if child.tag in _CONSTRAINT_TAGS]:
+    for element in [child for child in scope if child.tag in _DRAKE_CONSTRAINT_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
         if len(names) < 2 or len(groups) > 1:
             what = f"its links form a loop, by {element.tag}"
-            model.add_fault(f"{what}; model the chain to the sensor alone")
+            model.add_fault(f"{what}; model only the chain to the sensor")
     return chain, num_joints_to_link
 
 

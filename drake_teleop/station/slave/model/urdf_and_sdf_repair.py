@@ -29,7 +29,7 @@ _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
 def repair_urdf(model: ModelRepair) -> None:
-    """Write a URDF text that Drake reads, with converted meshes."""
+    """Set `model.text` to a URDF text that Drake reads, with converted meshes."""
     root = model.root
     root.set("name", root.get("name") or model.path.stem)
     if not model.purpose.is_scene:
@@ -42,7 +42,7 @@ def repair_urdf(model: ModelRepair) -> None:
 
 
 def repair_sdf(model: ModelRepair) -> None:
-    """Write an SDF text that Drake reads, with converted meshes and repaired included files."""
+    """Set `model.text` to an SDF text that Drake reads; convert meshes, repair included files."""
     if not model.purpose.is_scene:
         _keep_model_with_sensor(model)
         _remove_children_ignored_by_drake(list(model.root.iter()))
@@ -64,7 +64,6 @@ def _remove_children_ignored_by_drake(elements: list[Element]) -> None:
 
 
 def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
-    """Repair links and joints of a robot, or of a model and its nested models."""
     model_numbers.replace_commas_by_blanks(model.root)
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
@@ -87,7 +86,6 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
 
 
 def _convert_meshes_and_write_text(model: ModelRepair) -> None:
-    """Convert meshes and write the text, or raise one DrakeTeleopError about all faults."""
     model.raise_faults()
     remove_unusable_shapes(model)
     model.raise_faults()
@@ -103,7 +101,7 @@ def _convert_meshes_and_write_text(model: ModelRepair) -> None:
 
 
 def find_dependence_reasons(root: Element) -> dict[str, str]:
-    """Return, by name, why joints (mimic) or links (floating) do not move independently."""
+    """Return texts by name: why mimic joints and floating links depend on other joints or links."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         parent = joint_link(joint, "parent")
@@ -198,7 +196,7 @@ def _remove_references_to_missing_parts(model: ModelRepair) -> None:
 
 
 def _repair_included_file(uri: Element, model: ModelRepair) -> None:
-    """Let an include refer to its file by absolute path, repaired if URDF or SDF; raise if none."""
+    """Replace an include's address by an absolute path, to a repaired copy of URDF or SDF."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, model)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
