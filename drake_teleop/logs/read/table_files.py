@@ -47,6 +47,7 @@ _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"
 _THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
 _DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_MIN_WRENCH_COLUMNS = 6
 _MIN_SIMILAR_SHEET = 0.5  # rows of a second log in an Excel file, over those of the first
 _TIME_CELL_PATTERN = re.compile(r"\d[\dT:./ +-]*Z?")  # of dates and times of day
 _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
@@ -208,8 +209,8 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _is_data_row(cells: list[str]) -> bool:
-    numbers = sum(map(_is_number, cells))
-    others = [cell for cell in cells if cell and not _is_number(cell)]
+    numbers = sum(map(_is_decimal_number, cells))
+    others = [cell for cell in cells if cell and not _is_decimal_number(cell)]
     if len(cells) < 2 or not numbers:
         return False
     return all(map(_TIME_CELL_PATTERN.fullmatch, others)) or numbers >= max(3, len(cells) / 2)
@@ -292,7 +293,7 @@ def _read_excel(path: Path) -> Table:
             cells = sheet.select(number.is_not_null())
             rows[name] = int(cells.select((pl.sum_horizontal(pl.all()) > 1).sum()).item())
             full = cells.select(pl.all().sum() > 0.5 * rows[name]).row(0)
-            wide += [name] if rows[name] and sum(full) >= len(_WRENCH_COLUMN_NAMES) else []
+            wide += [name] if rows[name] and sum(full) >= _MIN_WRENCH_COLUMNS else []
     best = max(wide or rows, key=lambda name: rows[name])
     if similar := [x for x in wide if x != best and rows[x] >= _MIN_SIMILAR_SHEET * rows[best]]:
         what = (
