@@ -189,7 +189,8 @@ def identify_log(
         fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
     errors = _errors_beside_the_load(raw, fitted, frame_findings, why, too_still, check)
     errors = errors if mirrored is None else (mirrored,)
-    result, causes, note = fitted.fit.identification, (), fitted.fit.note
+    causes: tuple[Finding, ...] = ()
+    result, note = fitted.fit.identification, fitted.fit.note
     accepted = None if errors else why
     if errors:
         useless = too_still or errors[0].name in _NOTHING_IDENTIFIED_FINDINGS
