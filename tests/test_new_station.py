@@ -170,6 +170,10 @@ def test_advised_line_names_the_file_only_if_it_includes_no_models(name, where):
     assert (name in advice) == ("add to" in where)
 
 
+def test_advised_quaternion_has_no_rounding_errors():
+    assert 'quat="0 1 0 0"' in place.tool_frame_advice(Path("scene.xml"), "hand", "-z")
+
+
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_advised_line_of_directives_turns_z_to_the_tool(axis):
     line = place.tool_frame_advice(Path("a.dmd.yaml"), "sensor", axis).split(" - ")[1]
@@ -205,7 +209,7 @@ def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, run
     assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
 
 
-def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeypatch):
+def test_arm_of_five_joints_starts_with_tool_down(tmp_path, runs, monkeypatch):
     monkeypatch.setattr(place, "_CUBE_HALF_EDGES_M", (*place._CUBE_HALF_EDGES_M, 2.0))
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
@@ -213,13 +217,27 @@ def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeyp
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     start = NominalSlave(slave)
     assert len(slave.home) == start.arm.num_joints == 5
-    assert RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()[2, 2] < -0.95
+    assert RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()[2, 2] < -0.9999
     half, p_WS = plan_station(path, "sensor").place.cube_half_m, start.X_WS_start[4:]
     assert half >= 0.03
     for way in np.vstack([np.eye(3), -np.eye(3)]):
         target, reached = start.X_WS_start + half * np.append(np.zeros(4), way), np.empty(7)
         pose_into(start.arm.table, find_posture(start.arm, target, start.start)[0], reached)
         assert np.linalg.norm(reached[4:] - p_WS - half * way) < 0.11 * half
+
+
+def test_tilt_of_a_tool_that_cannot_be_vertical_is_stated(tmp_path, runs, monkeypatch):
+    path = tmp_path / "five.sdf"
+    path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
+    monkeypatch.setattr(place, "find_posture", lambda *each: (each[2], IkStatus.OUT_OF_REACH))
+    monkeypatch.setattr(place, "_can_reach_corner", lambda *_: True)
+    monkeypatch.setattr(place, "_NUM_SOLVED_POSTURES", 3)
+    new_command(tmp_path / "mine", path, "sensor")
+    start = NominalSlave(LoadScenario(tmp_path / "mine" / "station.yaml").slave)
+    cosine = -RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()[2, 2]
+    tilt = f"tool {np.degrees(np.arccos(cosine)):.0f} degrees from downwards"
+    assert cosine < 0.999
+    assert f"joints at the start, {tilt} [rad, m]" in (tmp_path / "mine/station.yaml").read_text()
 
 
 PIECES = [

@@ -41,6 +41,7 @@ from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.joint_control import JointControlConfig, PositionInterface
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.scene import Scene
@@ -169,6 +170,15 @@ def test_noise_of_the_force_at_rest_is_no_oscillation(seed):
     noise = 0.1 * np.random.default_rng(seed).normal(size=(len(T), 3))
     for force in (noise, gaussian_filter1d(3 * noise, 3, axis=0)):
         assert run_warnings(without_network(force), Scenario(), ARM) == []
+
+
+def test_missed_orientation_of_an_arm_with_five_joints_is_no_warning(monkeypatch):
+    result = recorded(ik_status=(0, IkStatus.WRIST_SINGULAR * during(1.0, 2.0)))
+    assert "WRIST_SINGULAR from 1.000 to 2.000 s" in run_warnings(result, OVER_NETWORK, ARM)[0]
+    monkeypatch.setattr(type(ARM), "num_joints", 5)
+    assert run_warnings(result, OVER_NETWORK, ARM) == []
+    result = recorded(ik_status=(0, IkStatus.OUT_OF_REACH * during(1.0, 2.0)))
+    assert len(run_warnings(result, OVER_NETWORK, ARM)) == 1
 
 
 def test_normal_run_has_no_warnings():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.new_station import scenario_text
+from drake_teleop.lab.new_station.picture import draw_start_posture
 from drake_teleop.lab.new_station.place import (
     _order_postures_to_solve,
     _rows_away_from_limits,
@@ -50,6 +52,7 @@ from drake_teleop.station.slave.slave_config import Slave
 
 pytestmark = pytest.mark.slow
 _HALF = 0.5 * np.pi
+MISSING_MESH = '<visual><geometry><mesh filename="link.stl"/></geometry></visual>'
 
 
 def write_arm(path, *, base="0 0 0 0 0 0", ranges=()):
@@ -174,7 +177,7 @@ def test_gripper_of_the_model_points_down(from_flange, rpy, axis, tmp_path):
     old = _joint("flange", "fixed", "link6", "ft", "0 0 0.04")
     path.write_text(path.read_text().replace(old, flange + gripper))
     plan = plan_station(path, "ft")
-    assert plan.has_own_tool and plan.what_points_down == "tool"
+    assert plan.has_own_tool and plan.direction_at_start == "tool down"
     plan.posture_shapes.move_to(plan.place.q)
     down = plan.posture_shapes.X_WS.rotation().matrix() @ axis
     np.testing.assert_allclose(down, [0.0, 0.0, -1.0], atol=1e-3)
@@ -208,7 +211,9 @@ def test_rod_of_a_scara_points_down_for_each_sign(rpy, axis, last_axis, tmp_path
     plan.posture_shapes.move_to(plan.place.q)
     R_WS = plan.posture_shapes.X_WS.rotation().matrix()
     np.testing.assert_allclose(R_WS @ axis, [0.0, 0.0, -1.0], atol=1e-6)
-    assert plan.what_points_down == "tool" and not any("away" in text for text in plan.assumptions)
+    assert plan.direction_at_start == "tool down" and not any(
+        "away" in text for text in plan.assumptions
+    )
 
 
 def test_gripper_that_cannot_point_down_is_not_called_down(tmp_path):
@@ -218,7 +223,7 @@ def test_gripper_that_cannot_point_down_is_not_called_down(tmp_path):
     )
     path.write_text(path.read_text().replace("</robot>", f"{gripper}</robot>"))
     plan = plan_station(path, "ft")
-    assert plan.has_own_tool and plan.what_points_down == "-z_S"
+    assert plan.has_own_tool and plan.direction_at_start == "-z_S down"
     (text,) = [text for text in plan.assumptions if "away from the arm" in text]
     assert text.startswith("-z_S downwards at the start, as no posture was found in which x_S")
     assert plan.tool_axis_advice.startswith("-z_S points down, so")
@@ -289,6 +294,27 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
     assert plan.base_plane_height == pytest.approx(height, abs=1e-6)
     assert height < plan.place.position[2] < height + 0.9
     assert np.hypot(*(plan.place.position[:2] - [0.4, -0.5])) > 0.25
+
+
+@pytest.mark.parametrize(("height", "plane"), [(2.0, 0.0), (0.5, None)])
+def test_hanging_arm_starts_below_its_base(height, plane, tmp_path):
+    path = write_arm(tmp_path / "arm.urdf", base=f"0 0 {height} {np.pi} 0 0")
+    plan = plan_station(path, "ft")
+    sensor = plan.place.position[2]
+    assert plan.direction_at_start == "tool down" and sensor < height - 0.3
+    assert plan.base_plane_height < sensor
+    assert plane is None or plan.base_plane_height == plane
+
+
+def test_sticks_of_an_arm_without_shapes_are_not_the_base(tmp_path):
+    path = write_arm(tmp_path / "arm.urdf")
+    bare = re.sub("<collision>.*?</collision>", "", path.read_text())
+    path.write_text(bare.replace("<inertial>", f"{MISSING_MESH}<inertial>"))
+    plan = plan_station(path, "ft")
+    assert plan.posture_shapes.has_sticks and plan.base_plane_height == 0.0
+    caption = draw_start_posture(plan, "arm").get_supxlabel()
+    assert "shapes of some links are missing, sticks replace them" in caption
+    assert "base plane: z_W = 0 m;" in caption and "meshes" not in caption
 
 
 def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):

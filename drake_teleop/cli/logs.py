@@ -124,7 +124,7 @@ def eliminate_command(
         files.write_picture(out / "contact_wrench.png", draw_elimination(found))
         files.write_json(out / "summary.json", summary)
     if not quiet:
-        print_elimination(summary, out)
+        print_contact_wrench_summary(summary, out)
     return summary
 
 
@@ -187,7 +187,7 @@ def detect_command(
         files.write_picture(out / "detection.png", draw_detection(found))
         files.write_json(out / "summary.json", summary)
     if not quiet:
-        print_detection(summary, out)
+        print_contact_detection_summary(summary, out)
     return summary
 
 
@@ -217,14 +217,14 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     headings = ("", "value", "std", "unit")
     table = _summary_table("Load identified from", summary, headings, left_aligned=("", "unit"))
     offsets, deviations, units = summary["offsets"], summary["offsets_std"], ["N", "N m"]
-    rows = _load_rows(summary) + [
+    rows = _rows_of_load(summary) + [
         (name, offsets[i], deviations[i], 1.0, units[i // 3], name)
         for i, name in enumerate(PARAMETER_NAMES[:6])
     ]
     _add_parameter_rows(table, rows, summary["identifiable"])
     if "object" in summary:
         table.add_section()
-        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _rows_of_load(summary["object"])]
         _add_parameter_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         "com from, and inertia about, the origin So of the sensor frame S\n"
@@ -241,7 +241,7 @@ _ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _load_rows(load: dict[str, Any]) -> list[_ParameterRow]:
+def _rows_of_load(load: dict[str, Any]) -> list[_ParameterRow]:
     rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
@@ -263,7 +263,7 @@ def _add_parameter_rows(table: Any, rows: list[_ParameterRow], identifiable: lis
             table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")
 
 
-def print_elimination(summary: dict[str, Any], out: Path) -> None:
+def print_contact_wrench_summary(summary: dict[str, Any], out: Path) -> None:
     headings = ("rms of", "|F| [N]", "|tau| [N m]")
     table = _summary_table("Contact wrench in", summary, headings, left_aligned=("rms of",))
     for label, name in (
@@ -296,7 +296,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
     print_table_and_notes(table, figures, summary, out)
 
 
-def print_detection(summary: dict[str, Any], out: Path) -> None:
+def print_contact_detection_summary(summary: dict[str, Any], out: Path) -> None:
     headings = ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "direction in S")
     table = _summary_table("Contact in", summary, headings)
     for c in summary["contacts"]:

@@ -123,6 +123,8 @@ class FiniteNumber(click.FloatRange):
 
 
 class IntegerInRange(click.IntRange):
+    """Parameter type of integers in a range."""
+
     name, _type_without_range, convert = "integer", click.INT, FiniteNumber.convert
 
 

@@ -68,7 +68,7 @@ def _show_stages_as_bars(after: float) -> Iterator[StartStage]:
     )
     opened, shown = time.monotonic(), False
 
-    def show_bars() -> None:
+    def show_bars_after_delay() -> None:
         nonlocal shown
         if not shown and time.monotonic() - opened >= after:
             shown = True
@@ -79,11 +79,11 @@ def _show_stages_as_bars(after: float) -> Iterator[StartStage]:
 
     def start_stage(name: str) -> UpdateProgress:
         task = bars.add_task(name, total=1.0)
-        show_bars()
+        show_bars_after_delay()
 
         def update(fraction: float, words: str = "") -> None:
             bars.update(task, completed=fraction, description=f"{name} {words}")
-            show_bars()
+            show_bars_after_delay()
 
         return update
 

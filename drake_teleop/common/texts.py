@@ -74,7 +74,7 @@ for _kind, _, _first in _YAML_CORE_SCHEMA:
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """Return the data of a YAML file; `tagged` allows tags of mappings, under the key "_tag"."""
+    """Return a YAML file's data; `tagged`: tags of mappings become key "_tag", else errors."""
     return parse_yaml(read_text(path), str(path), tagged=tagged)
 
 

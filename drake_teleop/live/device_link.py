@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import conjugate_quaternion, quaternion_product
 from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
-    CLUTCH_OPEN,
+    CLUTCH_OPEN_FLAG,
     MAX_PACKET_BYTES,
     DeviceState,
     ForceCommand,
@@ -30,7 +30,7 @@ _CLIENT_END_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
 _LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
+_CLUTCH_OPEN_AFTER_START_S = 0.05
 
 
 class DeviceLink:
@@ -128,7 +128,7 @@ class DeviceLink:
         moved = np.subtract(state.position, first.position)
         back = conjugate_quaternion(first.quaternion_wxyz)
         values = inputs_at_displacement(moved, quaternion_product(state.quaternion_wxyz, back))
-        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_AFTER_SILENCE_S:
+        if state.flags & CLUTCH_OPEN_FLAG or now - self._connected_at < _CLUTCH_OPEN_AFTER_START_S:
             values["clutch"] = 0
         return values
 

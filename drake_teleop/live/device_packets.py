@@ -16,10 +16,7 @@ _STATE_FORMAT, _FORCE_FORMAT = struct.Struct("<4sIQd8d"), struct.Struct("<4sIQd6
 _STATE_TAG, _FORCE_TAG = b"DTD1", b"DTF1"
 MAX_PACKET_BYTES = _STATE_FORMAT.size  #: of both packets [bytes]
 _MAX_POSITION_M, _MAX_WRENCH_VALUE = 10.0, 1e3  # m; N, N m
-
-
-#: Flag of the device: its motion is not transmitted to the slave.
-CLUTCH_OPEN = 1
+CLUTCH_OPEN_FLAG = 1  #: motion of the device is not transmitted to the slave
 
 
 class DeviceState(NamedTuple):
@@ -28,7 +25,7 @@ class DeviceState(NamedTuple):
     Attributes:
         position: p_BE [m].
         quaternion_wxyz: (4,) unit quaternion of R_BE.
-        flags: 0 or `CLUTCH_OPEN`.
+        flags: 0 or `CLUTCH_OPEN_FLAG`.
         behind: age of the position that the displayed force answers [s]; 0: no force.
     """
 
@@ -78,7 +75,7 @@ def valid_state(number: int, t: float, flags: int, numbers: Sequence[float]) -> 
         return None
     orientation = (w / length, i / length, j / length, k / length)
     behind = min(max(behind, 0.0), 1.0)
-    return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN, behind)
+    return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN_FLAG, behind)
 
 
 def rejection_reason(packet: bytes) -> str:

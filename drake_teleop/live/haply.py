@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import DeviceLimits
-from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, valid_state
+from drake_teleop.live.device_packets import CLUTCH_OPEN_FLAG, DeviceState, valid_state
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _START_REMEDY = "start Haply's Inverse Service"
@@ -37,7 +37,7 @@ def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
         return None
     if not isinstance(name, str):
         return None
-    flags = CLUTCH_OPEN if pressed else 0
+    flags = CLUTCH_OPEN_FLAG if pressed else 0
     state = valid_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
     return None if state is None else (name, state)
 

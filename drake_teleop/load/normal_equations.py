@@ -379,7 +379,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T, residual r = F - [E V] theta, from Z = mean of z z^T."""
+    """Return the mean (6, 6) of r r^T, r = F - [E, V] theta, from Z = mean z z^T (module: z)."""
     L = -np.einsum("cjk,j->ck", regressor_coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T

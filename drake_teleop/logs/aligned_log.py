@@ -34,7 +34,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     estimate_from_poses,
     fit_motion_to_load,
 )
-from drake_teleop.logs.pose_motion.rigid import load_coefficients
+from drake_teleop.logs.pose_motion.rigid import wrench_coefficients_of_load
 from drake_teleop.logs.read import alignment
 from drake_teleop.logs.read.alignment import choose_delay, is_far_from_gaps, low_pass, low_pass_log
 from drake_teleop.logs.read.canonical import Log
@@ -87,7 +87,7 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
     return moved, np.cumsum(change[:-1]) > 0.0
 
 
-def _clock_rate_notes(found: PoseMotion) -> list[str]:
+def _pose_clock_rate_notes(found: PoseMotion) -> list[str]:
     if not found.clock_rate_error:
         return []
     side = "faster" if found.clock_rate_error > 0.0 else "slower"
@@ -139,7 +139,7 @@ def read_aligned_log(
     candidates: list[AlignedLog] = []
     motion = None
     if log.posed is not None and not log.static:
-        coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
+        coefficients = wrench_coefficients_of_load(phi, phi[:4] if weight_removed else None)
         fit = partial(fit_motion_to_load, coefficients=coefficients)
         with one_blas_thread(), suppress(DrakeTeleopError):  # too short
             motion, source = _fit_with_fallback_delay(log, delay, fit, fallback_delay_s, "load")
@@ -150,7 +150,7 @@ def read_aligned_log(
             moved = replace_specific_force_by_acceleration(moved)
             plain = None if plain is None else replace_specific_force_by_acceleration(plain)
         edge = one_sided | alignment.is_near_ends(moved, 0.0, cutoff_hz)
-        notes = tuple(_clock_rate_notes(motion))
+        notes = tuple(_pose_clock_rate_notes(motion))
         candidates = [AlignedLog(moved, motion.delay_s, source, plain, edge, notes)]
         if log.posed is None or log.posed.imu is None:
             return candidates[0]
@@ -281,7 +281,7 @@ def _batch_result_of_estimate(
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
+    notes = [*([found.note] if found.note else []), *_pose_clock_rate_notes(found)]
     if not found.fit.is_explained_by_gains:
         verb, beyond = ("increase", " beyond the stated") if gain_std else ("state", "")
         notes.append(

@@ -22,7 +22,7 @@ from drake_teleop.logs.causes.explain import (
     fit_with_missing_acceleration,
 )
 from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
-from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
+from drake_teleop.logs.causes.intervals import bias_of_load_by_alpha_noise
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
 from drake_teleop.logs.read.alignment import remove_delay
@@ -254,28 +254,28 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
 def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> Identification:
     """Return the load fitted with the causes, else `load` with intervals widened by a misfit."""
     if why.causes or why.always_fitted or why.is_acceleration_missing:
-        load = _load_fitted_with_causes(load, why)
+        load = _replace_load_by_fit_of_causes(load, why)
     elif not why.explained and load.identifiable.any():
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_WIDENING_STD_RATIO:
             factors = np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
-            load = _load_with_covariance(load, load.covariance * factors)
+            load = _replace_covariance_of_load(load, load.covariance * factors)
     if why.state.data.gravity_W is not None:
         return load
-    extra = load_bias_by_alpha_noise(why.state)
+    extra = bias_of_load_by_alpha_noise(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
-    return _load_with_covariance(load, load.covariance + np.diag(extra**2))
+    return _replace_covariance_of_load(load, load.covariance + np.diag(extra**2))
 
 
-def _load_with_covariance(load: Identification, covariance: Array) -> Identification:
+def _replace_covariance_of_load(load: Identification, covariance: Array) -> Identification:
     known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _load_fitted_with_causes(load: Identification, why: MisfitExplanation) -> Identification:
+def _replace_load_by_fit_of_causes(load: Identification, why: MisfitExplanation) -> Identification:
     identifiable = is_precise_enough(np.sqrt(np.diag(why.covariance)), why.theta[6:])
     no_load = bool(why.causes) and why.causes[0].name == "no load"
     if no_load or has_negative_mass(why.state):

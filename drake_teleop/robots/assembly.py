@@ -49,10 +49,10 @@ MAX_DELAY_SLEW = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
-MAX_INLIER_DELAY_ERROR_AT_START_S = 0.03
+MAX_DELAY_ERROR_BEFORE_ESTIMATE_S = 0.03
 """Delay error that the residual of a sample may contain before the delay is known [s]."""
-MAX_INLIER_DELAY_ERROR_TRACKED_S = 0.004
-"""Delay error in a residual once the delay is known, besides the remaining correction [s]."""
+MAX_DELAY_ERROR_AFTER_ESTIMATE_S = 0.004
+"""The same once the delay is known, in addition to the remaining correction [s]."""
 DELAY_SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
 _MAX_INLIER_RESIDUAL_SIGMAS, _MIN_DELAY_SAMPLES = 5.0, 50  # samples before offsets are estimated
@@ -80,7 +80,7 @@ class DelayTracker:
     def _reset_estimate(self, t: float) -> None:
         self._t = self._fitted = t
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
-        self._delay_error = MAX_INLIER_DELAY_ERROR_AT_START_S
+        self._delay_error = MAX_DELAY_ERROR_BEFORE_ESTIMATE_S
 
     def update_delay(
         self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
@@ -128,13 +128,13 @@ class DelayTracker:
         estimate = float(self._weights @ (gr - g * r)) / information
         rest = rr - r * r - estimate * (gr - g * r)
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
-        self._delay_error = MAX_INLIER_DELAY_ERROR_AT_START_S
+        self._delay_error = MAX_DELAY_ERROR_BEFORE_ESTIMATE_S
         if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
             max_change = MAX_DELAY_SLEW * elapsed
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
-            tracked = MAX_INLIER_DELAY_ERROR_TRACKED_S + abs(correction)
-            self._delay_error = min(MAX_INLIER_DELAY_ERROR_AT_START_S, tracked)
+            tracked = MAX_DELAY_ERROR_AFTER_ESTIMATE_S + abs(correction)
+            self._delay_error = min(MAX_DELAY_ERROR_BEFORE_ESTIMATE_S, tracked)
 
 
 _GRAVITY_W = np.array([0.0, 0.0, -9.81])

@@ -50,8 +50,8 @@ class ZeroAndLoadMonitor:
         self._pending: Future[list[TimedChangeText]] | None = None
         self._reported: list[float] = []
 
-    def add_reading(self, reading: streams.Reading, flags: int) -> None:
-        if flags & _UNTESTED_READING_FLAGS:
+    def add_reading(self, reading: streams.Reading, output_flags: int) -> None:
+        if output_flags & _UNTESTED_READING_FLAGS:
             return
         if not 0.0 < reading.t - self._last < MIN_CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
@@ -59,7 +59,7 @@ class ZeroAndLoadMonitor:
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
         self._count += 1
-        if flags & _TEST_TRIGGER_FLAGS:
+        if output_flags & _TEST_TRIGGER_FLAGS:
             self._last_flagged = t
             if self._flagged_since > t:
                 self._flagged_since, self._next_attempt = t, t + MIN_FLAGGED_TIME_S

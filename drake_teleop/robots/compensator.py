@@ -87,7 +87,7 @@ class Compensator:
     """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
-        delay_readings: motion delay that the source has removed, and delay of outputs [readings].
+        delay_readings: delay of outputs; the source has removed it from the motion [readings].
         predicted: extrapolate over `delay_readings` and the delay of the low-pass.
         sensor_range: (6,) range of the sensor [N, N m].
         scales: arguments of `set_scales`.

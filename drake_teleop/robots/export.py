@@ -96,8 +96,8 @@ def unused_sensor_pose_error(to: str) -> DrakeTeleopError:
 
 def refuse_removed_weight(found: Identification, to: str) -> None:
     if found.weight_removed:
-        what = "the robot has removed the load's weight from the wrench, and"
-        what += f" {to} would subtract it once more"
+        removed = "the robot has removed the load's weight from the wrench"
+        what = f"{removed}, and {to} would subtract it once more"
         remedy = "identify without payload compensation, or use `drake-teleop compensate` instead"
         raise DrakeTeleopError(what, where="export", remedy=remedy)
 

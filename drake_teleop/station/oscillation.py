@@ -25,10 +25,8 @@ MAX_FORCE_RIPPLE_RMS_AT_REST_N = 0.05
 _MIN_OSCILLATION_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 # A touch begins where the force exceeds this share of the largest force within the time around it.
 _MIN_TOUCH_FORCE_SHARE_OF_PEAK, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
-# Smallest time between two touches [s]; closer ones are bounces of one touch-down.
-_MIN_TOUCH_INTERVAL_S = 0.005
-# Largest time between two touches of a series [s]: 5 Hz.
-_MAX_TOUCH_INTERVAL_S = 0.2
+_MIN_TOUCH_INTERVAL_S = 0.005  # closer touches are bounces of one touch-down
+_MAX_TOUCH_INTERVAL_S = 0.2  # of a series: 5 Hz
 # Smallest number of touches, duration [s] and force [N] of a series.
 _MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.5
 # Largest time between a touch and the reversal of the command that explains it [s].

@@ -263,7 +263,7 @@ class SimulationResult:
         """
         from drake_teleop.common.style import Picture, plot_style, shade_contact
 
-        panels = [panel for name in names or self.signals for panel in self._plot_panels(name)]
+        panels = [panel for name in names or self.signals for panel in self._panels_by_unit(name)]
         with plot_style():
             figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
             rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -280,7 +280,7 @@ class SimulationResult:
             rows[-1].set_xlabel("t [s]")
         return figure
 
-    def _plot_panels(self, name: str) -> list[tuple[str, str, list[int]]]:
+    def _panels_by_unit(self, name: str) -> list[tuple[str, str, list[int]]]:
         if name in self._columns:
             signal, index = self._columns[name]
             return [(signal, self._specs[signal].units[index], [index])]

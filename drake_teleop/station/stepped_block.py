@@ -47,7 +47,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
 
     @abstractmethod
     def _advance(self, context: Context, results: list[Array]) -> None:
-        """Advance the states, the first arrays in `results`, and write the other arrays."""
+        """Advance the states `results[:num_states]` by a period; write the others, outputs."""
 
     def _calc_step(self, context: Context, step: AbstractValue) -> None:
         results = step.get_mutable_value()

@@ -19,7 +19,7 @@ from drake_teleop.live.device_client import DeviceClient, VirtualDevice, tapping
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import (
-    CLUTCH_OPEN,
+    CLUTCH_OPEN_FLAG,
     DeviceState,
     ForceCommand,
     pack_force,
@@ -65,7 +65,7 @@ def link():
 def test_packets_match_the_c_header():
     text = resources.files("drake_teleop.live").joinpath("drake_teleop_device.h").read_text()
     sizes = [int(size) for size in re.findall(r"device: (\d+) bytes", text)]
-    state = DeviceState(7, 1.5, (0.1, -0.2, 0.3), (0.0, 0.6, 0.8, 0.0), CLUTCH_OPEN, 0.004)
+    state = DeviceState(7, 1.5, (0.1, -0.2, 0.3), (0.0, 0.6, 0.8, 0.0), CLUTCH_OPEN_FLAG, 0.004)
     command = ForceCommand(7, 1.5, (1.0, 2.0, 3.0, 0.1, 0.2, 0.3))
     assert [len(pack_state(state)), len(pack_force(command))] == sizes
     assert unpack_state(pack_state(state)) == state
@@ -85,7 +85,7 @@ def test_invalid_packets_only_change_a_counter(link):
             # `behind` is only displayed: it is clipped to its range.
             assert unpack_state(odd[-1]) is None or (place == 80 and np.isfinite(value))
     far = DeviceState(1, 0.0, (0.0, 0.0, 0.0), (0.0, 1.8, 0.0, 0.0), 7, 1e9)
-    near = far._replace(quaternion_wxyz=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN, behind=1.0)
+    near = far._replace(quaternion_wxyz=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN_FLAG, behind=1.0)
     assert unpack_state(pack_state(far)) == near
     for places, values in zip(
         random.integers(0, 88, (500, 6)), random.integers(0, 256, (500, 6)), strict=True
@@ -193,7 +193,7 @@ def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link
     assert inputs["y"] == pytest.approx(2000.0)
     other.send(3, (0.1, 0.02, 0.0))
     assert "clutch" not in link.hand_inputs(0.2801)
-    other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN)
+    other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN_FLAG)
     assert link.hand_inputs(0.29)["clutch"] == 0
 
 
@@ -369,7 +369,7 @@ def test_inverse3_answers_every_message_of_its_service():
     assert places == [
         None,
         DeviceState(0, 0.0, (-0.2, 0.1, 0.3)),
-        DeviceState(0, 0.0, (-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
+        DeviceState(0, 0.0, (-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN_FLAG),
     ]
     values = [said["inverse3"][0]["commands"]["set_cursor_force"]["values"] for said in heard[1:]]
     assert values == [{"x": 0.0, "y": -1.0, "z": 0.0}, {"x": 0.0, "y": -2.0, "z": 0.0}]

@@ -79,8 +79,10 @@ def test_free_target_may_jump():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slow", [1, 10])
-@pytest.mark.parametrize("rates", [{"x": 12_000, "rz": 5000}, {"z": -777.7}, {"y": 2400, "x": 0}])
+@pytest.mark.parametrize(
+    ("slow", "rates"),
+    [(10, {"x": 12_000, "rz": 5000}), (1, {"z": -777.7}), (1, {"y": 2400, "x": 0})],
+)
 def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, rates):
     now, live = 0.0, Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, now)

@@ -12,7 +12,7 @@ import pytest
 
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_packets import (
-    CLUTCH_OPEN,
+    CLUTCH_OPEN_FLAG,
     ForceCommand,
     pack_force,
     unpack_state,
@@ -73,7 +73,7 @@ def test_client_sends_the_pose_and_displays_the_force(tmp_path):
     np.testing.assert_allclose(
         state.quaternion_wxyz, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12
     )
-    assert state.flags == CLUTCH_OPEN and 0.0 < state.behind < 1.0
+    assert state.flags == CLUTCH_OPEN_FLAG and 0.0 < state.behind < 1.0
     lines = [line.split() for line in output.splitlines() if line.startswith("force ")]
     assert {line[1] for line in lines} == {"1"}, "within a frame"
     forces = np.array([line[2:] for line in lines], float)

@@ -32,7 +32,7 @@ from drake_teleop.load.contact.detection import (
     update_statistics,
 )
 from drake_teleop.load.contact.noise_floor import (
-    MAX_SUMMED_SAMPLES,
+    MAX_GLR_WINDOW_SAMPLES,
     STATISTIC_NAMES,
     NoiseFloor,
     limit_covariance_to_scales,
@@ -194,13 +194,13 @@ def test_statistics_equal_their_definitions(contact, rho, slack):
 
 
 def test_window_of_the_likelihood_ratio_is_finite():
-    contact = np.zeros((3 * MAX_SUMMED_SAMPLES, 6))
+    contact = np.zeros((3 * MAX_GLR_WINDOW_SAMPLES, 6))
     contact[10] = 100.0 * NOISE
     glr = statistics_of_log(white(), contact, *at_rest(len(contact)))[:, 2]
-    assert glr[10 + MAX_SUMMED_SAMPLES - 1] == pytest.approx(
-        100.0 * math.sqrt(6.0 / MAX_SUMMED_SAMPLES)
+    assert glr[10 + MAX_GLR_WINDOW_SAMPLES - 1] == pytest.approx(
+        100.0 * math.sqrt(6.0 / MAX_GLR_WINDOW_SAMPLES)
     )
-    np.testing.assert_allclose(glr[10 + MAX_SUMMED_SAMPLES :], 0.0, atol=1e-9)
+    np.testing.assert_allclose(glr[10 + MAX_GLR_WINDOW_SAMPLES :], 0.0, atol=1e-9)
 
 
 @given(arrays(np.float64, (30, 6), elements=st.floats(-5.0, 5.0)))

@@ -18,6 +18,8 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
+pytestmark = pytest.mark.checks  # of a method that only benchmarks use
+
 NOISE = np.repeat([0.25, 0.012], 3)
 MOTION = np.repeat([0.06, 0.002, 1.5], 3)
 TRUTH = np.concatenate([OFFSETS, TOOL])

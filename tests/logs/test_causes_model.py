@@ -19,7 +19,7 @@ from drake_teleop.logs.causes.instants import (
     delay_of_linear_fit,
 )
 from drake_teleop.logs.causes.intervals import (
-    _load_variances_by_rejected_causes,
+    _phi_variances_by_rejected_causes,
     widening_factor_by_misfit,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
@@ -250,7 +250,7 @@ def test_rejected_causes_widen_the_load_by_their_score_or_smaller_residual():
         (0.0, 0.4, 1.0),
     ):
         rejected = [Candidate("drift", fit(3.0, ratio), score)]
-        found = _load_variances_by_rejected_causes(fit(0.0, 1.0), rejected)
+        found = _phi_variances_by_rejected_causes(fit(0.0, 1.0), rejected)
         np.testing.assert_allclose(found, share * (3.0**2 + 4.0))
 
 

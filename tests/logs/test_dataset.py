@@ -115,7 +115,7 @@ def test_another_tool_is_named() -> None:
     assert verdict(sample_episode(101, phi=other)) == {"tool changed"}
 
 
-@pytest.mark.parametrize("fps", [10.0, 15.0, 30.0, 50.0])
+@pytest.mark.parametrize("fps", [10.0, 30.0, 50.0])
 def test_clean_episodes_have_no_finding(fps: float) -> None:
     assert [verdict(sample_episode(k, fps=fps)) for k in range(3)] == [set()] * 3
 
@@ -146,6 +146,17 @@ def test_any_large_rotation_of_the_wrench_is_found(
     signals = EpisodeSignals(log_of(x))
     found, _ = find_simplest_hypothesis_and_residual(signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD)
     assert np.degrees(Rotation.from_matrix(found.axes[0] @ R.T).magnitude()) < 3.0
+
+
+STATE_COLUMNS = [f"observation.state[{k}]" for k in range(7)]
+WRENCH_COLUMNS = [f"observation.wrench[{k}]" for k in range(6)]
+LEROBOT = {
+    "wrench": {"force": {"columns": WRENCH_COLUMNS[:3]}, "torque": {"columns": WRENCH_COLUMNS[3:]}},
+    "pose": {
+        "position": {"columns": STATE_COLUMNS[:3]},
+        "orientation": {"columns": STATE_COLUMNS[3:], "form": "quaternion_wxyz"},
+    },
+}
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -192,7 +203,11 @@ def test_a_killed_run_continues_to_the_same_bytes(
 ) -> None:
     source = tmp_path / "demo"
     write_sample_dataset(source, episodes=2)
-    dataset_command(source, tmp_path / "whole", identify=True, quiet=True)
+    # A given description: the draft from the data takes most of the time of a run.
+    description = tmp_path / "columns.yaml"
+    description.write_text(json.dumps(LEROBOT))
+    options: dict[str, Any] = {"identify": True, "description": description, "quiet": True}
+    dataset_command(source, tmp_path / "whole", **options)
     judged, left = [], command._judge_episode
 
     def judge(task: Any, work: Path, number: int) -> None:
@@ -204,10 +219,10 @@ def test_a_killed_run_continues_to_the_same_bytes(
     monkeypatch.setattr(command, "_judge_episode", judge)
     out = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
-        dataset_command(source, out, identify=True, quiet=True)
+        dataset_command(source, out, **options)
     assert not (out / "summary.json").exists()
     judged.clear()
-    dataset_command(source, out, identify=True, quiet=True)
+    dataset_command(source, out, **options)
     assert judged == [1]
     whole, resumed = files_of(tmp_path / "whole"), files_of(out)
     for files in (whole, resumed):

@@ -88,7 +88,7 @@ def test_record_at_rest_has_one_pose_fit_and_no_search_over_wrench_edits(
         monkeypatch.setattr(module, name, counted)
 
     count(aligned_log, "estimate_from_poses", pose_fits)
-    count(against_load, "fit_load", load_fits)
+    count(against_load, "_fit_load_to_samples", load_fits)
     found = check_log(written(tmp_path, sway(size_mrad, noise_mm), imu=False))
     assert [finding.name for finding in found.findings] == ["payload"]
     assert len(pose_fits) == 1

@@ -413,7 +413,7 @@ def test_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("streams", [{}, {"pose": False}])
+@pytest.mark.parametrize("streams", [pytest.param({}, marks=pytest.mark.long), {"pose": False}])
 def test_reversed_gravity_is_not_reported_as_axes_and_a_torque_factor(
     tmp_path: Path, streams: dict[str, bool]
 ) -> None:

@@ -67,8 +67,7 @@ def test_identify_reports_no_change_of_a_constant_load(tmp_path: Path) -> None:
     assert summary["causes"] == [] and summary["loads"] == []
 
 
-@pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
-@pytest.mark.parametrize("cutoff_hz", [30.0, None])
+@pytest.mark.parametrize(("record", "cutoff_hz"), [("1-baseline", 30.0), ("2-vibrations", None)])
 def test_ntnu_records_have_one_load(
     ntnu: Path, tmp_path: Path, record: str, cutoff_hz: float | None
 ) -> None:
@@ -241,7 +240,7 @@ def test_contact_in_most_of_a_record_leaves_the_load_of_the_rest(tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_wrong_sign_is_no_error_of_the_clock(tmp_path: Path) -> None:
-    t = np.arange(0.0, 20.0, 4e-3)
+    t = np.arange(0.0, 12.0, 8e-3)
     wrench = load_wrench(t, TOOL)
     load = identify_log(posed_log(tmp_path, t, wrench)).identification
     found = eliminate_log(posed_log(tmp_path, t, wrench, sign=-1.0), load)

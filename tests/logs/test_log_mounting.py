@@ -184,7 +184,7 @@ def test_deviations_equal_the_scatter_of_repeated_records() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_wrench_determines_the_lever_arm_without_a_pose(seed: int) -> None:
     p = np.random.default_rng(seed).uniform(-0.1, 0.1, 3)
     recorder = Recorder(random_rotation(seed), p, seed, noise=3.0)

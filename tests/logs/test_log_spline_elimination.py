@@ -20,7 +20,7 @@ from drake_teleop.logs.causal import causal_low_pass
 from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.pose_motion.estimate import fit_motion_to_load
 from drake_teleop.logs.pose_motion.poses import Poses
-from drake_teleop.logs.pose_motion.rigid import load_coefficients
+from drake_teleop.logs.pose_motion.rigid import wrench_coefficients_of_load
 from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 from drake_teleop.logs.read.alignment import low_pass, remove_delay
@@ -317,7 +317,7 @@ def test_an_imu_is_used_where_the_load_explains_more_with_it(tmp_path, shift):
 def test_clock_of_the_poses_is_corrected_with_a_known_load(rate):
     t, wrench, poses = record(Kind(place=5e-5, turn=1e-4, seed=14))
     late = Poses(rate * poses.t, poses.position, poses.quaternion)
-    found = fit_motion_to_load(t, wrench, late, GRAVITY_W, load_coefficients(PHI))
+    found = fit_motion_to_load(t, wrench, late, GRAVITY_W, wrench_coefficients_of_load(PHI))
     assert found.clock_rate_error == pytest.approx(rate - 1.0, abs=2e-5)
 
 
@@ -330,7 +330,7 @@ def test_the_coefficients_of_a_load_give_its_wrench():
     rest, zeta = np.zeros_like(s), splines.signals(t, GRAVITY_W)
     removed = non_contact_wrench(-gravity, rest, rest, np.concatenate([weight, np.zeros(6)]))
     expected = non_contact_wrench(s, omega, alpha, PHI)
-    np.testing.assert_allclose(zeta @ load_coefficients(PHI).T, expected, atol=1e-12)
+    np.testing.assert_allclose(zeta @ wrench_coefficients_of_load(PHI).T, expected, atol=1e-12)
     np.testing.assert_allclose(
-        zeta @ load_coefficients(PHI, weight).T, expected - removed, atol=1e-12
+        zeta @ wrench_coefficients_of_load(PHI, weight).T, expected - removed, atol=1e-12
     )

@@ -49,7 +49,7 @@ def assert_nothing_is_certain_and_wrong(found: IdentifiedLog, torque_factor: flo
     assert (error < 4.0 * np.sqrt(np.diag(load.covariance)))[known].all()
 
 
-@pytest.mark.parametrize("torque_factor", [1.0, 100.0, 0.01])
+@pytest.mark.parametrize("torque_factor", [1.0, pytest.param(100.0, marks=pytest.mark.long), 0.01])
 def test_unknown_translation_corrects_neither_torque_unit_nor_pose_frame(
     tmp_path: Path, torque_factor: float
 ) -> None:

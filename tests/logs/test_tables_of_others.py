@@ -464,8 +464,15 @@ def test_numbered_quaternions_are_drafted(
     assert draft["pose"]["position"]["columns"] == ["x", "y", "z"] and left == []
 
 
-@pytest.mark.parametrize("push", [0.0, 50.0])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    ("sign", "push"),
+    [
+        (1, 0.0),
+        (-1, 50.0),
+        pytest.param(-1, 0.0, marks=pytest.mark.long),
+        pytest.param(1, 50.0, marks=pytest.mark.long),
+    ],
+)
 def test_order_of_quaternions_and_sign_are_found_together(
     tmp_path: Path, sign: int, push: float
 ) -> None:

@@ -188,7 +188,7 @@ ERRORS = {
     "SDF of two models": ("sdf", sdf("</model><model name='n'>"), "cannot be read as a robot"),
     "SDF of the future": ("sdf", sdf("", "99"), "Unable to convert from SDF version 99"),
     "SDF without an axis": ("sdf", sdf(sdf_joint("revolute", "")), "axis must be specified for"),
-    "SDF of a mimic": ("sdf", sdf(sdf_joint("revolute", "<axis><xyz>0 0 1</xyz><mimic joint='k'>"
+    "SDF of a mimic": ("sdf", sdf(sdf_joint("revolute", "<axis><xyz>0 0 1</xyz><mimic joint='j'>"
                        "<multiplier>1</multiplier></mimic></axis>")), "j moves with another"),
     "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "j is a gearbox joint"),
     "SDF of a fixed arm": ("sdf", sdf(sdf_joint("fixed")),

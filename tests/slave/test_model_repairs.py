@@ -249,6 +249,24 @@ def test_hold_frees_chain_from_coupled_joint_and_opens_gripper(tmp_path):
     np.testing.assert_allclose(p, [0, 0.03, 0.25], atol=1e-12)
 
 
+def test_joint_of_the_chain_does_not_mimic_a_joint_beside_it(tmp_path):
+    """Such joints are those of a parallelogram, of which the tree has one side."""
+    beside = joint(9, parent="l1", child="f") + link("f")
+    text = arm(j3=joint(3, inside='<mimic joint="j9" multiplier="-1"/>'), beyond=beside)
+    _, model, said = read(written(tmp_path, text))
+    assert model.joint_names == tuple(f"j{i}" for i in range(1, 7))
+    assert said.startswith("independent of the joint that it mimics, which does not move S: j3; ")
+    path = written(tmp_path, text)
+    with pytest.raises(DrakeTeleopError, match=r"j3 moves with another joint"):
+        read(path, hold={"j9": 0.3})  # which would not hold j3
+
+
+def test_massless_link_of_a_held_joint_before_the_arm_is_not_reported(tmp_path):
+    path = written(tmp_path, arm(l3=link("l3", "")))
+    assert "no inertia of l3" in read(path, hold={"j3": 0.2})[2]  # j1 and j2 move it
+    assert "no inertia" not in read(path, hold={"j1": 0.2, "j2": 0.1, "j3": 0.0})[2]
+
+
 @pytest.mark.parametrize(
     ("hold", "expected"),
     [

@@ -28,7 +28,7 @@ _UNIT_CIRCLE_TOLERANCE = 1e-9  # distance up to which a multiplier counts as on 
 
 @dataclass(frozen=True)
 class CutLoop:
-    """Transfer function L(z) of the one-axis loop, cut at the displayed force, without delay."""
+    """Open-loop transfer function L(z) of one axis, cut at the displayed force, without delay."""
 
     open_multipliers: Complex  #: (..., n) multipliers of the cut loop
     closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay

@@ -222,16 +222,16 @@ class CollisionScene:
             "capsule_ends": np.array([each.ends for each in outer_capsules]).reshape(-1, 2, 3),
             "capsule_radius": np.array([each.radius for each in outer_capsules]),
         }
-        capsules_apart = limits.capsule_distances(motions, *fields.values(), pairs)
+        capsule_distances = limits.capsule_distances(motions, *fields.values(), pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _required_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
+            distance = _required_capsule_distance(shape_distances[a, b], capsule_distances[:, k])
             near = shape_distances[a, b] < MIN_CLEARANCE_M
-            capsules_near = capsules_apart[:, k] < distance
+            capsules_near = capsule_distances[:, k] < distance
             if near.sum() >= _MIN_POSTURES_NEAR_CONTACT:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                near_share = np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M)
+                near_share = np.mean(capsule_distances[:, k] < MIN_CLEARANCE_M)
                 useful = near.any() or 0 < near_share < _MAX_POSTURE_SHARE_OF_RARE_CONTACT
             if useful:
                 used.append(k)
@@ -239,15 +239,15 @@ class CollisionScene:
         return fields | {"capsule_pairs": pairs[used], "min_pair_distances": np.array(distances)}
 
 
-def _required_capsule_distance(shape_distances: Array, capsules_apart: Array) -> float:
+def _required_capsule_distance(shape_distances: Array, capsule_distances: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     low, high = _NEAR_CONTACT_GAPS_M
     touching = (shape_distances > low) & (shape_distances < high)
     excess = np.zeros(1)
     if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT:
-        excess = (shape_distances - capsules_apart)[touching]
+        excess = (shape_distances - capsule_distances)[touching]
     required = MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE)
-    free = capsules_apart[shape_distances > MIN_CLEARANCE_M]
+    free = capsule_distances[shape_distances > MIN_CLEARANCE_M]
     return float(min(required, np.quantile(free, _BLOCKABLE_POSTURE_SHARE)))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, replace_file_on_success, write_picture
 from drake_teleop.common.texts import to_yaml_text
-from drake_teleop.lab.new_station.picture import draw_start
+from drake_teleop.lab.new_station.picture import draw_start_posture
 from drake_teleop.lab.new_station.plan import (
     SWING_HZ,
     StationPlan,
@@ -91,7 +91,7 @@ def new_command(
                 each.rmdir()
         raise
     picture = folder / "start.png"
-    write_picture(picture, draw_start(plan, f"{arm.stem}, sensor frame {sensor_frame}"))
+    write_picture(picture, draw_start_posture(plan, f"{arm.stem}, sensor frame {sensor_frame}"))
     if not quiet:
         _print_plan(plan, scenario, picture)
     return run_command(scenario, folder / "first_run", quiet=quiet)
@@ -113,8 +113,8 @@ def scenario_text(
     else:
         slave["home"] = place.home
     comments = {
-        "slave.position": f"sensor at the start, {plan.what_points_down} down [m]",
-        "slave.home": f"joints at the start, {plan.what_points_down} down [rad, m]",
+        "slave.position": f"sensor at the start, {plan.direction_at_start} [m]",
+        "slave.home": f"joints at the start, {plan.direction_at_start} [rad, m]",
         "slave.tip": "contact point, p_STip [m]",
         "slave.torque_limits": "the limits of the model cannot hold the arm",
         "kinematic_scaling": f"the arm can move {place.reachable_text}",
@@ -175,7 +175,7 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     for name, value in (
         ("Joints", f"{len(joint_names)}: {', '.join(joint_names)}"),
         ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
-        ("Start", f"sensor at {position} m, {plan.what_points_down} down"),
+        ("Start", f"sensor at {position} m, {plan.direction_at_start}"),
         ("Reachable from there", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
@@ -186,5 +186,5 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     notes += [f"assumed: {assumed}" for assumed in plan.assumptions]
     notes += [f"warning: {overlap}" for overlap in plan.overlap_warnings]
     notes += [f"picture of the start: {picture}"]
-    for line in (*notes, "the first run takes about a minute on an idle computer"):
+    for line in (*notes, "the first run takes one to two minutes on an idle computer"):
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -22,18 +22,11 @@ _WALL_THICKNESS_M = 0.1
 _LIGHT_DIRECTION = np.array([0.35, -0.5, 0.8])
 _VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from the tool
 _NUM_WALL_DIVISIONS = 8  # divisions of the wall in the picture
-# Directions (k, 3) whose extreme points represent a shape with more points.
-_HULL_SPIRAL_INDICES = np.arange(0.5, 250.0)
-_HULL_SPIRAL_HEIGHTS = 1.0 - _HULL_SPIRAL_INDICES / 125.0
-_HULL_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _HULL_SPIRAL_INDICES
-_HULL_SPIRAL_UNIT_XY = np.array([np.cos(_HULL_SPIRAL_ANGLES_RAD), np.sin(_HULL_SPIRAL_ANGLES_RAD)])
-_HULL_SAMPLE_DIRECTIONS = np.column_stack(
-    [*(np.sqrt(1.0 - _HULL_SPIRAL_HEIGHTS**2) * _HULL_SPIRAL_UNIT_XY), _HULL_SPIRAL_HEIGHTS]
-)
+_HULL_SAMPLE_DIRECTIONS = np.random.default_rng(0).normal(size=(250, 3))  # of extreme points
 
 
-def draw_start(plan: StationPlan, title: str) -> Figure:
-    """Draw the station in its start posture, meshes as convex hulls."""
+def draw_start_posture(plan: StationPlan, title: str) -> Figure:
+    """Draw the station in its start posture, shapes as convex hulls."""
     shapes, wall = plan.posture_shapes, plan.wall
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
@@ -58,9 +51,12 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
             axes.view_init(elevation, side + azimuth)
             _fit_view(axes, lower, upper, plan.base_plane_height)
         gap = 1e3 * (plan.lowest_tool_point_W[2] - wall.position[2])
-        plane = round(plan.base_plane_height, 2) + 0.0  # not -0
-        caption = f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m;"
-        caption += " axes of S: x red, y green, z blue; meshes as convex hulls"
+        plane = round(plan.base_plane_height, 3) + 0.0  # not -0
+        caption = f"tool (orange) {gap:.0f} mm above the wall; base plane: z_W = {plane:g} m; "
+        caption += "axes of S: x red, y green, z blue; "
+        is_incomplete = any("shapes are missing of" in text for text in plan.assumptions)
+        caption += "shapes of some links are missing" if is_incomplete else "meshes as convex hulls"
+        caption += ", sticks replace them" if shapes.has_sticks else ""
         figure.supxlabel(caption, x=0.02, ha="left", fontsize=9, color=BLACK)
     return figure
 

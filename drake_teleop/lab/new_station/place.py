@@ -38,15 +38,13 @@ from drake_teleop.station.slave.arm import (
     TRANSLATION_COLUMN,
     ArmModel,
     holding_torque,
-    pose_into,
 )
 from drake_teleop.station.slave.home import R_WS_HOME, q_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_warnings
 
-#: Edges of the walls that are tried, the first preferred [m].
-WALL_EDGES_M = (0.4, 0.25, 0.15)
+WALL_EDGES_M = (0.4, 0.25, 0.15)  #: edges of the walls that are tried, the first preferred
 _TRIAL_WALL_NAMES = {edge: f"wall of {edge:g} m" for edge in WALL_EDGES_M}
 #: Rotation R_SA from each axis of S to z.
 TOOL_AXES = {
@@ -77,6 +75,7 @@ _SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
 _MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
 # Cost of overlaps and of shapes below the base plane [1/m], of any overlap, of each smaller wall.
 _OVERLAP_COST_PER_M, _COST_OF_ANY_OVERLAP, _COST_OF_SMALLER_WALL = 30.0, 1.0, 0.1
+_COST_OF_TILTED_TOOL, MIN_COS_OF_TOOL_DOWN = 1.0, 0.9999  # the cosine of 0.8 degrees
 
 
 class StartPlace(NamedTuple):
@@ -177,7 +176,7 @@ def find_start_place(
         )
         remedy = "check joint limits and the orientation of sensor_frame"
         raise DrakeTeleopError(what, where="new", remedy=remedy)
-    pose = best.pose if axis == "z" else _sensor_pose_at(arm, best.q)
+    pose = best.pose if axis == "z" else arm.pose(best.q)
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
@@ -215,25 +214,32 @@ def _order_postures_to_solve(
 def _solved_starts(
     arm: ArmModel, postures: Postures, region: StartRegion, has_six_dof: bool
 ) -> Iterator[StartPlace]:
-    if not has_six_dof:  # position and orientation are coupled
-        solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
-    else:
+    if has_six_dof:
         pairs = zip(postures.q, postures.p_WS, strict=True)
         solved = [s for q, p_WS in pairs for s in _starts_at_rounded_position(arm, q, p_WS)]
+    else:  # position and orientation are coupled
+        solved = [s for k in range(len(postures.q)) for s in _coupled_starts(arm, postures, k)]
     if not solved:
         return
     rows = _rows_away_from_limits(arm, np.array([q for q, _, _ in solved]))
     solved = [solved[k] for k in rows]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), least_joint_margins(arm, exact.q)
+    merits -= _COST_OF_TILTED_TOOL * (exact.R_WS[:, 2, 2] > -MIN_COS_OF_TOOL_DOWN)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
         yield StartPlace(pose, by_position, q, 0.0, float(room), float(merit))
 
 
-def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
-    pose = np.empty(7)
-    pose_into(arm.table, q, pose)
-    return pose
+def _coupled_starts(arm: ArmModel, at: Postures, k: int) -> Iterator[tuple[Array, Array, bool]]:
+    # The posture, and that after the smallest rotation of its tool to downwards, if reachable.
+    R_WA, q = at.R_WS[k], at.q[k]
+    yield q, arm.pose(q), False
+    K = np.cross(np.cross(R_WA[:, 2], [0.0, 0.0, -1.0]), np.eye(3)).T
+    R_WA = (np.eye(3) + K + K @ K / (1.0 - R_WA[2, 2])) @ R_WA
+    pose = np.array([*RotationMatrix(R_WA).ToQuaternion().wxyz(), *at.p_WS[k]])
+    found, status = find_posture(arm, pose, q)
+    if status == IkStatus.OK:
+        yield found, pose, False
 
 
 def _starts_at_rounded_position(
@@ -343,7 +349,7 @@ def _can_reach_corner(
     q, status = find_posture(arm, target, place.q)
     if has_six_dof:
         return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_MOVE_TO_CORNER)
-    error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
+    error = np.linalg.norm(arm.pose(q)[4:] - target[4:])
     return bool(error < _MAX_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
 
 
@@ -390,7 +396,7 @@ def tool_frame_advice(
     R_SA, name = TOOL_AXES[axis], f"{sensor_frame}_z_to_tool"
     rpy = " ".join(f"{angle + 0.0:.5g}" for angle in RollPitchYaw(R_SA).vector())
     degrees = ", ".join(f"{angle + 0.0:.5g}" for angle in np.degrees(RollPitchYaw(R_SA).vector()))
-    quaternion = " ".join(f"{part + 0.0:.5g}" for part in R_SA.ToQuaternion().wxyz())
+    quaternion = " ".join(f"{part:.5g}" for part in R_SA.ToQuaternion().wxyz().round(5) + 0.0)
     lines = {
         ".xml": f'<body name="{name}" quat="{quaternion}"/> in the body {sensor_frame}',
         ".sdf": f'<frame name="{name}" attached_to="{sensor_frame}"><pose>0 0 0 {rpy}</pose>'

@@ -11,6 +11,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station import place as start
+from drake_teleop.lab.new_station.random_postures import random_postures
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
@@ -19,8 +20,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
 from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 
-#: Half edge of the Phantom's workspace cube around the default start [m] (E).
-_PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08
+_PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08  # of the cube around the default start (E)
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
@@ -48,7 +48,7 @@ class StationPlan:
         wall: horizontal wall, 1.5 swing amplitudes below this point.
         tip_S: (3,) the same point in S [m]; empty if z_S points down.
         tool_axis_advice: advice on the sensor frame if another axis than z_S points down, else "".
-        what_points_down: "tool", or an axis such as "x_S" if the tool cannot point down.
+        direction_at_start: such as "tool down", or "x_S down" if the tool cannot point down.
         weak_joints: names of joints whose torque limits cannot hold the arm.
     """
 
@@ -64,7 +64,7 @@ class StationPlan:
     tip_S: list[float]
     assumptions: tuple[str, ...]
     tool_axis_advice: str
-    what_points_down: str
+    direction_at_start: str
     overlap_warnings: tuple[str, ...]
     base_plane_height: float
     weak_joints: tuple[str, ...]
@@ -114,6 +114,9 @@ def plan_station(
     by_stiffness = _MAX_DISPLAYED_STIFFNESS_N_M / (_WALL_STIFFNESS_N_M * translation_scale)
     shapes.move_to(place.q)
     lowest = start.lowest_tool_point(shapes)
+    cosine = -(shapes.X_WS.rotation() @ start.TOOL_AXES[axis].matrix()[:, 2])[2]
+    tilt = f"{np.degrees(np.arccos(min(cosine, 1.0))):.0f} degrees from downwards"
+    direction = "down" if cosine > start.MIN_COS_OF_TOOL_DOWN else tilt
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
     swing *= min(1.0, _MAX_JOINT_SPEED_USE / _largest_speed_use_of_swing(model, place, swing))
@@ -138,7 +141,7 @@ def plan_station(
         tool_axis_advice=start.tool_frame_advice(
             arm, sensor_frame, axis, is_along_tool=is_along_tool
         ),
-        what_points_down="tool" if is_along_tool else f"{axis}_S",
+        direction_at_start=f"{'tool' if is_along_tool else f'{axis}_S'} {direction}",
         overlap_warnings=tuple(overlap_warnings(shapes, slave_only=True)),
         base_plane_height=plane,
         weak_joints=weak_joints,
@@ -191,10 +194,15 @@ def _has_tool_beyond_sensor_link(shapes: PostureShapes, axis: str) -> bool:
 def find_base_plane_height(shapes: PostureShapes) -> float:
     """Return the height z_W of the base plane [m]: the lowest point of shapes fixed to the world.
 
-    Without such shapes it is 0, or the first joint's height if that is lower.
+    Without such shapes it is 0, or the first joint's height if that is lower. Below a hanging arm
+    it is 0, or the lowest height of the sensor if that is lower.
     """
     heights = shapes.points_on_bodies(shapes.anchored_bodies())[:, 2]
-    return float(heights.min()) if len(heights) else min(float(shapes.arm.table[0, 11]), 0.0)
+    is_known = len(heights) > 0 and not shapes.has_sticks
+    plane = heights.min() if is_known else min(shapes.arm.table[0, 11], 0.0)
+    sensor_heights = random_postures(shapes.arm).p_WS[:, 2]
+    hangs = np.median(sensor_heights) < plane
+    return float(min(sensor_heights.min(), 0.0) if hangs else plane)
 
 
 def _stand_in_tool(axis: str, length: float) -> Tool:

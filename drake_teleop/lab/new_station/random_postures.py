@@ -29,12 +29,10 @@ _PREFERRED_TOOL_HEIGHT_OVER_REACH = 0.25
 _MIN_PREFERRED_HEIGHT_OVER_REACH = -0.4
 _MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
-# Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
 _HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_JOINT_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
 _MAX_RATIO_OF_ZERO_SINGULAR_VALUE = 1e-9  # singular values that are 0, over the largest
 _MAX_NEUTRAL_ELBOW_OFFSET_OVER_REACH = 0.03  # smaller offsets have no direction
-#: Sufficient values: margin to limits, smallest singular value over L, elbow up.
 _SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
 

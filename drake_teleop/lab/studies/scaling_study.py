@@ -78,7 +78,7 @@ def scaling_study_command(
     }
     with files.output_folder(out, "answer.json"):
         files.write_table(out / "answer.csv", _merit_table(answers))
-        files.write_picture(out / "answer.png", draw_criteria(rows))
+        files.write_picture(out / "answer.png", draw_task_criteria_over_scales(rows))
         files.write_picture(out / "choice.png", draw_best_scales(answers, *_sigmas_and_gammas()))
         files.write_json(out / "answer.json", summary)
     if not quiet:
@@ -198,7 +198,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     return table
 
 
-def draw_criteria(rows: dict[str, pl.DataFrame]) -> Figure:
+def draw_task_criteria_over_scales(rows: dict[str, pl.DataFrame]) -> Figure:
     sigmas, gammas = _sigmas_and_gammas()
     tasks = [task for task in TASK_CRITERIA if "force" in TASK_CRITERIA[task]]
     with plot_style():

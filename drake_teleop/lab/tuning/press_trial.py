@@ -282,7 +282,7 @@ class OneAxisGammaSearch:
     def share_in_one_axis(
         self, axis: OneAxis, settings: TunedSettings, grip: str, wall: float, seed: int
     ) -> float:
-        """Return the rendered share of contact force in a one-axis run; 0: unstable or noisy."""
+        """Return displayed over scaled contact force in a one-axis run; 0: unstable or noisy."""
         forward, backward = self.base_scenario.channel.networks_of_directions()
         held = axis_with_grip(axis, grip)
         shown = {f.name: getattr(held, f.name) for f in dataclasses.fields(AxisParameters)}
@@ -319,7 +319,7 @@ def short_press_task(round_trip: float) -> Task:
 
 
 def renderable_press_depth(base: Scenario, grip: str) -> float:
-    """Return an intended depth [m] in a wall whose force the device can render to the grip."""
+    """Return the hand's target depth [m] in a wall, limited by the device's peak force."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
     return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)

@@ -148,12 +148,12 @@ def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> SolvedNormalE
     return form
 
 
-def _std_growth_by_rejection(whole: EstimatorFit, kept: SecondMoments) -> float:
-    if kept.num_samples < _MIN_SAMPLES_TO_REJECT:
+def _std_growth_by_rejection(whole: EstimatorFit, kept_moments: SecondMoments) -> float:
+    if kept_moments.num_samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
     used = excited_columns(whole.moments.mean_products)
     variances = []
-    for moments in (whole.moments, kept):
+    for moments in (whole.moments, kept_moments):
         gram = moments.num_samples * normal_equations(moments.mean_products, whole.form.weights)[0]
         variances.append(np.sum(root_of_pseudo_inverse(gram, used) ** 2, axis=1)[used])
     return float(np.sqrt(np.max(variances[1] / variances[0])))

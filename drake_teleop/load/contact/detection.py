@@ -21,8 +21,8 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, positive_array
 from drake_teleop.load.contact.noise_floor import (
-    MAX_SUMMED_SAMPLES,
-    NUM_SUM_LENGTHS,
+    MAX_GLR_WINDOW_SAMPLES,
+    NUM_GLR_WINDOWS,
     DetectorSamples,
     NoiseFloor,
     noise_std_into,
@@ -33,12 +33,12 @@ from drake_teleop.load.contact.noise_floor import (
 
 # Indices into the memory: sample count; held |a|^2 and |alpha|^2; contact flag; samples
 # below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6);
-# sum of all e (6); ring of its last MAX_SUMMED_SAMPLES values.
+# sum of all e (6); ring of its last MAX_GLR_WINDOW_SAMPLES values.
 SAMPLE_COUNT_INDEX, HELD_SQUARES_START = 0, 1
 CONTACT_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 3, 4, 5
 NORMALIZED_WRENCH_START, MEAN_START, CUSUM_START = 8, 14, 20
 INNOVATION_SUM_START, RING_BUFFER_START = 26, 32
-MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
+MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_GLR_WINDOW_SAMPLES
 """Length of the memory of `update_statistics`."""
 CUSUM_SLACK = 1.0
 """Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
@@ -52,7 +52,7 @@ CONTACT_END_LEVEL = 0.7 * NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES
 @njit(cache=True)
 def _square_of_innovation_sum(memory, last, n):
     # The sum before the first sample is zero, as is the initial ring.
-    before = RING_BUFFER_START + 6 * ((last + MAX_SUMMED_SAMPLES - n) % MAX_SUMMED_SAMPLES)
+    before = RING_BUFFER_START + 6 * ((last + MAX_GLR_WINDOW_SAMPLES - n) % MAX_GLR_WINDOW_SAMPLES)
     total = 0.0
     for i in range(6):
         difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
@@ -97,9 +97,9 @@ def update_statistics(
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
         memory[CUSUM_START + i] *= shrink
-    here = RING_BUFFER_START + 6 * (count % MAX_SUMMED_SAMPLES)
+    here = RING_BUFFER_START + 6 * (count % MAX_GLR_WINDOW_SAMPLES)
     best, n = 0.0, 1
-    for m in range(NUM_SUM_LENGTHS):
+    for m in range(NUM_GLR_WINDOWS):
         if n > count + 1:
             break
         best = max(best, _square_of_innovation_sum(memory, count, n) / (n * widths[m] * widths[m]))
@@ -115,7 +115,7 @@ def update_statistics(
 @njit(cache=True)
 def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
     m = 0
-    while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
+    while 2 << m <= min(hold, MAX_GLR_WINDOW_SAMPLES // 2):
         m += 1
     last = int(memory[SAMPLE_COUNT_INDEX]) - 1
     total = _square_of_innovation_sum(memory, last, 1 << m)
@@ -164,7 +164,7 @@ def _detect_contact_in_rows(memory, rows, settings, statistics, flags):
 
 
 def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUSUM_SLACK) -> Array:
-    """Return level, cusum and glr (N, 3) for the arrays of a `DetectorSamples`."""
+    """Return (N, 3) with columns level, cusum, glr for the arrays of a `DetectorSamples`."""
     # Without contact, which would reset the sums.
     flag_settings = float(positive_array("slack", slack)), 0.0, 0, np.inf, CONTACT_END_LEVEL, 0
     settings = floor.compiled_parameters, flag_settings
@@ -297,7 +297,7 @@ def fit_noise_floor(
     rho = np.clip(np.sum(z[1:] * z[:-1], axis=0) / energy, 0.0, _MAX_LAG_ONE_CORRELATION)
     e = (z[1:] - rho * z[:-1]) / np.sqrt(1.0 - rho**2)
     sums = np.cumsum(np.vstack([np.zeros(6), e]), axis=0)
-    lengths = [min(2**m, len(e)) for m in range(NUM_SUM_LENGTHS)]
+    lengths = [min(2**m, len(e)) for m in range(NUM_GLR_WINDOWS)]
     squares = [np.sum((sums[n:] - sums[:-n]) ** 2, axis=1) / n for n in lengths]
     power = np.array([square.mean() for square in squares]) / 6.0
     rare = np.array([np.quantile(square, 1.0 - _RARE_SUM_SHARE) for square in squares])

@@ -21,10 +21,10 @@ from drake_teleop.common.vectors import dot
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.load.regressor import regressor_into
 
-MAX_SUMMED_SAMPLES = 128
-"""Longest window of the likelihood ratio [samples], a power of two."""
-NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
-"""Number of windows: 1, 2, 4 ... MAX_SUMMED_SAMPLES samples."""
+MAX_GLR_WINDOW_SAMPLES = 128
+"""Longest window of the likelihood ratio (GLR) [samples], a power of two."""
+NUM_GLR_WINDOWS = MAX_GLR_WINDOW_SAMPLES.bit_length()
+"""Number of windows: 1, 2, 4 ... MAX_GLR_WINDOW_SAMPLES samples."""
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
@@ -80,7 +80,7 @@ class NoiseFloor:
     per_acceleration: Array
     correlation: Array
     rho: Array
-    sum_widths: Array = field(default_factory=lambda: np.ones(NUM_SUM_LENGTHS))
+    sum_widths: Array = field(default_factory=lambda: np.ones(NUM_GLR_WINDOWS))
     fade: float = 0.0
     free_maxima: Array = field(default_factory=lambda: np.zeros(3))
 
@@ -90,7 +90,7 @@ class NoiseFloor:
         finite_array("per_acceleration", self.per_acceleration, 6, 2)
         correlation = finite_array("correlation", self.correlation, 6, 6)
         rho = finite_array("rho", self.rho, 6)
-        positive_array("sum_widths", self.sum_widths, NUM_SUM_LENGTHS)
+        positive_array("sum_widths", self.sum_widths, NUM_GLR_WINDOWS)
         finite_array("free_maxima", self.free_maxima, 3)
         indefinite = np.linalg.eigvalsh(correlation).min() <= 0.0
         worst = rho[np.abs(rho).argmax()]

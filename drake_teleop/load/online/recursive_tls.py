@@ -148,7 +148,7 @@ def weighted_right_side(LZ, W, index, factors, g):
 
 @njit(cache=True)
 def eliminate_rows(A):
-    """Replace the rows [S B] in A by [D L^T, L^-1 B], for symmetric S = L D L^T (n, n)."""
+    """Replace A = [S B] by [D L^T, L^-1 B], for symmetric S = L D L^T (n, n)."""
     n, m = A.shape
     for k in range(n):
         inverse = 1.0 / A[k, k]

@@ -22,9 +22,9 @@ from drake_teleop.logs.causes.changes import remove_small_steps
 from drake_teleop.logs.causes.instants import BlockMeans, delay_of_linear_fit
 from drake_teleop.logs.causes.intervals import (
     GOOD_SMOOTH_MISFIT,
-    load_covariance_by_gain_errors,
-    load_covariance_by_torque_unit,
-    load_deviations_if_unexplained,
+    covariance_of_load_by_gain_errors,
+    covariance_of_load_by_torque_unit,
+    deviations_of_load_if_unexplained,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, LoadModel
 from drake_teleop.logs.causes.state import FittedModel, fit_model
@@ -267,8 +267,8 @@ def explain_misfit(
     with one_blas_thread():
         state, delay_s, rejected = search_causes(data, means_at, always_fitted)
         blocks = intervals.jackknife_load_deviations(state)
-        gains = load_covariance_by_gain_errors(state) + load_covariance_by_torque_unit(state)
-        covariance = intervals.load_covariance(state, rejected, blocks, gains)
+        gains = covariance_of_load_by_gain_errors(state) + covariance_of_load_by_torque_unit(state)
+        covariance = intervals.covariance_of_load(state, rejected, blocks, gains)
         causes = cause.name_misfit_causes(state, always_fitted)
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):
@@ -278,7 +278,7 @@ def explain_misfit(
             explained=only_noise,
             theta=state.x[OFFSETS_AND_LOAD],
             covariance=covariance,
-            misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
+            misfit_deviations=deviations_of_load_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(cause.loads_between_changes(state, covariance)),
             state=state,

@@ -28,7 +28,7 @@ _MIN_LIKELIHOOD_RISE_BY_GAINS, _MIN_SHARE_EXPLAINED_BY_GAINS = 20.0, 0.5
 _MAX_PLAUSIBLE_GAIN_STD = 0.025
 
 
-def load_covariance(
+def covariance_of_load(
     state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
@@ -36,12 +36,12 @@ def load_covariance(
     deviations = np.sqrt(np.diag(out))
     factor = widening_factor_by_misfit(state, jackknife_std)
     squares = np.maximum(factor * deviations, jackknife_std) ** 2
-    squares = squares + _load_variances_by_rejected_causes(state, rejected)
+    squares = squares + _phi_variances_by_rejected_causes(state, rejected)
     ratio = np.sqrt(squares) / deviations
     return np.asarray(out * np.outer(ratio, ratio) + gain_covariance)
 
 
-def load_deviations_if_unexplained(
+def deviations_of_load_if_unexplained(
     state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
     """Return jackknife standard deviations (16,) of [offsets; phi] with an unexplained misfit."""
@@ -51,11 +51,11 @@ def load_deviations_if_unexplained(
         growth = 1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
         jackknife_std = jackknife_std * growth
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
-    variance = jackknife_std**2 + _load_variances_by_rejected_causes(state, lasting)
+    variance = jackknife_std**2 + _phi_variances_by_rejected_causes(state, lasting)
     return np.asarray(np.sqrt(variance + np.diag(gain_covariance)))
 
 
-def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
+def _phi_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
     squares = np.zeros(16)
     for candidate in rejected:
         other, score = candidate.state, candidate.score
@@ -67,7 +67,7 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
     return squares
 
 
-def load_covariance_by_gain_errors(state: FittedModel) -> Array:
+def covariance_of_load_by_gain_errors(state: FittedModel) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to gain errors; 0 if unlikely."""
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
@@ -103,7 +103,7 @@ def load_covariance_by_gain_errors(state: FittedModel) -> Array:
     return np.asarray(effects @ effects.T)
 
 
-def load_covariance_by_torque_unit(state: FittedModel) -> Array:
+def covariance_of_load_by_torque_unit(state: FittedModel) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in fits_with_other_torque_units(state):
@@ -112,7 +112,7 @@ def load_covariance_by_torque_unit(state: FittedModel) -> Array:
     return out
 
 
-def load_bias_by_alpha_noise(state: FittedModel) -> Array:
+def bias_of_load_by_alpha_noise(state: FittedModel) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     data = state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop))

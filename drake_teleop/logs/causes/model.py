@@ -120,10 +120,10 @@ class LoadModel:
         """Return the model's wrench for x (B, size), as coefficients (B, 6, W) of W signals."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, _columns_of_step(len(self.steps)).start))
-        out[..., : instants.NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
+        out[..., : instants.NUM_SIGNALS] = _wrench_coefficients_of_load(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
-                load = _load_coefficients(x[:, parts[f"step {i}"]])
+                load = _wrench_coefficients_of_load(x[:, parts[f"step {i}"]])
                 out[..., _columns_of_step(i)] = load @ motion[..., COLUMNS_REPEATED_BY_STEP]
         if "weight" in parts:
             removed = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
@@ -190,7 +190,7 @@ def _columns_of_step(i: int) -> slice:
     return slice(start, start + len(COLUMNS_REPEATED_BY_STEP))
 
 
-def _load_coefficients(phi: Array) -> Array:
+def _wrench_coefficients_of_load(phi: Array) -> Array:
     return np.einsum("bj,cjk->bck", phi, _REGRESSOR_TENSOR)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import fdtri
@@ -71,16 +72,45 @@ class LoadFitQuality:
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     """Return the quality of a load's fit to the best fitting `kept_share` of a low-passed log."""
+    return _fit_load_to_samples(_low_passed_samples(log), kept_share)
+
+
+class _LowPassedSamples(NamedTuple):
+    wrench: Array
+    motion: tuple[Array, Array, Array]
+    gravity: Array | None  # only if the weight is estimated
+    cutoff_hz: float | None
+    dt: float
+    duration_s: float
+    wrench_noise: Array
+
+
+def _low_passed_samples(log: Log) -> _LowPassedSamples:
+    """Return copies of few samples, so that the results for many edits need little memory."""
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_FITTED_SAMPLES))
-    wrench = smooth.wrench[rows]
+    s, omega, alpha = (x[rows].copy() for x in smooth.motion)
+    gravity = smooth.gravity[rows].copy() if smooth.gravity is not None else None
+    return _LowPassedSamples(
+        smooth.wrench[rows].copy(),
+        (s, omega, alpha),
+        gravity if "weight" in log.estimated else None,
+        cutoff,
+        log.dt,
+        float(log.t[-1] - log.t[0]),
+        white_noise_deviations(log.wrench),
+    )
+
+
+def _fit_load_to_samples(samples: _LowPassedSamples, kept_share: float) -> LoadFitQuality:
+    wrench, cutoff = samples.wrench, samples.cutoff_hz
     scale = _wrench_channel_scales(wrench)
-    V = regressor(*(x[rows] for x in smooth.motion))
-    if "weight" in log.estimated and smooth.gravity is not None:
-        rest = np.zeros_like(smooth.gravity[rows])
-        V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
+    V = regressor(*samples.motion)
+    if samples.gravity is not None:
+        rest = np.zeros_like(samples.gravity)
+        V = np.dstack([V, regressor(-samples.gravity, rest, rest)[..., :4]])
     V, w = V / scale[:, None], wrench / scale
     theta = _fit_load_parameters(V, w)
     if kept_share < 1.0:
@@ -94,9 +124,9 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     if cutoff is None:
         return LoadFitQuality(unexplained, float(theta[0]), 0.0, max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
-    passed = min(1.0, 1.67 * cutoff * log.dt)
-    noise_share = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
-    independent_samples = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
+    passed = min(1.0, 1.67 * cutoff * samples.dt)
+    noise_share = passed * float(((samples.wrench_noise / scale) ** 2).sum()) / total
+    independent_samples = 2 * cutoff * kept_share * samples.duration_s
     return LoadFitQuality(unexplained, float(theta[0]), noise_share, independent_samples)
 
 
@@ -137,17 +167,21 @@ def check_wrench_and_estimate_delay(
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
     too_still = too_little_motion(thin)
+    samples_of_edits: dict[int, list[_LowPassedSamples]] = {}  # by identity of the description
 
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFitQuality:
-        # A wrong description may cause a wrong delay.
-        log = _log_with_edited_wrench(thin, description, edited)
-        why = too_still
-        if log is None:
-            log = data.read_thinned_log(edited)
-            why = too_little_motion(log)
-        if edited is not description and why is not None:
-            raise DrakeTeleopError(why)
-        fits = [fit_load(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
+        if id(edited) not in samples_of_edits:
+            # A wrong description may cause a wrong delay.
+            log = _log_with_edited_wrench(thin, description, edited)
+            why = too_still
+            if log is None:
+                log = data.read_thinned_log(edited)
+                why = too_little_motion(log)
+            if edited is not description and why is not None:
+                raise DrakeTeleopError(why)
+            aligned = [remove_delay(log, shift) for shift in {0.0, delay or 0.0}]
+            samples_of_edits[id(edited)] = [_low_passed_samples(each) for each in aligned]
+        fits = [_fit_load_to_samples(each, kept_share) for each in samples_of_edits[id(edited)]]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fit_edited_description(description)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from drake_teleop.common.numeric import Array
@@ -58,6 +60,7 @@ def too_little_motion(log: Log) -> str | None:
     )
 
 
+@lru_cache(maxsize=1)  # edits of the wrench keep the poses, whose identity is the key
 def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
     """Return `motion_rms` by covariance of even and odd poses, in which noise cancels, or None."""
     poses = posed.poses.with_continuous_quaternions()

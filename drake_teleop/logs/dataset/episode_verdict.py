@@ -23,8 +23,8 @@ from drake_teleop.logs.pose_motion.splines import MIN_POSES_PER_KNOT, PoseSpline
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
-LAG_STEPS_PER_FRAME = 8
-"""Steps of the lag per frame."""
+TRIED_LAGS_PER_FRAME = 8
+"""Evenly spaced lags within one frame that are tried."""
 MAX_LAG_FRAMES = 8
 HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 """Wrenches of the load: in S; without its weight; in the axes of the base."""
@@ -219,7 +219,7 @@ class HypothesisSearch:
     def best_lag(self, x: WrenchHypothesis) -> float:
         """Return the lag [frames] at which hypothesis x has the least spread."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
-        for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
+        for step in (0.5, 1.0 / TRIED_LAGS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
             found = (self.with_spread_and_cost(replace(x, lag=float(y))) for y in lags)
             lag, reach = min(found, key=lambda x: x.spread.sum()).lag, 0.5
@@ -339,9 +339,9 @@ class EpisodeSignals:
             poses = log.posed.poses
             spacing = max(MIN_POSES_PER_KNOT / poses.rate, _MIN_POSE_KNOT_SPACING_S)
             self._splines = PoseSplines(poses, spacing, smooth=True)
-        margin = _MOTION_MARGIN_FRAMES * LAG_STEPS_PER_FRAME
-        steps = np.arange(-margin, len(log) * LAG_STEPS_PER_FRAME + margin)
-        self._fine = self.motion(log.t[0] + steps / LAG_STEPS_PER_FRAME * log.dt)
+        margin = _MOTION_MARGIN_FRAMES * TRIED_LAGS_PER_FRAME
+        steps = np.arange(-margin, len(log) * TRIED_LAGS_PER_FRAME + margin)
+        self._fine = self.motion(log.t[0] + steps / TRIED_LAGS_PER_FRAME * log.dt)
 
     def motion(self, t: Array) -> Motion:
         log = self.log
@@ -354,10 +354,10 @@ class EpisodeSignals:
 
     def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) at `lag` frames after each frame."""
-        first = (lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME
+        first = (lag + _MOTION_MARGIN_FRAMES) * TRIED_LAGS_PER_FRAME
         step = round(first)
         if abs(step - first) < 1e-6 and abs(lag) < _MOTION_MARGIN_FRAMES:
-            rows = slice(step, step + LAG_STEPS_PER_FRAME * len(self.log), LAG_STEPS_PER_FRAME)
+            rows = slice(step, step + TRIED_LAGS_PER_FRAME * len(self.log), TRIED_LAGS_PER_FRAME)
             return Motion(*(x[rows] for x in self._fine))
         return self.motion(self.log.t + lag * self.log.dt)
 

@@ -20,7 +20,7 @@ from drake_teleop.load.contact.noise_floor import (
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.dataset import episode_verdict
 from drake_teleop.logs.dataset.episode_verdict import (
-    LAG_STEPS_PER_FRAME,
+    TRIED_LAGS_PER_FRAME,
     EpisodeSignals,
     WrenchHypothesis,
 )
@@ -77,8 +77,8 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     phi = load.phi if determined else phi_with_inertia_replaced(load)[0]
     chosen = _episodes_sharing_load(episodes, phi)
     usual = [x.faultless_hypothesis_and_residual(phi) for x in chosen]
-    steps = float(np.median([x.lag for x, _ in usual])) * LAG_STEPS_PER_FRAME
-    lag = round(steps) / LAG_STEPS_PER_FRAME
+    steps = float(np.median([x.lag for x, _ in usual])) * TRIED_LAGS_PER_FRAME
+    lag = round(steps) / TRIED_LAGS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
     limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.STANDARD_NORMAL_QUARTILE, []
     for episode, (x, residual) in zip(chosen, usual, strict=True):
@@ -113,8 +113,8 @@ class _FittedEpisode(NamedTuple):
         search = episode_verdict.HypothesisSearch(
             self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
         )
-        steps = np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1)
-        lags = self.own.lag + steps / LAG_STEPS_PER_FRAME
+        steps = np.arange(-TRIED_LAGS_PER_FRAME, TRIED_LAGS_PER_FRAME + 1)
+        lags = self.own.lag + steps / TRIED_LAGS_PER_FRAME
         found = (
             search.with_spread_and_cost(episode_verdict.hypothesis_without_fault(float(lag)))
             for lag in lags

@@ -278,7 +278,7 @@ def _taper_zero_in_gaps(
     return spectra.exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
 
-def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
+def _pose_frame_of_fit(free: RigidFit, described: RigidParameters) -> PoseFrame:
     R_SP, r = free.parameters.R_PS.T, free.parameters.p_PoSo_P
     origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
@@ -290,8 +290,8 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     if not known.all():
         lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_DERIVATIVE_BY_UNDETERMINED
         deviations = np.where(lost, np.inf, deviations)
-    moved = free.parameters.p_PoSo_P - start.p_PoSo_P
-    turned = Rotation.from_matrix(start.R_PS.T @ free.parameters.R_PS).as_rotvec()
+    moved = free.parameters.p_PoSo_P - described.p_PoSo_P
+    turned = Rotation.from_matrix(described.R_PS.T @ free.parameters.R_PS).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
     limits = MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M

@@ -307,9 +307,9 @@ _MIN_REJECTION_MARGIN_S = 0.1  # least margin on both sides of a rejected time s
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return True for instants (M,) with contact, impact or saturation, and a note.
+    """Return flags (M,) of instants to reject (contact, impact, saturation), and a note.
 
-    `spacing` is that of the splines' knots [s]. The note is "" unless rejection is impossible.
+    `spacing`: of the knots [s]. If too little motion would remain, none is flagged, with a note.
     """
     # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
     window, grid = spectra.window, spectra.window.grid

@@ -71,9 +71,9 @@ class ImuData:
 
 @dataclass(frozen=True, eq=False)
 class PosesOfLog:
-    """Poses of S in a log, with gravity (3,) in the world [m/s^2].
+    """Poses of frame P in a log, with gravity (3,) in the world [m/s^2].
 
-    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are those of the log description.
+    `p_SoPo_S` (3,) [m], `R_SP` (3, 3): P in the sensor's frame S, by the description.
     """
 
     poses: Poses

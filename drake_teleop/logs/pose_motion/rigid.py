@@ -77,7 +77,7 @@ class RigidFit:
 
 
 def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
-    """Return M (19, 22), Eq. (T79), from [signals of P; wrench] to [1; wrench; motion of S]."""
+    """Return M (19, 22), (T79): [`PoseSplines.signals`; wrench] to [1; wrench; motion of S]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
@@ -90,7 +90,7 @@ def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
     return M
 
 
-def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
+def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without a weight [m, m c] (4,)."""
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
@@ -363,9 +363,9 @@ def estimate_position_unit_axes_and_masses(fit: LinearFit) -> UnitsAndAxes:
     return UnitsAndAxes(kappa, deviation, largest, U @ Vt, masses)
 
 
-def _position_unit_ratio(a: Array, g: Array, v_a: Array, v_g: Array) -> tuple[float, float]:
+def _position_unit_ratio(M_a: Array, M_g: Array, v_a: Array, v_g: Array) -> tuple[float, float]:
     known = (v_a > 0.0) & (v_g > 0.0)
-    a, g, v_a, v_g = (x[known] for x in (a, g, v_a, v_g))
+    a, g, v_a, v_g = (x[known] for x in (M_a, M_g, v_a, v_g))
     kappa = 0.0
     for _ in range(_UNIT_RATIO_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)

@@ -19,6 +19,7 @@ from drake_teleop.logs.read.canonical import Log
 
 _MIN_SAMPLES_AFTER_DELAY = 8
 _INTERPOLATED_CHUNK_ROWS = 2**18
+_MAX_VALUES_PER_TRANSFORM = 2**18  # limits the memory of the low-pass
 _MIN_SMOOTHER_WINDOW_SAMPLES, _SMOOTHER_DEGREE = 9, 5
 SMOOTHER_WINDOW_OVER_PERIOD = 1.8  # window [s] of the smoother times its bandwidth [Hz]
 
@@ -64,15 +65,29 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
     # connect the two continuations by a straight line.
     length = next_fast_len(n + 2 * pad, real=True)
     gain = 1 / (1 + (np.fft.rfftfreq(length, dt) / cutoff_hz) ** 4)
-    out, padded = np.empty((n, x.size // n)), np.empty(length)
-    for column, filtered in zip(x.reshape(n, -1).T, out.T, strict=True):
-        padded[pad : pad + n] = column
-        padded[:pad] = 2 * column[0] - column[pad:0:-1]
-        padded[pad + n : 2 * pad + n] = 2 * column[-1] - column[-2 : -2 - pad : -1]
-        end = 2 * pad + n
-        padded[end:] = np.linspace(padded[end - 1], padded[0], length - end)
-        filtered[:] = np.fft.irfft(np.fft.rfft(padded) * gain, length)[pad : pad + n]
+    out = np.empty((n, x.size // n))
+    columns = x.reshape(n, -1).T
+    count = max(1, _MAX_VALUES_PER_TRANSFORM // length)
+    for first in range(0, len(columns), count):  # one transform of several columns is faster
+        part = slice(first, first + count)
+        padded = _pad_by_continuation(columns[part], pad, length)
+        out.T[part] = np.fft.irfft(np.fft.rfft(padded) * gain, length)[:, pad : pad + n]
     return out.reshape(x.shape)
+
+
+def _pad_by_continuation(x: Array, pad: int, length: int) -> Array:
+    """Return rows x (k, N), continued at both ends by `pad` point reflections, (k, length)."""
+    n, end = x.shape[1], x.shape[1] + 2 * pad
+    padded = np.empty((len(x), length))
+    padded[:, pad : pad + n] = x
+    padded[:, :pad] = 2 * x[:, :1] - x[:, pad:0:-1]
+    padded[:, pad + n : end] = 2 * x[:, -1:] - x[:, -2 : -2 - pad : -1]
+    start, stop = padded[:, end - 1 : end], padded[:, :1]
+    step = (stop - start) / max(length - end - 1, 1)
+    padded[:, end:] = np.arange(length - end) * step + start
+    if length - end > 1:
+        padded[:, -1:] = stop
+    return padded
 
 
 def smooth_derivatives(

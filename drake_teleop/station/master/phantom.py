@@ -60,10 +60,10 @@ _STOP_STIFFNESSES, _STOP_DAMPINGS = np.repeat([300.0, 5.0], 3), np.repeat([1.5, 
 # Moments of inertia of the point masses of the links.
 _LINK_1_INERTIA = L1**2 * (MASS_A + MASS_C / 4)
 _LINK_2_INERTIA, _LINK_3_INERTIA = L2**2 * MASS_A / 4, L3**2 * MASS_C
-# M11 = _M11_CONSTANT + _M11_COS2Q2 cos 2 q2 + _M11_COS2Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
+# Terms of M11 [kg m^2]: constant, times cos 2 q2, times cos 2 q3, 2 _M23_MAX times cos q2 sin q3.
 _inertia_sum = sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
 _constant_terms = _inertia_sum + _LINK_1_INERTIA + _LINK_2_INERTIA + _LINK_3_INERTIA
-_M11_CONSTANT = INERTIA_BASE_YY + 0.5 * _constant_terms
+_M11_CONSTANT_TERM_KG_M2 = INERTIA_BASE_YY + 0.5 * _constant_terms
 _cosine_terms = INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + _LINK_1_INERTIA
 _M11_COS2Q2 = 0.5 * _cosine_terms
 _cosine_terms = INERTIA_A[1] - INERTIA_A[2] + INERTIA_DF[1] - INERTIA_DF[2]
@@ -79,7 +79,7 @@ _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6
 @njit(cache=True)
 def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
-    M[0, 0] = _M11_CONSTANT + _M11_COS2Q2 * math.cos(2.0 * q[1])
+    M[0, 0] = _M11_CONSTANT_TERM_KG_M2 + _M11_COS2Q2 * math.cos(2.0 * q[1])
     M[0, 0] += _M11_COS2Q3 * math.cos(2.0 * q[2])
     M[0, 0] += 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
     M[1, 1], M[2, 2] = _M22, _M33

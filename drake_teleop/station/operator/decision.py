@@ -188,10 +188,10 @@ def _contact_force_at_tool_along_approach(task, person, felt):
 
 
 @njit(cache=True)
-def _update_and_check_criterion(memory, time, good, still_good):
-    if memory[_CRITERION_MET_SINCE] < 0.0 and good:
+def _update_criterion_with_hysteresis(memory, time, is_met, is_nearly_met):
+    if memory[_CRITERION_MET_SINCE] < 0.0 and is_met:
         memory[_CRITERION_MET_SINCE] = time
-    elif not still_good:
+    elif not is_nearly_met:
         memory[_CRITERION_MET_SINCE] = -1.0
     return memory[_CRITERION_MET_SINCE] >= 0.0
 
@@ -242,7 +242,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
         if task.kind == tasks.KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
-            _update_and_check_criterion(memory, time, True, True)
+            _update_criterion_with_hysteresis(memory, time, True, True)
             and time - memory[_CRITERION_MET_SINCE] >= task.dwell
         ):
             _finish_task(state, memory, time, 1.0)
@@ -277,7 +277,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
     error = _perceived_standoff_target(task, person) - seen_W
     off = math.sqrt(dot(error, error))
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
-    met = _update_and_check_criterion(memory, time, inside, still_inside)
+    met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
     if task.kind == tasks.KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
@@ -335,8 +335,8 @@ def _displacement_to_set_force(task, memory, force):
 def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
     error = abs(task.force - force)
-    good, still_good = error <= 0.5 * task.tolerance, error <= task.tolerance
-    met = _update_and_check_criterion(memory, time, good, still_good)
+    is_met, is_nearly_met = error <= 0.5 * task.tolerance, error <= task.tolerance
+    met = _update_criterion_with_hysteresis(memory, time, is_met, is_nearly_met)
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:

@@ -294,7 +294,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intended_motion_inputs() | {self.time_ticket()}
+        moving = self._declare_intended_motion_sources() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("Operator: a task requires the arguments training, arm and tip")
@@ -321,7 +321,7 @@ class Operator(LeafSystem):
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
-    def _declare_intended_motion_inputs(self) -> set[DependencyTicket]:
+    def _declare_intended_motion_sources(self) -> set[DependencyTicket]:
         # `LiveHand` replaces these ports by a path to external targets.
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)

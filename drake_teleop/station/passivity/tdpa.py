@@ -106,15 +106,15 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         ledger[g] += fields.count_newly_received_energy(g, received, memory)
         limit_group(wrench, g, limits[g])
         share = min(1.0, 1.0 - withheld[g] + release)
-        drained = dot_of_group(wrench, dx, g)
+        work_on_hand = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
-        if share * drained > drain * stored:
+        if share * work_on_hand > drain * stored:
             max_decrease = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
             least = length_of_group(memory[slots.LAST_PORT_WRENCH], g) - max_decrease
-            share = min(share, max(drain * stored / drained, least / length_of_group(wrench, g)))
-            share = min(share, stored / drained)
+            by_rates = max(drain * stored / work_on_hand, least / length_of_group(wrench, g))
+            share = min(share, by_rates, stored / work_on_hand)
         withheld[g] = 1.0 - share
-        memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * drained
+        memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * work_on_hand
         fields.scale_group(wrench, g, share)
         _add_group_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
         _update_ledger_by_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
@@ -139,14 +139,15 @@ def _add_group_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _update_ledger_by_hand_work_of_group(g, drained, p, memory):
+def _update_ledger_by_hand_work_of_group(g, work_on_hand, p, memory):
     ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
-    if drained > 0.0:
-        more = min(ledger[g] - drained, 0.0)
-        ledger[g] = max(ledger[g] - drained, 0.0)
+    if work_on_hand > 0.0:
+        more = min(ledger[g] - work_on_hand, 0.0)
+        ledger[g] = max(ledger[g] - work_on_hand, 0.0)
     else:
-        more = min(-_KEPT_HAND_INPUT_SHARE * drained, max(p[_TARGET_RESERVE][g] - kept[g], 0.0))
-        memory[slots.SENT_ENERGY][g] -= drained + more
+        missing = max(p[_TARGET_RESERVE][g] - kept[g], 0.0)
+        more = min(-_KEPT_HAND_INPUT_SHARE * work_on_hand, missing)
+        memory[slots.SENT_ENERGY][g] -= work_on_hand + more
     kept[g] = max(kept[g] + more, 0.0)
 
 

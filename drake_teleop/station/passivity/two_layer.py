@@ -98,10 +98,10 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = requested[i] - damping * twist[i]
         fields.limit_group(wrench, g, limits[g])
-        drained = dot_of_group(wrench, dx, g)
+        work_on_hand = dot_of_group(wrench, dx, g)
         drainable = min(T * p[_MAX_TANK_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
-        if drained > drainable:
-            fields.scale_group(wrench, g, drainable / drained)
+        if work_on_hand > drainable:
+            fields.scale_group(wrench, g, drainable / work_on_hand)
         _limit_wrench_to_tank_of_group(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
     fill_packet(pose, twist, wrench, packet)
 

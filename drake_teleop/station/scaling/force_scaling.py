@@ -165,18 +165,18 @@ def _scaled_wrench_at_time_into(sample, estimate, gripper, scale_ramp, time, arm
 
 
 @njit(cache=True)
-def _contact_wrench_into(sample, estimate, gripper, scale_ramp, time, arm, contact_scales, out):
-    _scaled_wrench_into(sample, estimate, gripper, arm, contact_scales, out)
+def _unscaled_contact_wrench_into(sample, estimate, gripper, _ramp, _time, arm, scales, out):
+    _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
 
 
 @njit(cache=True)
-def _non_contact_wrench_into(sample, estimate, gripper, scale_ramp, time, out):
+def _non_contact_wrench_into(sample, estimate, _gripper, _ramp, _time, out):
     motion = sample[regressor.SAMPLE_MOTION]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], estimate[6:], out)
 
 
 @njit(cache=True)
-def _sample_fault_into(sample, estimate, gripper, scale_ramp, time, sample_limits, out):
+def _sample_fault_into(sample, estimate, _gripper, _ramp, time, sample_limits, out):
     out[0] = find_sample_fault(sample, estimate, time, sample_limits)
 
 
@@ -257,7 +257,7 @@ class ForceScaling(LeafSystem):
         frames = arm.table, np.ascontiguousarray(R_WB), sample_limits
         for name, size, calculate_into, constants in (
             ("scaled_wrench_S", 6, _scaled_wrench_at_time_into, (arm.table,)),
-            ("contact_wrench_S", 6, _contact_wrench_into, contact),
+            ("contact_wrench_S", 6, _unscaled_contact_wrench_into, contact),
             ("non_contact_wrench_S", 6, _non_contact_wrench_into, ()),
             ("wrench_B", 6, rendered, (*frames, 1.0)),
             ("load_wrench_B", 6, rendered, (*frames, 0.0)),

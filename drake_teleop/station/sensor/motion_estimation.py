@@ -238,7 +238,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     constants, n = constants[0], sample.shape[0] - regressor.FIRST_JOINT_INDEX
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     angles, gravity = sample[regressor.SAMPLE_JOINT_POSITION], motion[:3]
-    _align_signal_paths(constants, memory, n, reading, sample)
+    _equalize_signal_delays(constants, memory, n, reading, sample)
     if arm.shape[0] == 0:
         copy_into(motion, 3, angles, 0, 3)
     else:
@@ -279,17 +279,18 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
 
 
 @njit(cache=True)
-def _align_signal_paths(constants, memory, n, reading, sample):
+def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
     sections, angles = constants.angle_low_passes[:], sample[regressor.SAMPLE_JOINT_POSITION]
-    filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n][5 * n :]
-    copy_into(angles, 0, reading, READ_ANGLES.start, n)
+    filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * num_joints][5 * num_joints :]
+    copy_into(angles, 0, reading, READ_ANGLES.start, num_joints)
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :].reshape((-1, 12 + n))
+    delay_line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * num_joints :]
+    line = delay_line.reshape((-1, 12 + num_joints))
     shift_delay_line(line)
     copy_into(line[0], 0, reading, 0, 12)
-    copy_into(line[0], 12, angles, 0, n)
+    copy_into(line[0], 12, angles, 0, num_joints)
     if memory[0] == 0.0:
         line[1:] = line[0]
     waits = constants.wait_samples
@@ -297,7 +298,7 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     copy_into(sample, regressor.SAMPLE_MOTION.start, line[int(waits[1])], 6, 6)
     wait, older = int(waits[2]), waits[2] - int(waits[2])
     now, before = line[wait], line[min(wait + 1, line.shape[0] - 1)]
-    for i in range(n):
+    for i in range(num_joints):
         angles[i] = (1.0 - older) * now[12 + i] + older * before[12 + i]
     flagged = memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
     if reading[READ_SATURATED] != 0.0:

@@ -30,10 +30,8 @@ from drake_teleop.station.slave.arm import (
 
 _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
-# A larger range of a revolute joint may be in degrees [rad].
-_MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi
-# Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
-_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4
+_MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi  # larger ranges may be in degrees
+_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4  # larger: no limit; SDF specifies 1e16
 _DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
 
 
@@ -192,15 +190,14 @@ def fill_missing_joint_limits(
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_JOINT_RANGE_RAD)
-    half_range = _DEFAULT_JOINT_HALF_RANGE_M
     only_limit = "a range of 360 degrees from the only limit"
     turning_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s"
     sliding_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s"
     in_rad = f"limits in rad, though more than {_MAX_PLAUSIBLE_JOINT_RANGE_RAD:.4g} apart,"
     rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
-        (unlimited, "unlimited rotation", f"a range of +-{half_range:g} m"),
-        (half_limited, only_limit, f"a range of {2 * half_range:g} m"),
+        (unlimited, "unlimited rotation", f"a range of +-{_DEFAULT_JOINT_HALF_RANGE_M:g} m"),
+        (half_limited, only_limit, f"a range of {2 * _DEFAULT_JOINT_HALF_RANGE_M:g} m"),
         (~_is_positive_and_finite(arm.velocity_limit), turning_speed, sliding_speed),
         (~_is_positive_and_finite(specified), rate_text, rate_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),

@@ -20,8 +20,7 @@ from drake_teleop.station.slave.slave_config import Slave
 _MIN_MASS_MATRIX_EIGENVALUE_KG_M2 = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-# Shares of the joint ranges, about their middles, that are searched in this order.
-_SEARCHED_JOINT_RANGE_SHARES = (0.7, 0.9, 1.0)
+_SEARCHED_JOINT_RANGE_SHARES = (0.7, 0.9, 1.0)  # about the middles of the ranges
 #: Elbow up, reaching forward [rad]; home is the branch nearest to it.
 _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 

@@ -59,8 +59,8 @@ class PositionInterface:
             raise DrakeTeleopError(what, where=f"{where}.command_hz", remedy=remedy)
         damping = self.acceleration_per_error * self.lookahead / rate
         if damping + 0.5 * self.acceleration_per_error / rate**2 > 1.5:  # unstable from 2
-            limits = f"a lookahead of {self.lookahead:g} s and control steps of {1e3 / rate:g} ms"
-            what = f"{self.acceleration_per_error:g} 1/s^2 is too high for {limits}"
+            timing = f"a lookahead of {self.lookahead:g} s and control steps of {1e3 / rate:g} ms"
+            what = f"{self.acceleration_per_error:g} 1/s^2 is too high for {timing}"
             remedy = "lower it or lookahead, or raise rates.joint_control_hz"
             raise DrakeTeleopError(what, where=f"{where}.acceleration_per_error", remedy=remedy)
         if self.drive_bandwidth_hz > 0.1 * rate:

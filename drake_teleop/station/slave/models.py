@@ -29,7 +29,6 @@ _XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the resulting URDF"
 _UNUSED_XACRO_TAGS = ("xacro:property", "xacro:arg")  # of no effect without ${...} and $(...)
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
-# Remedies for missing packages.
 _ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
 _SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
 # Places in Drake's source and in repaired texts, which the user does not have.

@@ -40,8 +40,7 @@ from drake_teleop.station.slave.surroundings import (
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
 _TIP_END_TOLERANCE_M = 1e-3
 _NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
-#: Name of the arm's model instance in every plant.
-ARM_INSTANCE_NAME = "arm"
+ARM_INSTANCE_NAME = "arm"  #: name of the arm's model instance in every plant
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,8 @@ from drake_teleop.station.slave.plant import (
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-#: Larger overlaps are reported [m]; smaller ones are rounding of models.
-MIN_OVERLAP_M = 1e-3
-_MAX_COLLISION_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
+MIN_OVERLAP_M = 1e-3  #: larger overlaps are reported; smaller ones are rounding of models
+_MAX_CHECKED_SHAPE_HALF_WIDTH_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
 _MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
@@ -51,6 +50,7 @@ class PostureShapes:
         assumptions: texts about data that the models do not have.
         tool_body, tool_bodies: indices of the body on the sensor, and of all bodies beyond it.
         surroundings: indices of the bodies of the environment.
+        has_sticks: whether sticks replace the missing shapes.
     """
 
     def __init__(
@@ -67,7 +67,8 @@ class PostureShapes:
         self.tool_bodies = {body.index() for body in beyond}
         links = [self.plant.get_body(k) for k in self.moving_bodies() - self.tool_bodies]
         shapes = self.plant.GetCollisionGeometriesForBody, self.plant.GetVisualGeometriesForBody
-        if sticks and not any(find(link) for find in shapes for link in links):
+        self.has_sticks = sticks and not any(find(link) for find in shapes for link in links)
+        if self.has_sticks:
             AddSkeleton(self.plant, self._parsed.sensor_frame)
         _complete_and_bound_collision_shapes(self.plant, self._scene_graph)
         finalize_without_limit_warnings(self.plant)
@@ -235,7 +236,7 @@ def _complete_and_bound_collision_shapes(
         for k, identifier in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
             shape, box = inspector.GetShape(identifier), inspector.GetObbInGeometryFrame(identifier)
             is_curved = isinstance(shape, (geometry.Capsule, geometry.Cylinder, geometry.Ellipsoid))
-            is_limited = box is not None and max(box.half_width()) < _MAX_COLLISION_SHAPE_SIZE_M
+            is_limited = box is not None and max(box.half_width()) < _MAX_CHECKED_SHAPE_HALF_WIDTH_M
             here, name = RigidTransform(inspector.GetPoseInFrame(identifier)), f"solid_{k}"
             if is_curved:
                 shape = geometry.Convex(

@@ -20,7 +20,6 @@ from drake_teleop.station.slave.model import model_references
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
 from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
 
-# Numbers of each dimension of a shape.
 _NUM_VALUES_OF_SHAPE_SIZES = {
     "box": {"size": 3},
     "sphere": {"radius": 1},

@@ -35,7 +35,7 @@ def repair_inertia_and_detect_missing(
             model.add_assumption("1 kg, the default of SDF, for", name)
         elif inertial is not None:
             link.remove(inertial)
-        return not is_sdf
+        return not (is_sdf or is_fixed)
     if name == WORLD_NAME:
         link.remove(inertial)
         return False

@@ -53,14 +53,22 @@ def reduce_to_chain(
     joints = _remove_free_base(scope, joints, model)
     root, chain = joint_link(joints[0], "parent") if joints else sensor_link, set(joints)
     num_joints_to_link = _remove_unconnected_links(scope, root, chain, model)
+    names = {joint.get("name") for joint in joints} | model.purpose.held_positions.keys()
+    for joint in joints:
+        for element in (joint, *joint.findall("axis")):
+            for mimic in element.findall("mimic"):
+                if joint.get("type") != "fixed" and mimic.get("joint") not in names:
+                    element.remove(mimic)
+                    what = "independent of the joint that it mimics, which does not move S:"
+                    model.add_assumption(what, joint.get("name", ""))
     for joint in list_joints(scope):
         if joint not in chain and joint.get("name") not in model.purpose.held_positions:
             make_joint_fixed(joint, model)
     for element in [child for child in scope if child.tag in _DRAKE_CONSTRAINT_TAGS]:
-        names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
-        groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
+        ends = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
+        groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in ends}
         scope.remove(element)
-        if len(names) < 2 or len(groups) > 1:
+        if len(ends) < 2 or len(groups) > 1:
             what = f"its links form a loop, by {element.tag}"
             model.add_fault(f"{what}; model only the chain to the sensor")
     return chain, num_joints_to_link

@@ -44,7 +44,7 @@ def repair_urdf(model: ModelRepair) -> None:
 def repair_sdf(model: ModelRepair) -> None:
     """Set `model.text` to an SDF text that Drake reads; convert meshes, repair included files."""
     if not model.purpose.is_scene:
-        _keep_model_with_sensor(model)
+        _remove_models_without_sensor_frame(model)
         _remove_children_ignored_by_drake(list(model.root.iter()))
     _repair_links_and_joints(model, is_sdf=True)
     for named in model.root.findall("model"):
@@ -220,7 +220,7 @@ def _find_included_model_file(address: str, model: ModelRepair) -> Path | None:
     return found
 
 
-def _keep_model_with_sensor(model: ModelRepair) -> None:
+def _remove_models_without_sensor_frame(model: ModelRepair) -> None:
     root = model.root
     worlds = root.findall("world")
     children = [child for scope in (root, *worlds) for child in scope]
