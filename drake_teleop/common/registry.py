@@ -80,7 +80,7 @@ class Registry(dict[str, _Part]):
         raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (_import_new_scripts() and super().__contains__(name))
+        return super().__contains__(name) or (_import_env_scripts() and super().__contains__(name))
 
     def __missing__(self, name: str) -> _Part:
         return self[self.check(name)]
@@ -108,7 +108,7 @@ def register_from_script(script: Path) -> None:
     os.environ[_SCRIPTS_ENV] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
 
 
-def _import_new_scripts() -> bool:
+def _import_env_scripts() -> bool:
     paths = [Path(path) for path in os.environ.get(_SCRIPTS_ENV, "").split(os.pathsep) if path]
     new = [path for path in paths if path.stem not in sys.modules]
     for path in new:

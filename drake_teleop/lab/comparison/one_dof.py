@@ -325,9 +325,9 @@ def _detrended_range(x: Array) -> float:
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_delay_in_samples(hand_force: Array, pressed: Array, steady_force: float) -> float:
+def _rise_delay_in_samples(hand_force: Array, contact_force: Array, steady_force: float) -> float:
     level, sign = 0.5 * abs(steady_force), np.sign(steady_force)
-    exceeds, displayed = pressed * sign > level, hand_force * sign > level
+    exceeds, displayed = contact_force * sign > level, hand_force * sign > level
     start = int(np.argmax(exceeds))
     if not exceeds.any() or displayed[max(start - 1, 0)] or not displayed[start:].any():
         return float("nan")

@@ -98,7 +98,7 @@ _MIN_POSTURES_NEAR_CONTACT = 5  # for a correction
 # Pairs whose capsules are near in fewer postures count although their shapes were never near.
 _MAX_POSTURE_SHARE_OF_RARE_CONTACT = 0.05
 
-_TABLE_NAME = "drake_teleop_table"
+_TABLE_SHAPE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
 _BOX_FOR_HALF_SPACE = geometry.Box(10, 10, 1)
 _POSE_OF_BOX_FOR_HALF_SPACE = RigidTransform([0, 0, -0.5])
@@ -127,7 +127,7 @@ class CollisionScene:
         _add_load_body(self.plant, instance, self.sensor_frame, extra_phi)
         _add_collision_shapes_and_check_sizes(self.plant, self.scene_graph, visuals_collide, where)
         world, table = self.plant.world_body(), geometry.HalfSpace()
-        _add_collision_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)
+        _add_collision_shape(self.plant, world, RigidTransform(), table, _TABLE_SHAPE_NAME)
         finalize_without_limit_warnings(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
@@ -205,7 +205,7 @@ class CollisionScene:
                 X_WL = RigidTransform(RotationMatrix(R_WL.reshape(3, 3)), p_WL)
             X_LG = X_WL.InvertAndCompose(X_WB) @ inspector.GetPoseInFrame(shape)
             capsules[shape] = row, bounding_capsule(inspector.GetShape(shape)).transformed(X_LG)
-            if inspector.GetName(shape).endswith(_TABLE_NAME):
+            if inspector.GetName(shape).endswith(_TABLE_SHAPE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _find_largest_enclosing_shape(shape, capsules) for shape in capsules}
         outer_shapes = sorted(set(outer.values()), key=geometry.GeometryId.get_value)
