@@ -37,7 +37,7 @@ OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
 _MAX_IMPEDANCE_FIT_OMEGA_RAD_S = 2 * np.pi * 5.0  # limit of the fit of mass, damping and stiffness
 _NUM_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
-_EXCITATION_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
+_PROBING_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def analyze_command(
@@ -367,9 +367,7 @@ def measure_free_impedance(
     estimate = true_load(scenario)
     if not scenario.wrist_sensor.ideal:
         estimate[:6] = scenario.wrist_sensor.offset
-    found = measure_frequency_response(
-        smooth, along, _EXCITATION_MULTI_SINE, load_estimate=estimate
-    )
+    found = measure_frequency_response(smooth, along, _PROBING_MULTI_SINE, load_estimate=estimate)
     # Held force: its component at the frequency itself, as in the two-port.
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step

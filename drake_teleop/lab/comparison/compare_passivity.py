@@ -78,7 +78,7 @@ def compare_command(
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
-        limits = _run_longest_round_trip_study(methods, seed, jobs, stage)
+        limits = _run_round_trip_study(methods, seed, jobs, stage)
         released = _run_release_and_tap_study(networks, methods, seed, jobs, stage)
         runs, traces = _run_station_study(base, networks, methods, jobs, stage)
         covering = _run_injected_energy_study(stage)
@@ -257,7 +257,7 @@ def _displayed_share_of_tap_impulse(
     return float(max(displayed / pressed, 0.0)) if pressed < 0.0 else 0.0
 
 
-def _run_longest_round_trip_study(
+def _run_round_trip_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = [
