@@ -8,7 +8,7 @@ from drake_teleop.station.result import Signal
 LOG_BLOCK_NAME = "log"
 
 
-def _signal(name: str, components: str, units: str, description: str) -> Signal:
+def _make_signal(name: str, components: str, units: str, description: str) -> Signal:
     unit = tuple(units.split(","))
     return Signal(name, tuple(components.split()), unit[0] if len(unit) == 1 else unit, description)
 
@@ -23,13 +23,13 @@ _LOAD_ESTIMATE_COMPONENTS = (
     "fo_x fo_y fo_z tauo_x tauo_y tauo_z m mc_x mc_y mc_z I_xx I_xy I_xz I_yy I_yz I_zz",
     "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
 )
-_CHANNEL_PORT_COMPONENTS = (
+_CHANNEL_ENERGY_AND_SILENCE_COMPONENTS = (
     "hand hand_rotation slave slave_rotation master_silent slave_silent command command_rotation",
     "J,J,J,J,s,s,J,J",
 )
 
 
-def _signals_for_joints(num_joints: int) -> dict[str, Signal]:
+def _signals_by_name(num_joints: int) -> dict[str, Signal]:
     numbers = range(1, num_joints + 1)
     names = " ".join(f"joint_{i}" for i in numbers)
     angles, torques = (names, "rad"), (names, "N m")
@@ -72,24 +72,24 @@ def _signals_for_joints(num_joints: int) -> dict[str, Signal]:
          "state of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
          " smallest detected force at the hand; share of approach_speed (docs/operator.md)"),
         ("pose_received", _POSE_COMPONENTS, "setpoint X_WS of the slave after the channel"),
-        ("ports", _CHANNEL_PORT_COMPONENTS,
+        ("ports", _CHANNEL_ENERGY_AND_SILENCE_COMPONENTS,
          "energy into the channel at its ends, in the master's power units; time since the last"
          " packet at each end; energy of the slave's wrench along the command"),
         ("contact", ("contact", "1"), "1 while the slave's detector reports contact"),
         ("contact_at_hand", ("contact", "1"), "contact flag after the channel, at the master"),
     )  # fmt: skip
-    return {name: _signal(name, *parts, description) for name, parts, description in rows}
+    return {name: _make_signal(name, *parts, description) for name, parts, description in rows}
 
 
 #: All signals in the order of the log, for an arm with six joints.
-SIGNALS = _signals_for_joints(6)
+SIGNALS = _signals_by_name(6)
 
 
 def signal_with_size(name: str, size: int) -> Signal:
     """Return the description of a recorded signal; `size` is its number of components."""
     if name.startswith(MOVING_BODY_POSE_PREFIX):
         body = name.removeprefix(MOVING_BODY_POSE_PREFIX)
-        return _signal(name, *_POSE_COMPONENTS, f"pose of the body {body} in W, at t")
+        return _make_signal(name, *_POSE_COMPONENTS, f"pose of the body {body} in W, at t")
     if size == len(SIGNALS[name].components):
         return SIGNALS[name]
-    return _signals_for_joints(size // 2 if name in ("slave_state", "master_state") else size)[name]
+    return _signals_by_name(size // 2 if name in ("slave_state", "master_state") else size)[name]

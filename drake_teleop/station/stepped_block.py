@@ -28,13 +28,13 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
         self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
         producer = ValueProducer(
             allocate=lambda: AbstractValue.Make([np.array(part) for part in results]),
-            calc=weak_callback(self._calc_step),
+            calc=weak_callback(self._calc_step_results),
         )
         sources = {self.all_input_ports_ticket(), self.xd_ticket()}
         step = self.DeclareCacheEntry("step", producer, sources)
         self._step = step.cache_index()  # the entry itself would keep the block alive
         self._after_step = {step.ticket()}
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_step_results)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_states_after_step)
 
     def _declare_output(self, name: str, result: int, part: slice) -> None:
         """Declare an output port with the slice `part` of the step's array number `result`."""
@@ -49,7 +49,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
     def _advance(self, context: Context, results: list[Array]) -> None:
         """Advance the states `results[:num_states]` by a period; write the others, outputs."""
 
-    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+    def _calc_step_results(self, context: Context, step: AbstractValue) -> None:
         results = step.get_mutable_value()
         for state, index in zip(results, self._states, strict=False):
             state[:] = context.get_discrete_state(index).value()
@@ -59,6 +59,6 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
         results: list[Array] = self.get_cache_entry(self._step).Eval(context)
         return results
 
-    def _store_step_results(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_states_after_step(self, context: Context, discrete_state: DiscreteValues) -> None:
         for state, index in zip(self._step_results(context), self._states, strict=False):
             discrete_state.set_value(index, state)

@@ -17,7 +17,7 @@ from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
 _SLOT_FLOOR_TOLERANCE_M = 2e-3  # m
-_PHASE_TEXTS = {
+_TASK_PHASE_TEXTS = {
     decision.PHASE_MOVING: "moving to the target",
     decision.PHASE_APPROACHING: "approaching the contact",
     decision.PHASE_STOPPING: "stopped after contact",
@@ -36,7 +36,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         what = "the scenario has no operator's task to measure"
         remedy = "give the operator a task: !Reach, !Touch, !Press or !Insert"
         raise DrakeTeleopError(what, where="operator.task", remedy=remedy)
-    state, t, ended = result["task_state"], result.t, _last_row_of_task(result)
+    state, t, ended = result["task_state"], result.t, _log_row_at_task_end(result)
     begun = int(np.argmax(state[:, decision.PHASE_INDEX] != decision.PHASE_WAITING))
     span = slice(begun, ended + 1)
     done = state[ended, decision.OUTCOME_INDEX] > 0.0
@@ -70,7 +70,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     """Return the reason why the task failed (timeout, given up, not achieved); "" after success."""
-    task, state, ended = scenario.operator.task, result["task_state"], _last_row_of_task(result)
+    task, state, ended = scenario.operator.task, result["task_state"], _log_row_at_task_end(result)
     assert task is not None
     at, outcome = float(result.t[ended]), state[ended, decision.OUTCOME_INDEX]
     if outcome > 0.0:
@@ -80,7 +80,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     if phase == decision.PHASE_WAITING:
         return f"the task begins at {task.t_start:g} s, when the simulation has ended"
     taken = at + scenario.simulation.settle - task.t_start
-    found = f"{_PHASE_TEXTS[phase]}, {_force_and_position_text(result, scenario, task, ended)}"
+    found = f"{_TASK_PHASE_TEXTS[phase]}, {_force_and_position_text(result, scenario, task, ended)}"
     if outcome == 0.0:
         return (
             f"the simulation ended after {taken:.2f} s of the task, while the operator was {found};"
@@ -97,7 +97,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     )
 
 
-def _last_row_of_task(result: SimulationResult) -> int:
+def _log_row_at_task_end(result: SimulationResult) -> int:
     outcome = result["task_state"][:, decision.OUTCOME_INDEX]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 

@@ -58,7 +58,7 @@ _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_TOLERANCE = 1e-6
 _OVERLOAD_LIMIT_IN_RANGES = 10.0
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
-_MAX_SATURATED_READING_IN_RANGES = 1.5
+_MAX_SATURATED_READING_TO_RANGE_RATIO = 1.5
 
 
 @settings
@@ -142,7 +142,7 @@ class WristSensorConfig:
     def largest_plausible_wrench(self) -> Array:
         """Return the largest plausible absolute readings (6,) of force and torque [N, N m]."""
         limited = self.saturates and not self.ideal
-        factor = _MAX_SATURATED_READING_IN_RANGES if limited else _OVERLOAD_LIMIT_IN_RANGES
+        factor = _MAX_SATURATED_READING_TO_RANGE_RATIO if limited else _OVERLOAD_LIMIT_IN_RANGES
         return factor * self.ranges()[:6]
 
     def wrench_std(self) -> Array:
@@ -194,14 +194,14 @@ def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, otherwise: 
         raise DrakeTeleopError(f"{what} ({rate_hz:g} Hz)", where=where, remedy=remedy)
 
 
-_CALIBRATION_FIELDS = (
+_CALIBRATION_ERROR_FIELDS = (
     *("gain_error", "cross_talk", "misalignment"),
     *("acceleration_gain_error", "acceleration_misalignment"),
 )
 _NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
 SENSOR_PARTS: dict[str, dict[str, Any]] = {
-    "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
+    "calibration": dict.fromkeys(_CALIBRATION_ERROR_FIELDS, 0.0),
     "place": {"p_SoAo_S": [0.0] * 3, "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
     "low_pass": {"low_pass": "none"},
     "noise": {f"{name}_noise": 0.0 for name in _NOISY_QUANTITIES},
@@ -276,9 +276,9 @@ READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 _LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
-_RANDOM_WALK_START = 1
-FILTER_MEMORY_START = _RANDOM_WALK_START + _NUM_CHANNELS
-_DELAY_LINE_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_CHANNELS
+_RANDOM_WALK_MEMORY_START = 1
+FILTER_MEMORY_START = _RANDOM_WALK_MEMORY_START + _NUM_CHANNELS
+_DELAY_LINE_MEMORY_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_CHANNELS
 _DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 
@@ -317,7 +317,7 @@ def initialize_sensor_chain(
         overload_limits=_OVERLOAD_LIMIT_IN_RANGES * ranges[:6],
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    memory = np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
+    memory = np.zeros(_DELAY_LINE_MEMORY_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
     return constants, memory
 
 
@@ -354,11 +354,11 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
-    line = memory[_DELAY_LINE_START:].reshape((-1, _DELAY_LINE_ROW_SIZE + angles.shape[0]))
+    line = memory[_DELAY_LINE_MEMORY_START:].reshape((-1, _DELAY_LINE_ROW_SIZE + angles.shape[0]))
     shift_delay_line(line)
     row, channels = line[0], line[0, :_NUM_CHANNELS]
-    walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
-    filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
+    walks = memory[_RANDOM_WALK_MEMORY_START:FILTER_MEMORY_START]
+    filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_MEMORY_START]
     sections, place = constants.low_pass[:], constants.low_pass_stage
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         step = noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
@@ -377,8 +377,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
         channels[i] += constants.noise_std[i] * noise[first + i] + walks[i]
-    row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
-    row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
+    row[_NUM_CHANNELS] = _quantize_and_saturate_channels(constants, 0, 6, channels)
+    row[_NUM_CHANNELS + 1] = _quantize_and_saturate_channels(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
     quantum, turned = constants.encoder_quantum, row[_DELAY_LINE_ROW_SIZE:]
@@ -421,9 +421,9 @@ def _apply_calibration_errors(constants, truth, out):
 
 
 @njit(cache=True)
-def _quantize_and_saturate(constants, first, end, channels):
+def _quantize_and_saturate_channels(constants, first_channel, end_channel, channels):
     saturated = 0.0
-    for i in range(first, end):
+    for i in range(first_channel, end_channel):
         quantum, limit, value = constants.quantum[i], constants.range[i], channels[i]
         if quantum > 0.0:
             value = quantum * np.rint(value / quantum)

@@ -64,7 +64,7 @@ _EQUAL_TIME_TOLERANCE_PERIODS, _MAX_QUEUED_PLANT_STEPS = 1e-6, 16
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
 #: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
-_NO_DRAKE_CONTACT_WRENCH = np.zeros(0)
+_EMPTY_WRENCH_FOR_COMPILED_CONTACT = np.zeros(0)
 
 
 @njit(cache=True)
@@ -87,8 +87,8 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, out):
 
 
 @njit(cache=True)
-def _interpolate_state(h, u, x, xdot, end, end_dot, out):
-    half = x.shape[0] // 2
+def _interpolate_state(step_s, fraction, x, xdot, end, end_dot, out):
+    half, h, u = x.shape[0] // 2, step_s, fraction
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
         dq = end[i] - q - h * v - 0.5 * h * h * a
@@ -129,7 +129,7 @@ def append_step_to_queue(queue, time, state, surroundings):
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _try_queue_step(memory, queue_start, max_steps, time, state, surroundings):
+def _try_append_step(memory, queue_start, max_steps, time, state, surroundings):
     if memory[queue_start + 1] >= max_steps:
         return False
     append_step_to_queue(memory[queue_start:], time, state, surroundings)
@@ -331,12 +331,12 @@ class WristSensor(LeafSystem):
         seen = (self._state, *pushes, *around, self._noise)
         tickets = {port.ticket() for port in seen if port is not None}
         tickets |= {self.time_ticket(), self.xd_ticket()}
-        calc = weak_callback(self._calc_step)
+        calc = weak_callback(self._calc_samples_until_now)
         self._step = self.DeclareVectorOutputPort("step", len(self._result), calc, tickets)
         if self.reason_beyond_contact_law:
-            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._queue_step_or_take_samples)
         else:
-            self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
+            self.DeclarePerStepDiscreteUpdateEvent(self._queue_step_or_take_samples)
         check = self._check_acceleration_for_unknown_forces
         self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_PERIOD_S, 0.0, check)
 
@@ -351,7 +351,7 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Take the samples that are due before now, and store them in the context."""
-        self._take_samples_into(context, False, self._result)
+        self._take_due_samples_into(context, False, self._result)
         context.SetDiscreteState(self._result[self._memory_slice])
 
     def reset_queue(self, context: Context) -> None:
@@ -370,7 +370,7 @@ class WristSensor(LeafSystem):
     def _evaluate_applied_wrench(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _tool_proximity(self, state: Array, surroundings: Array) -> int:
+    def _classify_tool_proximity(self, state: Array, surroundings: Array) -> int:
         if self._contacts is None:
             return PROXIMITY_FAR
         if self.reason_beyond_contact_law:
@@ -383,12 +383,12 @@ class WristSensor(LeafSystem):
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
-    def _calc_step(self, context: Context, output: BasicVector) -> None:
-        self._take_samples_into(context, True, output.get_mutable_value())
+    def _calc_samples_until_now(self, context: Context, output: BasicVector) -> None:
+        self._take_due_samples_into(context, True, output.get_mutable_value())
 
-    def _take_samples_into(self, context: Context, until_now: bool, result: Array) -> None:
+    def _take_due_samples_into(self, context: Context, until_now: bool, result: Array) -> None:
         seen = self._states_of_arm_and_environment(context)
-        near, touching_W = self._tool_proximity(*seen), _NO_DRAKE_CONTACT_WRENCH
+        near, touching_W = self._classify_tool_proximity(*seen), _EMPTY_WRENCH_FOR_COMPILED_CONTACT
         if until_now and near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
         elif until_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
@@ -416,14 +416,14 @@ class WristSensor(LeafSystem):
             state = table[0, 2:]
             table[1 + k, :6] = self._plant_copy().wrench_W(state[:own], state[own:])
 
-    def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _queue_step_or_take_samples(self, context: Context, discrete_state: DiscreteValues) -> None:
         time = context.get_time()
         if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(time):
             seen = self._states_of_arm_and_environment(context)
             monitored = self._monitored_pairs.size
-            if not monitored or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
+            if not monitored or self._classify_tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
-                if _try_queue_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
+                if _try_append_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
@@ -442,7 +442,7 @@ class WristSensor(LeafSystem):
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)
-        near = self._tool_proximity(state, around)
+        near = self._classify_tool_proximity(state, around)
         if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
             contact_W, p_WS = self._plant_contact_wrench_W(context).copy(), np.empty(3)
             serial_arm.forward_kinematics(physics[0], state[:n], np.empty((3, 3)), p_WS)

@@ -109,7 +109,7 @@ class ArmModel:
 
 
 @njit(cache=True, inline="always")
-def _advance_pose_over_joint(
+def _propagate_pose_to_child_link(
     table: Array, row: int, q: float, x: Array
 ) -> tuple[float, float, float]:
     """Advance the pose in the state x from link P to the next link L; return p_PL_W."""
@@ -130,10 +130,10 @@ def _advance_pose_over_joint(
 
 
 @njit(cache=True, inline="always")
-def _advance_motion_over_joint(
+def _propagate_motion_to_child_link(
     table: Array, row: int, q: float, qd: float, qdd: float, x: Array
 ) -> None:
-    r = _advance_pose_over_joint(table, row, q, x)
+    r = _propagate_pose_to_child_link(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
     add_vector_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
     if table[row, IS_PRISMATIC_COLUMN] != 0.0:
@@ -161,7 +161,7 @@ def acceleration_from_specific_force_into(table: Array, q: Array, s: Array, out:
 
 
 @njit(cache=True, inline="always")
-def _write_motion_of_world_at_rest(table: Array, x: Array) -> None:
+def _write_base_motion_with_minus_gravity(table: Array, x: Array) -> None:
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN + k]
@@ -175,7 +175,7 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
     x = np.zeros(21)
     x[12] = x[16] = x[20] = 1.0
     for row in range(n + 1):
-        _advance_pose_over_joint(table, row, q[row] if row < n else 0.0, x)
+        _propagate_pose_to_child_link(table, row, q[row] if row < n else 0.0, x)
     for i in range(3):
         p_WS[i] = x[9 + i]
         R_WS[i, 0], R_WS[i, 1], R_WS[i, 2] = vector_at(x, 12 + 3 * i)
@@ -194,11 +194,11 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
     x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
     for row in range(n):
-        _advance_pose_over_joint(table, row, q[row], x)
+        _propagate_pose_to_child_link(table, row, q[row], x)
         for i in range(3):
             J_out[i, row] = x[9 + i]
             J_out[3 + i, row] = x[14 + 3 * i]
-    _advance_pose_over_joint(table, n, 0.0, x)
+    _propagate_pose_to_child_link(table, n, 0.0, x)
     p_WS = vector_at(x, 9)
     for row in range(n):
         column = J_out[:, row]
@@ -214,10 +214,10 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the motion of S to out (21,): s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows."""
     n = table.shape[0] - 1
-    _write_motion_of_world_at_rest(table, out)
+    _write_base_motion_with_minus_gravity(table, out)
     for row in range(n + 1):
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
-        _advance_motion_over_joint(table, row, qi, vi, ai, out)
+        _propagate_motion_to_child_link(table, row, qi, vi, ai, out)
     R_SW = transposed(matrix_at(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply_matrix(R_SW, vector_at(out, i))
@@ -227,12 +227,12 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the states [s, omega, alpha, p_WL, R_WL] in W of all links and S to out (n+1, 21)."""
     n = table.shape[0] - 1
-    _write_motion_of_world_at_rest(table, out[0])
+    _write_base_motion_with_minus_gravity(table, out[0])
     for row in range(n + 1):
         if row > 0:
             out[row] = out[row - 1]
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
-        _advance_motion_over_joint(table, row, qi, vi, ai, out[row])
+        _propagate_motion_to_child_link(table, row, qi, vi, ai, out[row])
 
 
 @njit(cache=True, inline="always")
@@ -279,10 +279,10 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
-    _write_motion_of_world_at_rest(table, x)
+    _write_base_motion_with_minus_gravity(table, x)
     for row in range(n + 1):
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
-        _advance_motion_over_joint(table, row, qi, vi, ai, x)
+        _propagate_motion_to_child_link(table, row, qi, vi, ai, x)
         _write_joint_axis_and_inertial_wrench(table, row, x, link)
     _project_wrenches_on_joints(table, link, tau_out)
     for row in range(n):
@@ -367,10 +367,10 @@ def forward_dynamics(
     link = np.empty((n + 1, 12))
     inertia = np.zeros((n + 1, 10))
     M = np.empty((n, n))
-    _write_motion_of_world_at_rest(table, x)
+    _write_base_motion_with_minus_gravity(table, x)
     for row in range(n + 1):
         qi, vi = (q[row], v[row]) if row < n else (0.0, 0.0)
-        _advance_motion_over_joint(table, row, qi, vi, 0.0, x)
+        _propagate_motion_to_child_link(table, row, qi, vi, 0.0, x)
         _write_joint_axis_and_inertial_wrench(table, row, x, link)
         _add_link_inertia_about_world(table, row, x, inertia[row])
     for k in range(6):
@@ -410,7 +410,7 @@ class ForwardKinematics(LeafSystem):
 
 
 @njit(cache=True)
-def _write_friction_force(coulomb, index, state, force):
+def _write_joint_friction_forces(coulomb, index, state, force):
     force[:] = 0.0
     for i in range(coulomb.shape[0]):
         force[index[i]] = dry_friction(coulomb[i], state[coulomb.shape[0] + i])
@@ -432,6 +432,6 @@ class JointFriction(LeafSystem):
         self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
 
     def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
-        _write_friction_force(
+        _write_joint_friction_forces(
             *self._constants, self._state.Eval(context), output.get_mutable_value()
         )

@@ -32,7 +32,7 @@ _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
 _MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi  # larger ranges may be in degrees
 _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4  # larger: no limit; SDF specifies 1e16
-_DEFAULT_TIME_TO_SPEED_S = 0.4  # to the speed limit
+_TIME_TO_SPEED_LIMIT_S = 0.4  # to the speed limit
 
 
 def ArmModelFromPlant(
@@ -185,7 +185,7 @@ def fill_missing_joint_limits(
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     place = f"{where}: acceleration"
     specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
-    default = velocity / _DEFAULT_TIME_TO_SPEED_S
+    default = velocity / _TIME_TO_SPEED_LIMIT_S
     limit = np.where(_is_positive_and_finite(specified), specified, default)
     limits: Any = {"velocity_limit": velocity, "acceleration_limit": limit, "effort_limit": effort}
     completed = replace(arm, lower=lower, upper=upper, **limits)
@@ -194,7 +194,7 @@ def fill_missing_joint_limits(
     turning_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s"
     sliding_speed = f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s"
     in_rad = f"limits in rad, though more than {_MAX_PLAUSIBLE_JOINT_RANGE_RAD:.4g} apart,"
-    rate_text = f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_S:g} s{hint}"
+    rate_text = f"acceleration limits that reach full speed in {_TIME_TO_SPEED_LIMIT_S:g} s{hint}"
     for missing, revolute_text, prismatic_text in (
         (unlimited, "unlimited rotation", f"a range of +-{_DEFAULT_JOINT_HALF_RANGE_M:g} m"),
         (half_limited, only_limit, f"a range of {2 * _DEFAULT_JOINT_HALF_RANGE_M:g} m"),

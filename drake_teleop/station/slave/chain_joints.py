@@ -33,11 +33,11 @@ from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
 _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG = 0.14
-_SLIDER_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
+_PRISMATIC_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 # Largest mass of a sensor body that is only a frame, and its largest distance to the origin of the
 # link that it shares.
 _MAX_FRAME_MASS_KG, _MAX_FRAME_OFFSET_M = 1e-6, 1e-6
-_SKELETON_STICK_RADIUS_M = 0.035
+_SKELETON_CAPSULE_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
@@ -183,7 +183,7 @@ def weld_load_of_link_to_sensor_frame(
         body, link = inboard.child_body(), inboard.parent_body()
         if not isinstance(inboard, WeldJoint) or _carried_mass(plant, body) > _MAX_FRAME_MASS_KG:
             break
-        X_LS = _pose_of_welded_child(inboard) @ X_LS
+        X_LS = _pose_of_welded_child_in_parent(inboard) @ X_LS
         others = [
             joint
             for joint in joints_by_child(plant).values()
@@ -211,7 +211,7 @@ def _carried_mass(plant: MultibodyPlant, body: RigidBody) -> float:
     return sum(each.default_mass() for each in [body, *bodies_carried_by(plant, body)])
 
 
-def _pose_of_welded_child(weld: WeldJoint) -> RigidTransform:
+def _pose_of_welded_child_in_parent(weld: WeldJoint) -> RigidTransform:
     X_MB = weld.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     return weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM() @ X_MB
 
@@ -286,19 +286,19 @@ def add_rotor_inertias(
     for joint in (joint for joint in chain if joint.index() in motors):
         motor, slides = motors[joint.index()], isinstance(joint, PrismaticJoint)
         has_rotor = motor.default_reflected_inertia() > 0.0
-        if not has_rotor and not _carries_inertia(plant, joint, auxiliary_bodies):
+        if not has_rotor and not _joint_moves_inertia(plant, joint, auxiliary_bodies):
             (sliding if slides else turning).append(joint.name())
-            motor.set_default_rotor_inertia(_SLIDER_DRIVE_MASS_KG if slides else inertia)
+            motor.set_default_rotor_inertia(_PRISMATIC_DRIVE_MASS_KG if slides else inertia)
             motor.set_default_gear_ratio(1.0)
     notes = {
         f"a rotor inertia of {inertia:.3g} kg m^2": turning,
-        f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg": sliding,
+        f"a moved mass of {_PRISMATIC_DRIVE_MASS_KG:g} kg": sliding,
     }
     reason = "as the model has no inertia there"
     return [f"{what}, {reason}, for {join_names(names)}" for what, names in notes.items() if names]
 
 
-def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: set[str]) -> bool:
+def _joint_moves_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: set[str]) -> bool:
     ahead, joints = [joint.child_body()], joints_by_child(plant).values()
     while ahead:
         body: RigidBody = ahead.pop()
@@ -315,37 +315,37 @@ def _length_of_moving_chain_m(chain: list[Joint], frame: Frame) -> float:
     joints = list(dropwhile(lambda joint: joint.num_velocities() == 0, chain))
     length, ends = 0.0, [*(joint.frame_on_parent() for joint in joints[1:]), frame]
     for joint, end in zip(joints, ends, strict=False):
-        segment = _origin_in_body(end) - _origin_in_body(joint.frame_on_child())
+        segment = _frame_origin_in_body(end) - _frame_origin_in_body(joint.frame_on_child())
         length += float(np.linalg.norm(segment))
         if isinstance(joint, WeldJoint):
             length += float(np.linalg.norm(joint.X_FM().translation()))
     return length
 
 
-def _origin_in_body(frame: Frame) -> Array:
+def _frame_origin_in_body(frame: Frame) -> Array:
     return frame.GetFixedPoseInBodyFrame().translation()
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
     """Add a visual stick to each arm link without visuals, from its joint to the next or to S."""
-    p_BEnd = _origin_in_body(sensor_frame)
+    p_BEnd = _frame_origin_in_body(sensor_frame)
     for joint in reversed(chain_to_body(plant, sensor_frame.body())):
-        start, frame = _origin_in_body(joint.frame_on_child()), joint.frame_on_parent()
+        start, frame = _frame_origin_in_body(joint.frame_on_child()), joint.frame_on_parent()
         if not isinstance(joint, WeldJoint):
-            _add_stick(plant, joint.child_body(), start, p_BEnd)
-            p_BEnd = _origin_in_body(frame)
+            _add_skeleton_capsule(plant, joint.child_body(), start, p_BEnd)
+            p_BEnd = _frame_origin_in_body(frame)
             continue
         if joint.parent_body().index() == plant.world_body().index():
-            _add_stick(plant, joint.child_body(), np.zeros(3), p_BEnd)
-        p_BEnd = _pose_of_welded_child(joint) @ p_BEnd
+            _add_skeleton_capsule(plant, joint.child_body(), np.zeros(3), p_BEnd)
+        p_BEnd = _pose_of_welded_child_in_parent(joint) @ p_BEnd
 
 
-def _add_stick(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
+def _add_skeleton_capsule(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
     if plant.GetVisualGeometriesForBody(body):
         return
     length = float(np.linalg.norm(end - start))
-    is_long = length > _SKELETON_STICK_RADIUS_M
+    is_long = length > _SKELETON_CAPSULE_RADIUS_M
     along = (end - start) / length if is_long else np.array([0.0, 0.0, 1.0])
     pose = RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), (start + end) / 2)
-    stick = Capsule(_SKELETON_STICK_RADIUS_M, max(length, 1e-3))
+    stick = Capsule(_SKELETON_CAPSULE_RADIUS_M, max(length, 1e-3))
     plant.RegisterVisualGeometry(body, pose, stick, f"stick_of_{body.name()}", _SKELETON_COLOUR)

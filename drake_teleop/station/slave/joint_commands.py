@@ -35,7 +35,7 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 
 # Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
 # mechanical stops of commercial arms are farther out.
-_JOINT_RANGE_TOLERANCE_SHARE = 0.01
+_JOINT_LIMIT_TOLERANCE_TO_RANGE_RATIO = 0.01
 
 
 def used_ik_method(name: str, arm: ArmModel) -> str:
@@ -70,7 +70,7 @@ class LeaderJointFollower(LeafSystem):
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_next_command)
 
-    def _next_command(self, context: Context) -> tuple[Array, IkStatus]:
+    def _next_command_and_status(self, context: Context) -> tuple[Array, IkStatus]:
         last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
         if not are_valid_port_values(leader):
             return last, IkStatus.BAD_POSE
@@ -79,13 +79,13 @@ class LeaderJointFollower(LeafSystem):
         return np.clip(within, last - self._step, last + self._step), status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._next_command(context)[0])
+        output.SetFromVector(self._next_command_and_status(context)[0])
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._next_command(context)[1]
+        output[0] = self._next_command_and_status(context)[1]
 
     def _store_next_command(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(0, self._next_command(context)[0])
+        discrete_state.set_value(0, self._next_command_and_status(context)[0])
 
 
 class ExcitationCommand(LeafSystem):
@@ -115,7 +115,7 @@ class JointRangeMonitor(LeafSystem):
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
-        tolerance = _JOINT_RANGE_TOLERANCE_SHARE * (arm.upper - arm.lower)
+        tolerance = _JOINT_LIMIT_TOLERANCE_TO_RANGE_RATIO * (arm.upper - arm.lower)
         self._lower, self._upper = arm.lower - tolerance, arm.upper + tolerance
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)

@@ -24,7 +24,7 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 # Memory of a position interface: periods since the last command, index of the oldest command in
 # the queue; then target, r and dr/dt (n each), and the queue of commands.
 _PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
-_BRAKING_ACCELERATION_SHARE = 0.8  # of the limit a, in the braking speed v^2 = 2 a d
+_BRAKING_TO_MAX_ACCELERATION_RATIO = 0.8  # of the limit a, in the braking speed v^2 = 2 a d
 COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 
 
@@ -208,7 +208,7 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
     memory[_PERIODS_SINCE_COMMAND_INDEX] = periods % periods_per_command
     for i in range(n):
         error = target[i] - r[i]
-        braking = math.sqrt(2.0 * _BRAKING_ACCELERATION_SHARE * limits[1, i] * abs(error))
+        braking = math.sqrt(2.0 * _BRAKING_TO_MAX_ACCELERATION_RATIO * limits[1, i] * abs(error))
         max_speed = min(limits[0, i], braking)
         setpoint = min(max(error / lookahead, -max_speed), max_speed)
         acceleration = gain * lookahead * (setpoint - speed[i])
@@ -322,9 +322,9 @@ class HeldTorque(LeafSystem):
         self._request = self.DeclareVectorInputPort("requested_torque", arm.num_joints)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
         self.DeclareStateOutputPort("joint_torque", holding)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._hold_requested_torque)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample_and_clip_torque)
 
-    def _hold_requested_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _sample_and_clip_torque(self, context: Context, discrete_state: DiscreteValues) -> None:
         torque = self._request.Eval(context)
         if are_valid_port_values(torque):
             discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))

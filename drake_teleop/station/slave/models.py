@@ -33,9 +33,9 @@ _ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
 _SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
 # Places in Drake's source and in repaired texts, which the user does not have.
 _DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
-_PLACE_IN_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_STRING_LOCATION_IN_MESSAGE_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_MAX_SEPARATORS_LENGTH = 30  # " ... " and separators of the error line
+_MAX_ERROR_SEPARATORS_LENGTH = 30  # " ... " and separators of the error line
 
 
 def repair_and_parse_model(
@@ -61,7 +61,7 @@ def repair_and_parse_model(
     forces = plant.num_force_elements()
     model = ModelRepair(path, files, purpose, Path(folder.name))
     with translate_drake_errors(path, folder.name, is_scene=purpose.is_scene):
-        instances = (_add_files_of_directives if kind == ".yaml" else _add_file)(parser, model)
+        instances = (_add_directives if kind == ".yaml" else _add_model_file)(parser, model)
         chain_joints.check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         what = "the model has springs or other force elements, which are not supported"
@@ -70,8 +70,8 @@ def repair_and_parse_model(
     return instances, model
 
 
-def _add_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceIndex]:
-    _repair_text(model)
+def _add_model_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceIndex]:
+    _repair_model_text(model)
     with raise_logged_errors():
         if model.text:
             kind = model.path.suffix.lower().removeprefix(".")
@@ -79,9 +79,7 @@ def _add_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceI
         return parser.AddModels(str(model.path))
 
 
-def _add_files_of_directives(
-    parser: parsing.Parser, model: ModelRepair
-) -> list[ModelInstanceIndex]:
+def _add_directives(parser: parsing.Parser, model: ModelRepair) -> list[ModelInstanceIndex]:
     with raise_logged_errors():
         loaded = parsing.LoadModelDirectives(str(model.path))
         directives = parsing.FlattenModelDirectives(loaded, parser.package_map())
@@ -91,7 +89,7 @@ def _add_files_of_directives(
         if file is None:
             continue  # Drake reports it
         if file not in parts:
-            parts[file] = model.repair_part(file, _repair_text)
+            parts[file] = model.repair_part(file, _repair_model_text)
         if parts[file].text:
             added.file = f"file://{model.write_file(file.name, parts[file].text)}"
     texts = [part.text for part in parts.values()]
@@ -101,7 +99,7 @@ def _add_files_of_directives(
     return [each.model_instance for each in models]
 
 
-def _repair_text(model: ModelRepair) -> None:
+def _repair_model_text(model: ModelRepair) -> None:
     repair = _REPAIR_FUNCTION_OF_SUFFIX.get(model.path.suffix.lower())
     if repair is None:
         return
@@ -230,13 +228,13 @@ def translate_drake_errors(
     # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
-        reason = _PLACE_IN_REPAIRED_TEXT_PATTERN.sub("", reason)
+        reason = _STRING_LOCATION_IN_MESSAGE_PATTERN.sub("", reason)
         if folder:
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {'scene' if is_scene else 'robot'}"
         packages = _SCENE_PACKAGE_REMEDY if is_scene else _ROBOT_PACKAGE_REMEDY
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {packages}"
-        room = MAX_ERROR_LINE_LENGTH - _MAX_SEPARATORS_LENGTH - len(f"{path}{what}{remedy}")
+        room = MAX_ERROR_LINE_LENGTH - _MAX_ERROR_SEPARATORS_LENGTH - len(f"{path}{what}{remedy}")
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None

@@ -27,7 +27,7 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
-_POSE_ROUNDING_ERROR_M = 1e-14  # largest error that is rounding only [m]
+_MAX_POSE_ROUNDING_ERROR_M = 1e-14  # largest error that is rounding only [m]
 MIN_SINGULAR_VALUE_M = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
 MAX_SOLVER_STEPS_PER_COMMAND = 10
@@ -37,7 +37,7 @@ _MIN_STEP_DAMPING_M2 = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-3, 100, 100
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_MIN_GRADIENT_RATIO_M = 1e-3
+_MIN_GRADIENT_TO_ERROR_RATIO_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
 _MAX_POSE_ERROR_AT_SINGULARITY_M = 5e-6
 # The same for `find_posture`, which stops the search earlier [m].
@@ -114,7 +114,7 @@ def _find_smallest_eigenpair(H, u):
 
 
 @njit(cache=True)
-def _is_joint_held_at_limit(q, lower, upper, i, push):
+def _is_joint_pushed_against_limit(q, lower, upper, i, push):
     return (push > 0.0 and q[i] >= upper[i]) or (push < 0.0 and q[i] <= lower[i])
 
 
@@ -124,7 +124,7 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):
-        held[i] = _is_joint_held_at_limit(q, lower, upper, i, g[i])
+        held[i] = _is_joint_pushed_against_limit(q, lower, upper, i, g[i])
     outside = True
     while outside:
         for i in range(n):
@@ -148,7 +148,7 @@ def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
-def _wrist_or_shoulder_status(L, J):
+def _classify_wrist_or_shoulder_singularity(L, J):
     n = J.shape[1]
     if n < 6:  # such an arm lacks a direction in every posture
         return _WRIST_SINGULAR
@@ -212,7 +212,7 @@ def follow_pose(
         anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
         for _ in range(steps):
-            is_met = squared < _POSE_ROUNDING_ERROR_M * _POSE_ROUNDING_ERROR_M
+            is_met = squared < _MAX_POSE_ROUNDING_ERROR_M * _MAX_POSE_ROUNDING_ERROR_M
             if is_met or stalled_steps > 3 or relative_damping > 1e9:
                 break
             if better:
@@ -221,7 +221,7 @@ def follow_pose(
                     g[i] = damping * (anchor[i] - q[i]) + push[i]
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
             largest = _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
-            if largest < _POSE_ROUNDING_ERROR_M:
+            if largest < _MAX_POSE_ROUNDING_ERROR_M:
                 break
             found = _pose_error_into(table, L, pose, trial, x, J, e, push)
             total = found
@@ -249,21 +249,21 @@ def follow_pose(
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
-                return _wrist_or_shoulder_status(L, J)
+                return _classify_wrist_or_shoulder_singularity(L, J)
             vectors.copy_into(q, 0, kept, 0, n)
             far = missed > limit**2 and (n < 6 or expected_gain < 1e-3 * before)
-            return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
+            return _OUT_OF_REACH if far else _classify_wrist_or_shoulder_singularity(L, J)
         held, free = -1, 0.0
         for i in range(n):
-            if not _is_joint_held_at_limit(q, low, high, i, push[i]):
+            if not _is_joint_pushed_against_limit(q, low, high, i, push[i]):
                 free += push[i] * push[i]
             elif held < 0 or lower[i] < q[i] < upper[i]:
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        zero_gradient = _MIN_GRADIENT_RATIO_M * _MIN_GRADIENT_RATIO_M * squared
+        zero_gradient = _MIN_GRADIENT_TO_ERROR_RATIO_M * _MIN_GRADIENT_TO_ERROR_RATIO_M * squared
         if min_singular_value > 0.0 and free > zero_gradient:
-            return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
+            return _classify_wrist_or_shoulder_singularity(L, J) if damping > 0.0 else _SPEED_LIMIT
         before, missed = squared, vectors.dot(p, p) if n < 6 else squared
         # Gain expected from later samples; without it, every pose would count as reachable.
         expected_gain = 4.0 * free / max(damping, _MIN_STEP_DAMPING_M2)
@@ -313,7 +313,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
                 squared < _MAX_SEARCH_ERROR_AT_SINGULARITY_M**2
                 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M
             ):
-                status = _wrist_or_shoulder_status(L, J)
+                status = _classify_wrist_or_shoulder_singularity(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
     return _nearest_joints_by_whole_turns(arm, nearest, reference), IkStatus(status)

@@ -190,7 +190,7 @@ def AddSlavePlant(
         builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
     X_WS_start = arm.pose(start) if slave.home else start_pose(slave)
-    tip, texts = _tip_of_tool(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
+    tip, texts = _tool_tip_S(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
     parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
     return SlavePlant(*parts, texts, slave, environment)
 
@@ -322,7 +322,7 @@ def _unit_sphere_points() -> Array:
     return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)
 
 
-def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
+def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
     instance = plant.get_body(parsed.tool).model_instance()

@@ -41,7 +41,7 @@ from drake_teleop.station.slave.surroundings import ToolContactModel
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 PROXIMITY_FAR, PROXIMITY_TOUCHING, PROXIMITY_NEAR_MONITORED = range(3)
-_NEAR_MONITORED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
+_MAX_DISTANCE_OF_NEAR_PAIRS_M = 0.02  # m, larger than any motion between two checks
 _MAX_TOUCHING_GAP_M = 1e-9  # m
 
 
@@ -122,7 +122,7 @@ def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
     for pair in monitored_pairs:
         box = _place_box_at_body(pair, bodies, placed)
         distance = lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
-        if distance < _NEAR_MONITORED_DISTANCE_M:
+        if distance < _MAX_DISTANCE_OF_NEAR_PAIRS_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed)

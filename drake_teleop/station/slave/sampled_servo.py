@@ -92,7 +92,7 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _torque_at_time_into(time, line, torque):
+def _evaluate_torque_ramp_into(time, line, torque):
     n = torque.shape[0]
     for i in range(n):
         torque[i] = line[i] + (time - line[-1]) * line[n + i]
@@ -128,17 +128,17 @@ class SampledServo(LeafSystem):
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)
         self.DeclareVectorOutputPort("torque_rate", n, rate, {self.xd_ticket()})
-        self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update_torque_line)
+        self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._predict_torque_ramp)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
-        _torque_at_time_into(context.get_time(), line, output.get_mutable_value())
+        _evaluate_torque_ramp_into(context.get_time(), line, output.get_mutable_value())
 
     def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
         output.SetFromVector(line[self._n : 2 * self._n])
 
-    def _update_torque_line(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _predict_torque_ramp(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
         sheet = self._at_rest if self._sheet is None else self._sheet.Eval(context)
         inputs = self._command.Eval(context), self._state.Eval(context), sheet

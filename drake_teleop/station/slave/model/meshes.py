@@ -20,7 +20,7 @@ from drake_teleop.station.slave.model import model_references
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
 from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
 
-_NUM_VALUES_OF_SHAPE_SIZES = {
+_NUM_VALUES_BY_SHAPE_AND_SIZE = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
     "cylinder": {"radius": 1, "length": 1},
@@ -46,7 +46,7 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                if fault := _shape_fault(shape) or _resolve_mesh_file(shape, model):
+                if fault := _unusable_shape_reason(shape) or _resolve_mesh_file(shape, model):
                     link.remove(shape)
                     removed.add(fault)
         reported = faults["collision"]
@@ -61,12 +61,12 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
         model.add_repair("shapes are missing of", f"{join_names(links)}: {fault}")
 
 
-def _shape_fault(shape: ElementTree.Element) -> str | None:
+def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _NUM_VALUES_OF_SHAPE_SIZES:
+    if inner is None or kind not in _NUM_VALUES_BY_SHAPE_AND_SIZE:
         return f"{kind or 'empty'} shapes cannot be read"
-    sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_VALUES_OF_SHAPE_SIZES[kind]
+    sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_VALUES_BY_SHAPE_AND_SIZE[kind]
     for name, count in sizes.items():
         values = parse_numbers(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
@@ -98,7 +98,7 @@ def _resolve_mesh_file(shape: ElementTree.Element, model: ModelRepair) -> str | 
     if (suffix == ".stl" or shape.tag == "collision") and not _is_mesh_readable(file, written):
         return f"{Path(address).suffix} meshes are empty or damaged"
     if suffix == ".stl" and model.purpose.plant_has_shapes:
-        file = model.write_file(f"{file.stem}.obj", _obj_text_of_stl(file, written))
+        file = model.write_file(f"{file.stem}.obj", _convex_hull_obj_text_of_stl(file, written))
     resolved = f"file://{file.resolve()}"  # Drake does not decode %20
     if mesh.get("filename"):
         mesh.set("filename", resolved)
@@ -119,7 +119,7 @@ def _is_mesh_readable(path: Path, _mtime_ns: int) -> bool:  # the time: an edite
 
 
 @lru_cache(maxsize=1024)
-def _obj_text_of_stl(path: Path, _mtime_ns: int) -> str:
+def _convex_hull_obj_text_of_stl(path: Path, _mtime_ns: int) -> str:
     triangles = read_triangles(path)
     with suppress(ValueError):
         triangles = convex_hull(triangles.vertices)

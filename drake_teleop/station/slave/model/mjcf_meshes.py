@@ -177,12 +177,12 @@ class Mesh:
         """Return the path of an .obj file of the mesh for Drake; write it if necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
-        return self._write_triangles(self.triangles)
+        return self._write_obj_file(self.triangles)
 
     def write_hull(self) -> Path:
-        return self._write_triangles(convex_hull(self.triangles.vertices))
+        return self._write_obj_file(convex_hull(self.triangles.vertices))
 
-    def _write_triangles(self, triangles: Triangles) -> Path:
+    def _write_obj_file(self, triangles: Triangles) -> Path:
         name = re.sub(r"[^A-Za-z0-9_-]", "_", self.name)[:40]
         return self._model.write_file(f"{name}.obj", obj_text(triangles))
 

@@ -46,7 +46,7 @@ def repair_mjcf(model: ModelRepair) -> None:
     bodies, sensor = world.with_descendants(), purpose.sensor_name
     if is_complete:
         moving = [joint for body in bodies for joint in body.joints]
-        _report_lost_couplings(moving, mjcf)
+        _report_unread_couplings_and_springs(moving, mjcf)
     else:
         chain = [body for body in bodies if sensor in {x.name for x in body.with_descendants()}]
         moving = _weld_other_joints_and_list_moving(world, chain, model)
@@ -55,7 +55,7 @@ def repair_mjcf(model: ModelRepair) -> None:
         world.geoms.clear()
         what = "left out, because the tool does not carry them: shapes of"
         model.add_assumption(what, "the world")
-    _check_names_and_generators(bodies, model)
+    _check_unique_names_and_generator_tags(bodies, model)
     _set_mass_properties_of_bodies(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
     model.effort_limits = _effort_limits(mjcf, with_motor)
@@ -194,7 +194,7 @@ def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mj
                 model.add_assumption(f"no {what}, which the model has, of", joint.name)
 
 
-def _report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
+def _report_unread_couplings_and_springs(joints: list[Joint], mjcf: Mjcf) -> None:
     for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
@@ -218,16 +218,16 @@ def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
             limits[name] = limits.get(name, 0.0) + limit
     for joint in joints:
         names = "actuatorfrcrange", "actuatorfrclimited"
-        own = _limit_in_both_directions(mjcf, joint.attributes, *names)
+        own = _symmetric_limit_from_range(mjcf, joint.attributes, *names)
         limits[joint.name] = min(limits.get(joint.name, float("inf")), own)
     of_joints = {joint.name: limits[joint.name] for joint in joints}
     return {name: limit for name, limit in of_joints.items() if 0.0 < limit < float("inf")}
 
 
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
-    force = _limit_in_both_directions(mjcf, given, "forcerange", "forcelimited")
+    force = _symmetric_limit_from_range(mjcf, given, "forcerange", "forcelimited")
     if (gain := _effort_per_control_unit(given, tag)) > 0.0:
-        control = _limit_in_both_directions(mjcf, given, "ctrlrange", "ctrllimited")
+        control = _symmetric_limit_from_range(mjcf, given, "ctrlrange", "ctrllimited")
         force = min(force, gain * control)
     return abs(given.numbers("gear", (1.0,))[0]) * force
 
@@ -244,7 +244,7 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     return abs(given.numbers("gainprm", (1.0,))[0])
 
 
-def _limit_in_both_directions(mjcf: Mjcf, given: Attributes, name: str, flag: str) -> float:
+def _symmetric_limit_from_range(mjcf: Mjcf, given: Attributes, name: str, flag: str) -> float:
     limits = given.read_range(name, flag, automatic=mjcf.autolimits)
     if limits is None:
         return float("inf")
@@ -252,7 +252,7 @@ def _limit_in_both_directions(mjcf: Mjcf, given: Attributes, name: str, flag: st
     return smaller if limits[0] < 0.0 < limits[1] else larger
 
 
-def _check_names_and_generators(bodies: list[Body], model: ModelRepair) -> None:
+def _check_unique_names_and_generator_tags(bodies: list[Body], model: ModelRepair) -> None:
     for body in bodies:
         for tag in body.generator_tags:
             model.add_fault(f"{body.name} contains <{tag}>, which is not supported; expand it")

@@ -12,7 +12,7 @@ from drake_teleop.station.slave.model.model_repair import ModelRepair
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_link
 
 # Row and column: ixx: (0, 0), ixy: (0, 1) and so on.
-_INERTIA_INDICES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
+_INERTIA_ENTRY_INDICES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
@@ -57,7 +57,7 @@ def repair_inertia_and_detect_missing(
         if no_mass and inertia.any():
             model.add_repair("an inertia without a mass left out of", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, model)
-        entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_INDICES.items()}
+        entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_ENTRY_INDICES.items()}
         pose = inertial.findall("pose" if is_sdf else "origin")[:1]
         inertial.clear()
         inertial.extend(pose)
@@ -76,7 +76,7 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
-    for name, (row, column) in _INERTIA_INDICES.items():
+    for name, (row, column) in _INERTIA_ENTRY_INDICES.items():
         default = "1" if is_sdf and row == column else "0"
         text = element.get(name) or element.findtext(name) or default
         tensor[row, column] = tensor[column, row] = parse_number(text)

@@ -33,7 +33,7 @@ PACKAGE_FOLDER_SETTINGS = "--package-path, or package_paths in slave or master.l
 """Places where users name the folders of packages, for messages."""
 MESHES_NOT_FOUND_FAULT = f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
 MESHES_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
-_PACKAGE_FILE_NAME = "package.xml"
+_ROS_MANIFEST_NAME = "package.xml"
 _FILE_ATTRIBUTE_REGEX = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
 _FILE_ELEMENT_TAG_PATTERN = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
 _FOLDER_ATTRIBUTES = ("meshdir", "texturedir", "assetdir")  # search folders of MJCF
@@ -60,10 +60,10 @@ class ModelFiles:
             if folder.is_dir():
                 self.packages.setdefault(folder.name, folder.resolve())
         around = [self._folder, *self._folder.parents]
-        own = [folder for folder in around if os.path.isfile(folder / _PACKAGE_FILE_NAME)]
+        own = [folder for folder in around if os.path.isfile(folder / _ROS_MANIFEST_NAME)]
         text = model.read_bytes().decode("utf-8", errors="replace")
         for name in set(re.findall(r"(?:package|model)://([^/\s\"'<]+)", text)):
-            beside = [each for each in around if os.path.isfile(each / name / _PACKAGE_FILE_NAME)]
+            beside = [each for each in around if os.path.isfile(each / name / _ROS_MANIFEST_NAME)]
             inside = [self._folder] if os.path.isdir(self._folder / name) else []
             named = [each for each in own if each.name == name]
             for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 
-_MAX_JOINED_NAMES = 12  # names in one statement
+_MAX_LISTED_NAMES = 12  # names in one statement
 
 
 class ModelPurpose(NamedTuple):
@@ -103,7 +103,7 @@ class ModelRepair:
     def describe_frame_fault(self, count: int, known: set[str]) -> tuple[str, str]:
         """Return fault and remedy if `count` frames, not one, have the sensor frame's name."""
         name = self.purpose.sensor_name
-        near = get_close_matches(name, sorted(known), n=_MAX_JOINED_NAMES, cutoff=0.0)
+        near = get_close_matches(name, sorted(known), n=_MAX_LISTED_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
         return f"{count or 'no'} frames are named {name!r}", remedy
 
@@ -124,5 +124,5 @@ class ModelRepair:
 def join_names(names: Iterable[str]) -> str:
     """Return the names, separated by commas; after twelve, only the number of the others."""
     each = list(names)
-    more = [f"and {len(each) - _MAX_JOINED_NAMES} more"] if len(each) > _MAX_JOINED_NAMES else []
-    return ", ".join(each[:_MAX_JOINED_NAMES] + more)
+    more = [f"and {len(each) - _MAX_LISTED_NAMES} more"] if len(each) > _MAX_LISTED_NAMES else []
+    return ", ".join(each[:_MAX_LISTED_NAMES] + more)

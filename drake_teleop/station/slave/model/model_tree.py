@@ -50,7 +50,7 @@ def reduce_to_chain(
     joints = _joint_chain_to_link(scope, sensor_link, model)
     if joints is None:
         return None
-    joints = _remove_free_base(scope, joints, model)
+    joints = _weld_floating_base(scope, joints, model)
     root, chain = joint_link(joints[0], "parent") if joints else sensor_link, set(joints)
     num_joints_to_link = _remove_unconnected_links(scope, root, chain, model)
     names = {joint.get("name") for joint in joints} | model.purpose.held_positions.keys()
@@ -108,7 +108,7 @@ def _joint_chain_to_link(scope: Element, link: str, model: ModelRepair) -> list[
     return chain[::-1]
 
 
-def _remove_free_base(scope: Element, chain: list[Element], model: ModelRepair) -> list[Element]:
+def _weld_floating_base(scope: Element, chain: list[Element], model: ModelRepair) -> list[Element]:
     first = next((k for k, each in enumerate(chain) if each.get("type") != "fixed"), None)
     if first is None or chain[first].get("type") not in ("floating", "planar"):
         return chain

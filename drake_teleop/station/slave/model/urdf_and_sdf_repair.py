@@ -38,7 +38,7 @@ def repair_urdf(model: ModelRepair) -> None:
     _repair_links_and_joints(model, is_sdf=False)
     if not model.purpose.is_scene:
         _remove_references_to_missing_parts(model)
-    _convert_meshes_and_write_text(model)
+    _convert_meshes_and_set_text(model)
 
 
 def repair_sdf(model: ModelRepair) -> None:
@@ -52,7 +52,7 @@ def repair_sdf(model: ModelRepair) -> None:
     model.raise_faults()
     for uri in model.root.iterfind(".//include/uri"):
         _repair_included_file(uri, model)
-    _convert_meshes_and_write_text(model)
+    _convert_meshes_and_set_text(model)
 
 
 def _remove_children_ignored_by_drake(elements: list[Element]) -> None:
@@ -67,7 +67,7 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
     model_numbers.replace_commas_by_blanks(model.root)
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
-        _make_names_unique(scope, model, is_sdf=is_sdf)
+        _make_joint_and_link_names_unique(scope, model, is_sdf=is_sdf)
     chain, num_joints_to_link = _reduce_model_to_arm(scopes, model) or (set(), {})
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
@@ -85,7 +85,7 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
                 model.add_assumption("no inertia of", name)
 
 
-def _convert_meshes_and_write_text(model: ModelRepair) -> None:
+def _convert_meshes_and_set_text(model: ModelRepair) -> None:
     model.raise_faults()
     remove_unusable_shapes(model)
     model.raise_faults()
@@ -126,7 +126,7 @@ def _reduce_model_to_arm(
     return model_tree.reduce_to_chain(scopes[0], link, model) if link else None
 
 
-def _make_names_unique(scope: Element, model: ModelRepair, *, is_sdf: bool) -> None:
+def _make_joint_and_link_names_unique(scope: Element, model: ModelRepair, *, is_sdf: bool) -> None:
     joints = list_joints(scope)
     # In SDF, a joint must not have the name of a link either.
     names = {link.get("name", "") for link in scope.findall("link")} if is_sdf else set[str]()
