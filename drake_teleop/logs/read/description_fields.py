@@ -29,15 +29,17 @@ SI_VALUE_OF_UNIT = {
 """SI value of each unit, except "g", the magnitude of the described gravity, and "mg"."""
 
 
-def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:
-    if value in words:
+def _parse_frame(value: Any, *, allowed_words: tuple[str, ...] = ("sensor", "base")) -> Any:
+    if value in allowed_words:
         return value
     try:
         matrix = np.asarray(value)
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
-        allowed = f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(words)}"
+        allowed = (
+            f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(allowed_words)}"
+        )
         raise ValueError(f"must be {allowed}")
     if not (np.abs(matrix) < 2.0).all() or orthogonality_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
@@ -45,7 +47,7 @@ def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> 
 
 
 def _parse_rotation(value: Any) -> Any:
-    return value if value is None else _parse_frame(value, words=("auto",))
+    return value if value is None else _parse_frame(value, allowed_words=("auto",))
 
 
 def _parse_position(value: Any) -> Any:
@@ -64,14 +66,14 @@ def _parse_gravity(value: Any) -> Any:
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
-def _parse_scale(value: Any) -> Any:
+def _parse_scale_factors(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE_FACTOR for x in factors):
         raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE_FACTOR:g}")
     return [float(value)] * 3 if _is_number(value) else value
 
 
-def _parse_weight(value: Any) -> Any:
+def _parse_removed_weight(value: Any) -> Any:
     if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
         raise ValueError("weight must be the word removed, or [m, m c_x, m c_y, m c_z] in kg, kg m")
     return value
@@ -107,11 +109,11 @@ _SCALE_SCHEMA = {
     "anyOf": _NUMBER_OR_VECTOR_SCHEMA,
     "description": "factor on the numbers of the file, or one for each column; -1 for another sign",
 }
-Scale = Annotated[Vector, BeforeValidator(_parse_scale), WithJsonSchema(_SCALE_SCHEMA)]
+Scale = Annotated[Vector, BeforeValidator(_parse_scale_factors), WithJsonSchema(_SCALE_SCHEMA)]
 MassAndMoment = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
 Weight = Annotated[
     MassAndMoment | Literal["removed"] | None,
-    BeforeValidator(_parse_weight),
+    BeforeValidator(_parse_removed_weight),
     Field(
         description="weight that the robot has subtracted: removed (that of the load), or that of a"
         " payload, [m, m c_x, m c_y, m c_z] in S, kg and kg m"
@@ -120,7 +122,7 @@ Weight = Annotated[
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_parse_frame)]
 ImuFrame = Annotated[
     Literal["sensor", "base", "auto"] | Rotation,
-    BeforeValidator(partial(_parse_frame, words=("sensor", "base", "auto"))),
+    BeforeValidator(partial(_parse_frame, allowed_words=("sensor", "base", "auto"))),
 ]
 RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_parse_rotation)]
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
