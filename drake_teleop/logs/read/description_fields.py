@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from typing import Annotated, Any, Literal, get_args
 
@@ -27,19 +28,28 @@ SI_VALUE_OF_UNIT = {
     "mdeg/s": 1e-3 * np.pi / 180,
 }  # fmt: skip
 """SI value of each unit, except "g", the magnitude of the described gravity, and "mg"."""
+_UNIT_OF_SPELLING = {
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
+    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
+    "rad/s²": "rad/s^2", "sec": "s",
+}  # fmt: skip
 
 
-def _parse_frame(value: Any, *, allowed_words: tuple[str, ...] = ("sensor", "base")) -> Any:
-    if value in allowed_words:
+def known_unit(text: str) -> str:
+    """Return the name of a unit in any spelling, such as "N m" for "[Nm]"; "" if it is unknown."""
+    plain = re.sub(r"[] ^[*.·]", "", text).lower().replace("\u03bc", "µ")
+    return _UNIT_OF_SPELLING.get(plain, "")
+
+
+def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:
+    if value in words:
         return value
     try:
         matrix = np.asarray(value)
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
-        allowed = (
-            f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(allowed_words)}"
-        )
+        allowed = f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(words)}"
         raise ValueError(f"must be {allowed}")
     if not (np.abs(matrix) < 2.0).all() or orthogonality_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
@@ -47,7 +57,7 @@ def _parse_frame(value: Any, *, allowed_words: tuple[str, ...] = ("sensor", "bas
 
 
 def _parse_rotation(value: Any) -> Any:
-    return value if value is None else _parse_frame(value, allowed_words=("auto",))
+    return value if value is None else _parse_frame(value, words=("auto",))
 
 
 def _parse_position(value: Any) -> Any:
@@ -122,7 +132,7 @@ Weight = Annotated[
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_parse_frame)]
 ImuFrame = Annotated[
     Literal["sensor", "base", "auto"] | Rotation,
-    BeforeValidator(partial(_parse_frame, allowed_words=("sensor", "base", "auto"))),
+    BeforeValidator(partial(_parse_frame, words=("sensor", "base", "auto"))),
 ]
 RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_parse_rotation)]
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
