@@ -205,7 +205,7 @@ class LiveHand(operator.Operator):
         motion = self._pose.Eval(context), self._twist.Eval(context), self._scratch
         _live_hand_wrench_into(path, time, *hand, *motion, output.get_mutable_value())
 
-    def _calc_intent(self, context: Context, output: BasicVector) -> None:
+    def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._current_motion(context)[:7])
 
 
