@@ -129,13 +129,13 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> Array:
 
 
 @njit(cache=True)
-def _minimum_jerk_ramp(time, length):
-    u = time / length
+def _minimum_jerk_ramp_and_rate(time, duration):
+    u = time / duration
     if u <= 0.0:
         return 0.0, 0.0
     if u >= 1.0:
         return 1.0, 0.0
-    return u * u * u * (10.0 + u * (6.0 * u - 15.0)), 30.0 * (u * (1.0 - u)) ** 2 / length
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0)), 30.0 * (u * (1.0 - u)) ** 2 / duration
 
 
 @njit(cache=True)
@@ -151,8 +151,8 @@ def intended_motion_into(packed, start, t, pose, twist):
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]
-        fade_in, fade_in_rate = _minimum_jerk_ramp(t - row[0], row[1])
-        fade_out, fade_out_rate = _minimum_jerk_ramp(t - row[2], row[3])
+        fade_in, fade_in_rate = _minimum_jerk_ramp_and_rate(t - row[0], row[1])
+        fade_out, fade_out_rate = _minimum_jerk_ramp_and_rate(t - row[2], row[3])
         angle = row[4] * (t - row[0]) + row[5]
         level = (fade_in - fade_out) * math.sin(angle)
         rate = (fade_in_rate - fade_out_rate) * math.sin(angle)
