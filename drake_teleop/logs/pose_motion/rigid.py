@@ -25,7 +25,7 @@ LEVER_PARAMETERS, ROTATION_PARAMETERS = slice(17, 20), slice(20, 23)
 _MAX_RIGID_FIT_STEPS, _MAX_CONVERGED_STEP_OVER_STD = 40, 1e-4
 _MAX_RIGID_MISFIT_OVER_DOF, _MAX_GAIN_MISFIT_OVER_EXPECTED, _NOISE_MISFIT_OVER_DOF = 4.0, 1.5, 1.5
 _MAX_PARAMETER_FIT_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_MIN_WRENCH_NOISE_OVER_RESIDUAL, _ROTATION_DIFFERENCE_STEP_RAD = 0.1, 1e-4
+_MIN_WRENCH_NOISE_OVER_RESIDUAL, _FINITE_DIFFERENCE_ROTATION_RAD = 0.1, 1e-4
 _MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
 _OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -229,7 +229,7 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and e (6, 38), coefficients of the residual wrench."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
-    step = _ROTATION_DIFFERENCE_STEP_RAD
+    step = _FINITE_DIFFERENCE_ROTATION_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, spectra.SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
