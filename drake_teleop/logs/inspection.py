@@ -66,7 +66,10 @@ def inspect_command(
     else:
         drafts = [_draft_of_recording(path, out, summary) for path in (log, *others)]
         with output_folder(out):
-            _correct_and_write_draft(join_drafts(drafts), _find_writable_draft_path(out), summary)
+            draft = join_drafts(drafts)
+            _correct_and_write_draft(draft, _find_writable_draft_path(out), summary)
+        more = [{"name": x.name, "message": x.message} for x in draft.findings]
+        summary["findings"] = [*summary["findings"], *more]
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -185,6 +188,8 @@ def _inspect_described_log(
     for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
+            if note := tables[stream.source].note:
+                findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, source)
         summary["streams"][name] = figures

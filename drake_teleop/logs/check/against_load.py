@@ -166,14 +166,18 @@ def check_wrench_and_estimate_delay(
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
+    too_still = too_little_motion(thin)
     samples_of_edits: dict[int, list[_LowPassedSamples]] = {}  # by identity of the description
 
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFitQuality:
         if id(edited) not in samples_of_edits:
             # A wrong description may cause a wrong delay.
             log = _log_with_edited_wrench(thin, description, edited)
-            log = log or data.read_thinned_log(edited)
-            if edited is not description and (why := too_little_motion(log)) is not None:
+            why = too_still
+            if log is None:
+                log = data.read_thinned_log(edited)
+                why = too_little_motion(log)
+            if edited is not description and why is not None:
                 raise DrakeTeleopError(why)
             aligned = [remove_delay(log, shift) for shift in {0.0, delay or 0.0}]
             samples_of_edits[id(edited)] = [_low_passed_samples(each) for each in aligned]
@@ -184,7 +188,7 @@ def check_wrench_and_estimate_delay(
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * MAX_SEARCHED_DELAY_S
     tried: list[tuple[Finding | None, Description]] = []
-    if not (given.is_good and inside):
+    if too_still is None and not (given.is_good and inside):
         tried += _clock_offset_edits(description, thin)
     if not given.is_good:
         tried = [*edits.wrench_and_motion_edits(description), *tried]

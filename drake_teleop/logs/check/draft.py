@@ -6,7 +6,8 @@ import copy
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +16,8 @@ import numpy as np
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
-from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.tables import Table
+from drake_teleop.logs.read.description_fields import known_unit
+from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 _TIME_NAME_PATTERN = (
     r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?|zeit|temps|tiempo|tempo)(_?(s|ms|us|ns))?$"
@@ -61,11 +62,6 @@ _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
-_UNIT_OF_SPELLING = {
-    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
-    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
-    "n*m": "N m", "n.m": "N m",
-}  # fmt: skip
 _ALLOWED_UNITS = {
     "force": description_fields.FORCE_UNITS, "torque": description_fields.TORQUE_UNITS,
     "specific_force": ("m/s^2", "mm/s^2", "g", "mg"),
@@ -95,10 +91,11 @@ _NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate:
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, and its comment lines."""
+    """Draft of a log description: its streams as in YAML, comment lines, and findings."""
 
     streams: dict[str, Any]
     comment_lines: list[str]
+    findings: tuple[Finding, ...] = ()
 
     def text(self) -> str:
         return to_yaml_text(self.streams, head=self.comment_lines)
@@ -111,7 +108,8 @@ class Draft(NamedTuple):
             for name in outer:
                 place = place.setdefault(name, {})
             place[last] = value
-        return Draft(streams, [*self.comment_lines, f"Corrected by the data: {finding.message}."])
+        lines = [*self.comment_lines, f"Corrected by the data: {finding.message}."]
+        return Draft(streams, lines, self.findings)
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
@@ -123,7 +121,8 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
     streams = streams or drafts[0].streams
     order = ["wrench", "imu", "pose", "static"]
     ordered = {name: streams[name] for name in order if name in streams}
-    return Draft(ordered, [*dict.fromkeys(x for draft in drafts for x in draft.comment_lines)])
+    lines = dict.fromkeys(x for draft in drafts for x in draft.comment_lines)
+    return Draft(ordered, [*lines], tuple(x for draft in drafts for x in draft.findings))
 
 
 def _is_template(stream: dict[str, Any]) -> bool:
@@ -140,8 +139,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     """Return a log description guessed from names and magnitudes of columns."""
     plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
-    found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
-    found |= _find_vectors_in_array_columns(table, plain)
+    found |= _find_wrench_in_arrays(table, plain) | _find_quaternion(table, plain)
     ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
@@ -195,13 +193,38 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *([_RAW_ACCELERATION_NOTE] if raw in str(draft.get("imu")) else []),
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
-    return Draft(draft, head)
+    return Draft(draft, head, tuple(_other_wrench_findings(table, plain, found)))
+
+
+def _find_wrench_in_arrays(table: Table, plain: _NamesAndUnits) -> _Columns:
+    numbered = _find_vectors_in_numbered_columns(plain)
+    return numbered | _find_vectors_in_array_columns(table, plain)
+
+
+def _other_wrench_findings(
+    table: Table, plain: _NamesAndUnits, found: _Columns
+) -> Iterator[Finding]:
+    """Yield a finding for each complete wrench of a table beside the one in `found`."""
+    pair = "force", "torque"
+    used = {x for names in found.values() for x in names}
+    taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
+    while taken:
+        arrays = {name.partition("[")[0] for name in used}
+        plain = {x: y for x, y in plain.items() if not {x, x.partition("[")[0]} & (used | arrays)}
+        rest = replace(table, columns=ColumnsOnAccess(plain, table.columns.__getitem__))
+        other = _find_vectors(plain) | _find_wrench_in_arrays(rest, plain)
+        if any(_count_scalars_per_row(table, other.get(kind, [])) != 3 for kind in pair):
+            return
+        used = {x for kind in pair for x in other[kind]}
+        lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
+        text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
+        yield Finding("other wrench", f"{text}; to use it, set {lines}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
-    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
+    if unit is None and suffix is not None and known_unit(suffix[1]):
         unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[\W_]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
@@ -209,6 +232,12 @@ def _normalized_name_and_unit(name: str) -> tuple[str, str]:
 
 def _remove_trailing_number(name: str) -> str:
     return re.sub(r"_?\d+$", "", name)
+
+
+def _is_not_measured(name: str) -> bool:
+    return (
+        re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name) is not None
+    )
 
 
 def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
@@ -224,6 +253,7 @@ def _find_vectors(plain: _NamesAndUnits) -> _Columns:
     found: _Columns = {}
     for pair in _VECTOR_PAIRS_OF_EACH_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
+        shared.sort(key=_is_not_measured)
         for kind in pair:
             for name in (shared or list(groups[kind]))[:1]:
                 found[kind] = groups[kind][name]
@@ -242,14 +272,10 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
             groups.setdefault("", {}).setdefault(words, name)
     for name, (words, unit) in plain.items() if not groups else ():  # in another language
         match = re.match(r"^(.*?)_?([xyz])$", words)
-        if match and _normalize_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
+        if match and known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
     whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
     return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
-
-
-def _normalize_unit(text: str) -> str:
-    return _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", text).lower(), "")
 
 
 def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
@@ -293,7 +319,7 @@ def _find_vectors_in_numbered_columns(plain: _NamesAndUnits) -> _Columns:
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
-        for base in sorted(fit, key=lambda name: "target" in name)[:1]:
+        for base in sorted(fit, key=_is_not_measured)[:1]:
             for kind, places in kinds.items():
                 found[kind] = [groups[base][k] for k in places]
     by_words = {words: name for name, (words, _) in plain.items()}
@@ -341,7 +367,7 @@ def _draft_quantity(
         if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_OF_RAW_COUNTS:
             group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
-        unit = _normalize_unit(spelling)
+        unit = known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
     if kind in ("force", "torque"):
@@ -390,7 +416,7 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
         structure, rows = vector_column.rpartition(".")[0], len(table.columns[vector_column])
         named.sort(key=lambda name: len(table.columns[name]) != rows)
         named.sort(key=lambda name: name.rpartition(".")[0] != structure)
-    unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
+    unit = known_unit(plain[named[0]][1])
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
     for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():

@@ -215,7 +215,8 @@ def _write_csv_copy(path: Path, target: Path, new: ContactColumns) -> None:
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
     head = first - 2
-    if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
+    is_header = head >= 0 and frame.columns[0].strip().encode() in lines[head]
+    if len(rows) != len(frame) or len(frame) != len(new.in_contact) or not is_header:
         what = "columns can only be added to a file with a header and one line for each row"
         raise DrakeTeleopError(what, where=str(path), remedy="convert it to Parquet")
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)

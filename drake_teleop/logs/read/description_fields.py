@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from typing import Annotated, Any, Literal, get_args
 
@@ -27,6 +28,17 @@ SI_VALUE_OF_UNIT = {
     "mdeg/s": 1e-3 * np.pi / 180,
 }  # fmt: skip
 """SI value of each unit, except "g", the magnitude of the described gravity, and "mg"."""
+_UNIT_OF_SPELLING = {
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
+    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
+    "rad/s²": "rad/s^2", "sec": "s",
+}  # fmt: skip
+
+
+def known_unit(text: str) -> str:
+    """Return the name of a unit in any spelling, such as "N m" for "[Nm]"; "" if it is unknown."""
+    plain = re.sub(r"[] ^[*.·]", "", text).lower().replace("\u03bc", "µ")
+    return _UNIT_OF_SPELLING.get(plain, "")
 
 
 def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:

@@ -146,6 +146,8 @@ class _LogReader:
         if stream.source not in self.tables:
             self.tables[stream.source] = read_stream_table(stream)
         table = self.tables[stream.source]
+        if table.note and table.note not in self.notes:
+            self.notes.append(table.note)
         return table if isinstance(stream, Static) else table.rows_with_any_number(stream.columns)
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:

@@ -31,6 +31,7 @@ class Table:
         absent_groups: names of column groups that the file marks as not provided.
         whole_table: table of all rows, if this one has only some of them.
         kept_rows: row numbers in `whole_table`, counted from 0; None: all rows.
+        note: which part of the file was read, if it has several.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class Table:
     absent_groups: tuple[str, ...] = ()
     whole_table: Table | None = None
     kept_rows: NDArray[np.intp] | None = None
+    note: str = ""
 
     def line_in_file(self, row: int) -> int:
         """Return the number in the file, for messages, of a row of this table."""
