@@ -301,7 +301,7 @@ NOTHING_REJECTED_NOTE = (
     " scale and mounting"
 )
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
-_STD_PER_NORMAL_MAD, _MAX_FIT_STD_GROWTH = 1.4826, 2.5
+_NORMAL_STD_OVER_MEDIAN_DEVIATION, _MAX_FIT_STD_GROWTH = 1.4826, 2.5
 _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE = 0.3
 _MIN_REJECTION_MARGIN_S = 0.1  # least margin on both sides of a rejected time span [s]
 
@@ -357,7 +357,7 @@ def _max_residuals_over_std(x: Array, y: Array, weights: Array, inside: NDArray[
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
-    scale = _STD_PER_NORMAL_MAD * np.median(residual[inside], axis=0)
+    scale = _NORMAL_STD_OVER_MEDIAN_DEVIATION * np.median(residual[inside], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     scale = np.maximum(scale, MIN_NOISE_STD_OVER_WRENCH_RMS * rms + 1e-30)
     return np.asarray((residual / scale).max(axis=1))

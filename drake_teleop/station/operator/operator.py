@@ -319,7 +319,7 @@ class Operator(LeafSystem):
             moving.add(self.discrete_state_ticket(self._groups[1]))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
-        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intended_pose), moving)
 
     def _declare_intended_motion_sources(self) -> set[DependencyTicket]:
         # `LiveHand` replaces these ports by a path to external targets.
@@ -357,6 +357,6 @@ class Operator(LeafSystem):
         stylus = self._pose.Eval(context), self._twist.Eval(context)
         _hand_wrench_at_time(intent, time, *own, *stylus, output.get_mutable_value())
 
-    def _calc_intent(self, context: Context, output: BasicVector) -> None:
+    def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
         intent, pose = self._intent_at_present(context), output.get_mutable_value()
         _intended_plus_planned_motion_into(intent, context.get_time(), pose, self._intent_twist)
