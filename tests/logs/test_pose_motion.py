@@ -30,7 +30,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import use_spline_motion_and_flag_edges
-from drake_teleop.logs.explained_log import _noise_of_spline_acceleration
+from drake_teleop.logs.explained_log import _acceleration_noise_of_splines_m_s2
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     _taper_excluding_gaps,
@@ -186,7 +186,7 @@ def test_noise_of_the_acceleration_of_splines_is_predicted(rate, spacing, noise)
     splines = PoseSplines(Poses(t, position, np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))), spacing)
     at = np.arange(2.0, 58.0, 0.002)
     acceleration = np.diff(splines.position(at), 2, axis=0) / 0.002**2
-    predicted = _noise_of_spline_acceleration(splines)
+    predicted = _acceleration_noise_of_splines_m_s2(splines)
     assert predicted == pytest.approx(np.sqrt(np.mean(acceleration**2)), rel=0.1)
 
 
