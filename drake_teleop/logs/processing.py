@@ -177,7 +177,7 @@ def identify_log(
         checks: result of `check_conventions_of_file` for this log, if known.
     """
     METHODS.check(method, "method")
-    _check_log_arguments(path, cutoff_hz)
+    _check_path_and_cutoff(path, cutoff_hz)
     check = partial(check_conventions_of_file, Path(path)) if checks is None else lambda: checks
     options = method, cutoff_hz
     raw, fitted, frame_findings = _read_and_fit_load(path, *options, delay)
@@ -260,7 +260,7 @@ def _explain_residual(
     Gain errors within the stated ones are no causes.
     """
     why = None
-    if _is_explanation_possible(log, fitted.motion is not None):
+    if _is_misfit_explainable(log, fitted.motion is not None):
         why = explained_log.explain_log(log, fitted.delay_s, fitted.motion)
     causes = () if why is None else why.causes
     need_motion = any(x.name not in CAUSES_AT_REST for x in (*frame_findings, *causes))
@@ -353,7 +353,7 @@ def _unexplained_misfit(
     return why
 
 
-def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
+def _check_path_and_cutoff(path: Any, cutoff_hz: Any) -> None:
     expect_type((str, Path), path, "log", "give the file's name")
     if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_CUTOFF_HZ:
         remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no filter"
@@ -378,7 +378,7 @@ def _fit_load_to_motion(
     return LoadFitOfLog(log, fit, delay_s, source)
 
 
-def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
+def _is_misfit_explainable(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
     if log.static or (high - low <= _CONSTANT_CHANNEL_TOLERANCE * np.maximum(high, -low)).any():
         return False
@@ -473,7 +473,7 @@ def eliminate_log(
         DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
             static poses.
     """
-    _check_log_arguments(path, cutoff_hz)
+    _check_path_and_cutoff(path, cutoff_hz)
     if untouched_s is not None:
         start_s, stop_s = finite_array("untouched_s", untouched_s, 2).tolist()
         untouched_s = start_s, stop_s
@@ -482,7 +482,7 @@ def eliminate_log(
     identification = load if isinstance(load, Identification) else Identification.load(load)
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma}
     given |= {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _checked_scales(given, eta, gripper is not None)
+    scales = _resolve_force_scales(given, eta, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -498,8 +498,8 @@ def eliminate_log(
     reference = None
     if free is not None:
         free_motion = _read_and_eliminate_log(free, *common)
-        _require_motion(free_motion)
-        _require_motion(found)
+        _reject_static_log(free_motion)
+        _reject_static_log(found)
         free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
     if found.log.static:
@@ -518,7 +518,7 @@ def eliminate_log(
     return replace(found, detection=detection)
 
 
-def _require_motion(found: EliminatedLog) -> None:
+def _reject_static_log(found: EliminatedLog) -> None:
     if found.log.static:
         what = "contains only poses at rest (`static`), in which no contact can be detected"
         raise DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
@@ -564,7 +564,7 @@ def _read_and_eliminate_log(
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
-            return residual[_rows_in_span(shown, *untouched_s)].mean(axis=0), 1.0
+            return residual[_rows_in_tare_span(shown, *untouched_s)].mean(axis=0), 1.0
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
@@ -598,7 +598,7 @@ def _read_and_eliminate_log(
         inner: dict[str, Any] = {"contact": late.contact[known], "scaled": late.scaled[known]}
         causal_wrench = replace(late, offsets=causal_offsets, **inner)
     measured = log.wrench - offsets
-    findings = _findings_if_contact_is_large(Path(path), measured, contact, identification)
+    findings = _check_log_if_contact_is_large(Path(path), measured, contact, identification)
     notes = (*log.notes, *notes_on_undetermined_load(identification))
     # A wrong description would explain the clock, too.
     shown = replace(shown, notes=notes if findings else (*notes, *aligned.clock_notes))
@@ -621,7 +621,7 @@ def _read_and_eliminate_log(
     )
 
 
-def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
+def _rows_in_tare_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
         found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
@@ -667,7 +667,7 @@ def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
     )
 
 
-def _findings_if_contact_is_large(
+def _check_log_if_contact_is_large(
     path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
@@ -684,7 +684,7 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=where, remedy="use sigma alone; it scales the inertia")
 
 
-def _checked_scales(
+def _resolve_force_scales(
     given: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
     for name, value in given.items():
@@ -737,7 +737,7 @@ def detect_log(
     found = eliminate_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
-    _require_motion(found)
+    _reject_static_log(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
         remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"

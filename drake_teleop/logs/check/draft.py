@@ -31,7 +31,7 @@ _VECTOR_NAME_PATTERNS = {
     "orientation": "q|quat|quaternion|orientation",
     "position": "p|pos|position|translation|tcp|ee|eef",
 }
-_VECTORS_OF_ONE_INSTRUMENT = (
+_VECTOR_PAIRS_OF_EACH_INSTRUMENT = (
     ("force", "torque"),
     ("specific_force", "angular_velocity"),
     ("orientation", "position"),
@@ -57,7 +57,7 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 _HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-_BASE_AXES_COLUMN_PATTERN = r"tcp_force$|^o_f_ext"
+_FORCE_IN_BASE_AXES_PATTERN = r"tcp_force$|^o_f_ext"
 _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
@@ -72,9 +72,9 @@ _ALLOWED_UNITS = {
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
-_MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
-_MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
-_MAX_DEG_S = 4000.0  # faster than any gyroscope measures
+_MAX_ROWS_OF_STATIC_LOG = 200  # a table without time and with more rows has a constant rate
+_MIN_MEDIAN_OF_RAW_COUNTS = 2000.0  # median of integers that are raw counts
+_MAX_GYRO_RATE_DEG_S = 4000.0  # faster than any gyroscope measures
 _FILL_IN_TEXT, _MIN_CLOCK_ROWS = "FILL IN", 20
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -153,7 +153,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
-    if any(re.search(_BASE_AXES_COLUMN_PATTERN, name) for name in forces):
+    if any(re.search(_FORCE_IN_BASE_AXES_PATTERN, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
@@ -161,7 +161,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     imu = {
         kind: _draft_quantity(table, plain, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if _width_of_columns(table, found.get(kind, [])) == 3
+        if _count_scalars_per_row(table, found.get(kind, [])) == 3
     }
     if imu:
         draft["imu"] = stream_with_time(**imu)
@@ -173,7 +173,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
     without_time = _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time"))
-    if without_time and table.rows <= _MAX_STATIC_ROWS and pose and not _is_template(wrench):
+    if without_time and table.rows <= _MAX_ROWS_OF_STATIC_LOG and pose and not _is_template(wrench):
         kept = {name: value for name, value in wrench.items() if name != "time"}
         draft = {"static": {**kept, "orientation": pose["orientation"]}}
     times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
@@ -213,7 +213,7 @@ def _other_wrench_findings(
         plain = {x: y for x, y in plain.items() if not {x, x.partition("[")[0]} & (used | arrays)}
         rest = replace(table, columns=ColumnsOnAccess(plain, table.columns.__getitem__))
         other = _find_vectors(plain) | _find_wrench_in_arrays(rest, plain)
-        if any(_width_of_columns(table, other.get(kind, [])) != 3 for kind in pair):
+        if any(_count_scalars_per_row(table, other.get(kind, [])) != 3 for kind in pair):
             return
         used = {x for kind in pair for x in other[kind]}
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
@@ -230,8 +230,8 @@ def _normalized_name_and_unit(name: str) -> tuple[str, str]:
     return re.sub(r"[\W_]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
 
-def _remove_trailing_number(plain: str) -> str:
-    return re.sub(r"_?\d+$", "", plain)
+def _remove_trailing_number(name: str) -> str:
+    return re.sub(r"_?\d+$", "", name)
 
 
 def _is_not_measured(name: str) -> bool:
@@ -251,7 +251,7 @@ def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, li
 def _find_vectors(plain: _NamesAndUnits) -> _Columns:
     groups = {kind: _group_axes(plain, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
     found: _Columns = {}
-    for pair in _VECTORS_OF_ONE_INSTRUMENT:
+    for pair in _VECTOR_PAIRS_OF_EACH_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
         shared.sort(key=_is_not_measured)
         for kind in pair:
@@ -335,7 +335,7 @@ def _find_vectors_in_array_columns(table: Table, plain: _NamesAndUnits) -> _Colu
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, form = plain[name][0], kind
-            fits = _width_of_columns(table, [name]) == width
+            fits = _count_scalars_per_row(table, [name]) == width
             if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
                 words = words[:-5]
                 form = "quaternion_xyzw" if plain[name][0].endswith("xyzw") else kind
@@ -351,7 +351,7 @@ def _names_of_array_columns(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width_of_columns(table: Table, columns: list[str]) -> int:
+def _count_scalars_per_row(table: Table, columns: list[str]) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in columns)
 
 
@@ -364,7 +364,7 @@ def _draft_quantity(
     if kind in ("force", "torque"):
         x = table.numbers_with_nan(columns[0], columns[0])
         is_integer = (np.nan_to_num(x) % 1.0 == 0.0).all()
-        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT:
+        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_OF_RAW_COUNTS:
             group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
         unit = known_unit(spelling)
@@ -378,7 +378,7 @@ def _draft_quantity(
         limits = {"g": (0, 3), "m/s^2": (3, 30), "mg": (700, 1400), "mm/s^2": (7e3, 14e3)}
         fitting = [unit for unit, (low, high) in limits.items() if low <= median < high]
         return group | ({"unit": fitting[0]} if fitting else {"scale": _FILL_IN_TEXT})
-    if kind == "angular_velocity" and np.nanmax(size) > _MAX_DEG_S:
+    if kind == "angular_velocity" and np.nanmax(size) > _MAX_GYRO_RATE_DEG_S:
         return group | {"unit": "mdeg/s"}
     usual, other, limit = {
         "angular_velocity": ("rad/s", "deg/s", 15),
@@ -388,7 +388,7 @@ def _draft_quantity(
 
 
 def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
-    if _width_of_columns(table, found.get("orientation", [])) == 4:
+    if _count_scalars_per_row(table, found.get("orientation", [])) == 4:
         orientation = {"columns": found["orientation"], "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
         orientation = {"columns": found[form], "form": form}
@@ -400,7 +400,7 @@ def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[st
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if _width_of_columns(table, found.get("position", [])) == 3:
+    if _count_scalars_per_row(table, found.get("position", [])) == 3:
         pose["position"] = _draft_quantity(table, plain, "position", found["position"])
     return pose
 
@@ -409,7 +409,7 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
     named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
-    named = named or _clock_columns(table, plain)
+    named = named or _find_clock_columns(table, plain)
     if not named:
         return {"column": _FILL_IN_TEXT}
     if vector_column in table.columns:
@@ -429,7 +429,7 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
     return {"column": named[0], "unit": unit}
 
 
-def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
+def _find_clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
     def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:

@@ -35,16 +35,16 @@ if TYPE_CHECKING:
     import polars as pl
 
 _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
-_CANONICAL_COLUMNS = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
 _ROWS_FOR_TYPE_INFERENCE = 1000  # rows from which column types are inferred
-_UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF_16_BYTE_ORDER_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
-_THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
+_THOUSANDS_COMMA_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
 _DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 _MIN_WRENCH_COLUMNS = 6
@@ -96,7 +96,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     with path.open("rb") as file:
         head = file.read(_INSPECTED_HEAD_BYTES)
     source: Path | bytes = path
-    if head.startswith(_UTF_16_MARKS):
+    if head.startswith(_UTF_16_BYTE_ORDER_MARKS):
         source = path.read_text("utf-16").encode()
         head = source[:_INSPECTED_HEAD_BYTES]
     elif not _is_utf_8(head):
@@ -122,7 +122,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
         source = b"\n".join([b" ".join(line.split()) for line in aligned])
         rest = [" ".join(line.split()) for line in rest]
-    names = _names_in_comment(lines[:before], rest, separator) if header else None
+    names = _header_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
     cells = (cell for line in rest for cell in line.split(separator))
     parse = partial(
@@ -155,7 +155,7 @@ def _normalize_line_ends_and_decimal_commas(
         tail = file.read() if isinstance(source, Path) else source
     returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
     # "1,500" can be 1500.
-    commas = [found for found in commas if not _THOUSANDS_PATTERN.fullmatch(b",".join(found))]
+    commas = [found for found in commas if not _THOUSANDS_COMMA_PATTERN.fullmatch(b",".join(found))]
     if not (returns or commas or _length_without_blank_end(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
@@ -229,7 +229,7 @@ def _find_separator(line: str) -> str:
     return " " if "," not in bare and " " in bare else ","
 
 
-def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+def _header_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
     if not marked or not all(_is_decimal_number(cell) for cell in rest[0].split(separator)):
         return None
@@ -256,8 +256,8 @@ def _strip_column_names(names: list[str]) -> list[str]:
 
 def _add_lower_case_names_if_canonical(columns: dict[str, _ColumnType]) -> dict[str, _ColumnType]:
     small = {name.lower(): column for name, column in columns.items()}
-    canonical = len(small) == len(columns) and _CANONICAL_COLUMNS.issubset(small)
-    return small | columns if canonical and not _CANONICAL_COLUMNS.issubset(columns) else columns
+    canonical = len(small) == len(columns) and _WRENCH_COLUMN_NAMES.issubset(small)
+    return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
 
 
 def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
@@ -401,7 +401,7 @@ _ARRAY_READERS: dict[str, _ArrayReader] = {".npz": _read_npz, ".npy": _read_npy,
 _ARRAY_READERS |= {".h5": read_hdf5, ".hdf5": read_hdf5, ".zarr": read_zarr}
 
 
-def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
+def _table_reader_of_arrays(read: _ArrayReader) -> _ArrayReader:
     return lambda path: array_columns(_with_samples_as_rows(read(path)))
 
 
@@ -422,7 +422,7 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
         **dict.fromkeys((".parquet", ".arrow", ".feather", ".jsonl", ".ndjson"), _read_with_polars),
         ".xlsx": _read_excel,
-        **{suffix: _reader_of_columns(read) for suffix, read in _ARRAY_READERS.items()},
+        **{suffix: _table_reader_of_arrays(read) for suffix, read in _ARRAY_READERS.items()},
     },
 )
 """Readers of files by suffix; a reader returns columns by name."""

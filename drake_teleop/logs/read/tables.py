@@ -107,7 +107,7 @@ class Table:
         if name not in self.columns:
             return self._finite_column(name, where)
         column = self.columns[name]
-        numbers = _column_to_numbers(column, partial(self._cell_error, name))
+        numbers = _column_to_numbers(column, partial(self._not_a_number_error, name))
         numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
         self.check_magnitude(numbers, MAX_PLAUSIBLE_NUMBER, "", f"{self.path}:{name}")
         return numbers
@@ -162,7 +162,7 @@ class Table:
             raise DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
         return numbers
 
-    def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
+    def _not_a_number_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         what = f"{cell!r} in row {self.line_in_file(row)} is not a number"
         remedy = "correct the cell or delete the row"
         if row == 0:
