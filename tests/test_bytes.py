@@ -45,7 +45,7 @@ from matplotlib.figure import Figure
 from drake_teleop.station.replay_file import ReplayFile
 painted = Figure.savefig
 Figure.savefig = lambda _, path, **options: painted(Figure(figsize=(0.1, 0.1)), path, **options)
-ReplayFile._record_scene = lambda self, make_scene: "<body></body>"
+ReplayFile._record_scene_html = lambda self, make_scene: "<body></body>"
 """
 
 
@@ -66,7 +66,7 @@ def test_two_surroundings_that_have_nothing_in_common(benchmark, tmp_path, monke
     found = benchmark.written(others, commands, tmp_path / "there", program)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    for kind, name in ((Figure, "savefig"), (ReplayFile, "_record_scene")):
+    for kind, name in ((Figure, "savefig"), (ReplayFile, "_record_scene_html")):
         monkeypatch.setattr(kind, name, getattr(kind, name))  # so that the test can restore it
     monkeypatch.setattr("sys.argv", ["", json.dumps(benchmark.typed(commands))])
     exec(program, {})

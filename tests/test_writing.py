@@ -256,7 +256,7 @@ def test_summary_of_an_earlier_run_is_removed(tmp_path, monkeypatch, little_work
 
 
 def test_replay_that_cannot_be_written_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(ReplayFile, "_record_scene", lambda self, make_scene: "<body></body>")
+    monkeypatch.setattr(ReplayFile, "_record_scene_html", lambda self, make_scene: "<body></body>")
     film = ReplayFile("x", np.arange(2.0), 1.0)
     with small_disk(), pytest.raises(CannotWrite, match=r"x\.html: cannot be written"):
         film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)

@@ -99,8 +99,8 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
-            _make_progress_bar(half, is_known=bool(evaluation.is_known[k])),
-            _parameter_verdict(evaluation, k),
+            _make_accuracy_bar(half, is_known=bool(evaluation.is_known[k])),
+            _accuracy_verdict_of_entry(evaluation, k),
         )
     lines = [Text(line, style="red") for line in (*evaluation.doubts, evaluation.failure) if line]
     if evaluation.advice:
@@ -108,21 +108,21 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
     return Group(table, *lines)
 
 
-def _make_progress_bar(relative_half_width: float, *, is_known: bool) -> Text:
+def _make_accuracy_bar(relative_half_width: float, *, is_known: bool) -> Text:
     share = 1.0 - np.log10(np.clip(relative_half_width, 1.0, None)) / _BAR_DECADES
     cells = int(np.clip(np.nan_to_num(share), 0.0, 1.0) * _BAR_CHARACTERS)
     colour = "green" if is_known else "yellow"
     return Text("█" * cells + "·" * (_BAR_CHARACTERS - cells), style=colour)
 
 
-def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
-    if evaluation.is_known[k]:
+def _accuracy_verdict_of_entry(evaluation: RecordEvaluation, index: int) -> str:
+    if evaluation.is_known[index]:
         return "known"
-    if not np.isfinite(evaluation.relative_half_widths[k]):
+    if not np.isfinite(evaluation.relative_half_widths[index]):
         return "not known: no information yet"
     if evaluation.doubts:
         return "not known: see the text below"
-    return "almost known" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
+    return "almost known" if evaluation.relative_half_widths[index] <= 1.0 else "not known"
 
 
 def draw_accuracy(evaluations: list[RecordEvaluation], tolerance: tolerances.Tolerance) -> Figure:

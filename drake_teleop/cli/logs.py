@@ -120,7 +120,7 @@ def eliminate_command(
     from drake_teleop.logs.pictures import draw_elimination
 
     with files.output_folder(out):
-        files.write_table(out / "contact_wrench.parquet", _wrench_table(found))
+        files.write_table(out / "contact_wrench.parquet", _make_contact_wrench_table(found))
         files.write_picture(out / "contact_wrench.png", draw_elimination(found))
         files.write_json(out / "summary.json", summary)
     if not quiet:
@@ -132,7 +132,7 @@ def _path_text_or_none(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def _wrench_table(found: processing.EliminatedLog) -> pl.DataFrame:
+def _make_contact_wrench_table(found: processing.EliminatedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
@@ -183,7 +183,7 @@ def detect_command(
     from drake_teleop.logs.pictures import draw_detection
 
     with files.output_folder(out):
-        files.write_table(out / "detection.parquet", _detection_table(found))
+        files.write_table(out / "detection.parquet", _make_contact_detection_table(found))
         files.write_picture(out / "detection.png", draw_detection(found))
         files.write_json(out / "summary.json", summary)
     if not quiet:
@@ -191,7 +191,7 @@ def detect_command(
     return summary
 
 
-def _detection_table(found: processing.DetectedLog) -> pl.DataFrame:
+def _make_contact_detection_table(found: processing.DetectedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
@@ -201,7 +201,7 @@ def _detection_table(found: processing.DetectedLog) -> pl.DataFrame:
     return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})
 
 
-def _summary_table(
+def _make_empty_table(
     title: str, summary: dict[str, Any], headings: Sequence[str], left_aligned: Sequence[str] = ()
 ) -> Any:
     from rich.markup import escape
@@ -215,16 +215,16 @@ def _summary_table(
 
 def print_identification(summary: dict[str, Any], out: Path) -> None:
     headings = ("", "value", "std", "unit")
-    table = _summary_table("Load identified from", summary, headings, left_aligned=("", "unit"))
+    table = _make_empty_table("Load identified from", summary, headings, left_aligned=("", "unit"))
     offsets, deviations, units = summary["offsets"], summary["offsets_std"], ["N", "N m"]
-    rows = _rows_of_load(summary) + [
+    rows = _load_parameter_rows(summary) + [
         (name, offsets[i], deviations[i], 1.0, units[i // 3], name)
         for i, name in enumerate(PARAMETER_NAMES[:6])
     ]
     _add_parameter_rows(table, rows, summary["identifiable"])
     if "object" in summary:
         table.add_section()
-        rows = [(f"object: {row[0]}", *row[1:]) for row in _rows_of_load(summary["object"])]
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_parameter_rows(summary["object"])]
         _add_parameter_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         "com from, and inertia about, the origin So of the sensor frame S\n"
@@ -241,7 +241,7 @@ _ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _rows_of_load(load: dict[str, Any]) -> list[_ParameterRow]:
+def _load_parameter_rows(load: dict[str, Any]) -> list[_ParameterRow]:
     rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
@@ -265,7 +265,7 @@ def _add_parameter_rows(table: Any, rows: list[_ParameterRow], identifiable: lis
 
 def print_contact_wrench_summary(summary: dict[str, Any], out: Path) -> None:
     headings = ("rms of", "|F| [N]", "|tau| [N m]")
-    table = _summary_table("Contact wrench in", summary, headings, left_aligned=("rms of",))
+    table = _make_empty_table("Contact wrench in", summary, headings, left_aligned=("rms of",))
     for label, name in (
         ("measured, without offsets", "raw"),
         ("less the static weight only", "gravity_only"),
@@ -298,7 +298,7 @@ def print_contact_wrench_summary(summary: dict[str, Any], out: Path) -> None:
 
 def print_contact_detection_summary(summary: dict[str, Any], out: Path) -> None:
     headings = ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "direction in S")
-    table = _summary_table("Contact in", summary, headings)
+    table = _make_empty_table("Contact in", summary, headings)
     for c in summary["contacts"]:
         push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
         table.add_row(

@@ -436,17 +436,17 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
     return 0 if calibrate_command(source, out, **options)["all_known"] else 1
 
 
-_CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
-_EXPORT_FORMAT_TYPE = option.RegisteredName(
+_CONTROLLER_EXPORT_FORMATS = ("c99", "fmu", "ros2_filter")
+_EXPORT_FORMAT_OPTION_TYPE = option.RegisteredName(
     "export format",
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
-    *_CONTROLLER_FORMATS,
+    *_CONTROLLER_EXPORT_FORMATS,
 )
 
 
 @cli.command()
 @click.argument("identification", type=option.PATH_TYPE)
-@click.option("--to", required=True, type=_EXPORT_FORMAT_TYPE)
+@click.option("--to", required=True, type=_EXPORT_FORMAT_OPTION_TYPE)
 @option.sensor_pose
 @option.choice("--sign", ["-1", "1"], "-1")
 @option.rate_hz()
@@ -471,11 +471,11 @@ def export(
     """
     from drake_teleop.load.identification import Identification
 
-    if to not in _CONTROLLER_FORMATS:
+    if to not in _CONTROLLER_EXPORT_FORMATS:
         remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
         option.refuse_given_options("out", "rate_hz", "cutoff_hz", "sensor_range", remedy=remedy)
     found = Identification.load(identification)
-    if to in _CONTROLLER_FORMATS:
+    if to in _CONTROLLER_EXPORT_FORMATS:
         from drake_teleop.robots.controller.export import export_controller
 
         notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **options)

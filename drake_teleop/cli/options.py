@@ -57,7 +57,7 @@ path = partial(click.option, type=PATH_TYPE)
 HELP_SETTINGS = dict(help_option_names=["-h", "--help"], max_content_width=100, show_default=True)
 
 
-_SHARED_HELP = """
+_SHARED_OPTION_HELP = """
     --cluster: Dask scheduler that runs the processes; local: start one on this machine.
     --cutoff: Cutoff of the low-pass on all signals; zero-phase for logs, causal for live streams.
     --delay: Delay of the motion behind the wrench [s], or auto to estimate it.
@@ -93,7 +93,7 @@ class DocumentedCommand(click.Command):
     def __init__(self, name: str | None, *, help: str | None = None, **settings: Any) -> None:
         text, _, listed = cleandoc(help or "").partition("\n\nOptions:")
         super().__init__(name, help=text, **settings)
-        texts = _parse_option_help(_SHARED_HELP) | _parse_option_help(listed)
+        texts = _parse_option_help(_SHARED_OPTION_HELP) | _parse_option_help(listed)
         for each in self.params:
             if isinstance(each, click.Option):
                 each.help = each.help or texts.get(each.opts[0])  # `python -OO` has no docstrings
@@ -195,20 +195,20 @@ def output_folder(command: str) -> Callable[[Any], Any]:
         type=PATH_TYPE,
         default=Path("out") / command,
         metavar="DIR",
-        callback=_remove_new_empty_folders_at_end,
+        callback=_schedule_empty_folder_removal,
     )
 
 
-def _remove_new_empty_folders_at_end(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+def _schedule_empty_folder_removal(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
         ctx.call_on_close(lambda: _remove_empty_folders(new))
     return folder
 
 
-def _remove_empty_folders(new: list[Path]) -> None:
-    inner = sorted(new[0].rglob("*"), reverse=True)
-    for folder in (*inner, *new):
+def _remove_empty_folders(new_folders: list[Path]) -> None:
+    inner = sorted(new_folders[0].rglob("*"), reverse=True)
+    for folder in (*inner, *new_folders):
         if folder.is_symlink() or not folder.is_dir():
             return
         try:

@@ -54,14 +54,14 @@ class Fault(IntEnum):
     RESUMING = 7
 
 
-_OUT_OF_RANGE_TEXT = f"not finite or above {LARGEST_PORT_VALUE:g} in SI units"
+_PORT_VALUE_OUT_OF_RANGE_TEXT = f"not finite or above {LARGEST_PORT_VALUE:g} in SI units"
 FAULT_WARNINGS = {
     Fault.STALE: "the wrist sensor's last sample is more than 50 ms and two periods from now",
     Fault.READING: "the wrist sensor gives no reading, or one beyond its valid range",
-    Fault.JOINTS: f"the slave's joint angles are {_OUT_OF_RANGE_TEXT}",
-    Fault.LOAD: f"the load estimate is {_OUT_OF_RANGE_TEXT}",
-    Fault.WRENCH: f"the wrench for the hand is {_OUT_OF_RANGE_TEXT}",
-    Fault.HAND: f"the hand's joint angles are {_OUT_OF_RANGE_TEXT}",
+    Fault.JOINTS: f"the slave's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.LOAD: f"the load estimate is {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.WRENCH: f"the wrench for the hand is {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.HAND: f"the hand's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
     Fault.RESUMING: "the force at the hand increases again after a fault",
 }
 """Warning text of each fault."""

@@ -99,7 +99,7 @@ class _CacheFiles:
     def load(self, key: Any) -> Any:
         with (
             suppress(OSError, EOFError, pickle.UnpicklingError),
-            self._path_of_key(key).open("rb") as file,
+            self._cache_file_path(key).open("rb") as file,
         ):
             if not _is_trusted_file(os.fstat(file.fileno())):
                 return None
@@ -107,7 +107,7 @@ class _CacheFiles:
             return code if stored_key == key else None
 
     def save(self, key: Any, code: Any) -> None:
-        path = self._path_of_key(key)
+        path = self._cache_file_path(key)
         temporary = path.with_suffix(f".{uuid4().hex}")
         try:
             temporary.touch(mode=0o644)  # not writable by others, with any umask
@@ -121,7 +121,7 @@ class _CacheFiles:
     def flush(self) -> None:
         self._remove_cache_files()
 
-    def _path_of_key(self, key: Any) -> Path:
+    def _cache_file_path(self, key: Any) -> Path:
         this = sha256(str(key).encode()).hexdigest()[:16]
         return self._folder / f"{self._prefix}{fingerprint_of_code(self._dispatcher)}-{this}.nbc"
 
@@ -131,33 +131,33 @@ class _CacheFiles:
                 path.unlink(missing_ok=True)
 
 
-def _is_trusted_file(file: os.stat_result) -> bool:
+def _is_trusted_file(status: os.stat_result) -> bool:
     owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
-    return file.st_uid in owners and not file.st_mode & stat.S_IWOTH
+    return status.st_uid in owners and not status.st_mode & stat.S_IWOTH
 
 
 def fingerprint_of_code(dispatcher: Dispatcher) -> str:
     found: set[Any] = {dispatcher}
     pending: list[Any] = [dispatcher]
     while pending:
-        called = _code_and_callees(pending.pop())[1] - found
+        called = _fingerprint_text_and_callees(pending.pop())[1] - found
         found |= called
         pending.extend(called)
-    texts = sorted(_code_and_callees(each)[0] for each in found)
+    texts = sorted(_fingerprint_text_and_callees(each)[0] for each in found)
     return sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 @cache
-def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
+def _fingerprint_text_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
     function = getattr(compiled, "py_func", compiled)
     constants = dict(_values_referenced_by(function))
     options = getattr(compiled, "targetoptions", {})
     text = (
         _qualified_name(compiled),
-        _cache_key_text(function.__code__),
-        _cache_key_text(function.__defaults__),
+        _fingerprint_text(function.__code__),
+        _fingerprint_text(function.__defaults__),
         sorted((name, str(option)) for name, option in options.items()),
-        sorted((name, _cache_key_text(value)) for name, value in constants.items()),
+        sorted((name, _fingerprint_text(value)) for name, value in constants.items()),
     )
     package = function.__module__.partition(".")[0]
     callees = (value for value in constants.values() if _is_callee(value, package))
@@ -193,14 +193,14 @@ def _names_referenced_by_code(code: CodeType) -> Iterator[str]:
             yield from _names_referenced_by_code(constant)
 
 
-def _cache_key_text(value: Any) -> str:
+def _fingerprint_text(value: Any) -> str:
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
         # Since Python 3.11 exception handlers are in a separate table.
         parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
-        return repr((parts, _cache_key_text(value.co_consts)))
+        return repr((parts, _fingerprint_text(value.co_consts)))
     if isinstance(value, tuple):
-        return f"{type(value).__name__}{[_cache_key_text(each) for each in value]}"
+        return f"{type(value).__name__}{[_fingerprint_text(each) for each in value]}"
     if isinstance(value, np.ndarray):
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):

@@ -115,7 +115,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
             continue
         place = field_location(where, key)
         check_field_name(schema, key, place)
-        _check_type(kinds[key], value, place, from_file=True)
+        _check_value_type(kinds[key], value, place, from_file=True)
 
 
 def check_field_name(schema: type, name: Any, where: str) -> None:
@@ -141,41 +141,41 @@ def check_all_field_values(config: Any, where: str) -> None:
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_location(where, field.name)
         _check_field_value(field, kinds[field.name], value, place)
-        for item_place, item in _items_with_places(value, place):
+        for item_place, item in _locations_and_items(value, place):
             if dataclasses.is_dataclass(item):
                 check_all_field_values(item, item_place)
 
 
-def _items_with_places(value: Any, place: str) -> list[tuple[str, Any]]:
+def _locations_and_items(value: Any, where: str) -> list[tuple[str, Any]]:
     if isinstance(value, list):
-        return [(f"{place}[{index}]", item) for index, item in enumerate(value)]
-    return [(place, value)]
+        return [(f"{where}[{index}]", item) for index, item in enumerate(value)]
+    return [(where, value)]
 
 
-def _check_field_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
+def _check_field_value(field: Any, kind: FieldType, value: Any, where: str) -> None:
     metadata = field.metadata
-    _check_type(kind, value, place, from_file=False)
+    _check_value_type(kind, value, where, from_file=False)
     if "choices" in metadata:
         words, registry = metadata["choices"], metadata.get("registry")
         if registry is not None:
-            registry.check(value, place, *words)
+            registry.check(value, where, *words)
         elif value not in words:
             remedy = suggest_name(value, words, f"choose one of {', '.join(words)}")
-            raise DrakeTeleopError(f"'{value}' is not known", where=place, remedy=remedy)
+            raise DrakeTeleopError(f"'{value}' is not known", where=where, remedy=remedy)
     elif "unit" in metadata and value is not None:
-        _check_quantity_range(metadata, value, place)
+        _check_quantity_range(metadata, value, where)
 
 
-def _check_quantity_range(metadata: Any, value: Any, place: str) -> None:
+def _check_quantity_range(metadata: Any, value: Any, where: str) -> None:
     if isinstance(value, dict):
         for name, number in value.items():
-            _check_quantity_range(metadata, number, f"{place}.{name}")
+            _check_quantity_range(metadata, number, f"{where}.{name}")
         return
     values = value if isinstance(value, list) else [value]
     length = metadata.get("length")
     if length is not None and len(values) != length:
         what = f"has {len(values)} numbers"
-        raise DrakeTeleopError(what, where=place, remedy=f"give {length} numbers")
+        raise DrakeTeleopError(what, where=where, remedy=f"give {length} numbers")
     low, high = metadata["low"], metadata["high"]
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in values:
@@ -183,7 +183,7 @@ def _check_quantity_range(metadata: Any, value: Any, place: str) -> None:
             limits = f"{short_text(low)} to {short_text(high)}{unit}"
             what = f"{short_text(number)}{unit} is outside {limits}"
             remedy = f"check the value and its unit ({metadata['doc']})"
-            raise DrakeTeleopError(what, where=place, remedy=remedy)
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _field_types(schema: type) -> dict[str, FieldType]:
@@ -233,47 +233,47 @@ def field_type_of(hint: Any) -> FieldType:
     return inner._replace(optional=len(options) < len(typing.get_args(hint)))
 
 
-def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> None:
+def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: bool) -> None:
     first = kind.items[0]
     if value is None and kind.optional:
         return
     if kind.is_mapping:
         if not isinstance(value, dict) or "_tag" in value:
-            raise _make_type_error("a mapping of names", value, place, "write {name: value}")
+            raise _make_type_error("a mapping of names", value, where, "write {name: value}")
         for name, item in value.items():
             inner = kind._replace(is_mapping=False)
-            _check_type(inner, item, f"{place}.{name}", from_file=from_file)
+            _check_value_type(inner, item, f"{where}.{name}", from_file=from_file)
     elif kind.list_depth:
         if not isinstance(value, list):
-            raise _make_type_error("a list", value, place, "write it in brackets: [...]")
+            raise _make_type_error("a list", value, where, "write it in brackets: [...]")
         inner = FieldType(kind.list_depth - 1, kind.items, False)
         for index, item in enumerate(value):
-            _check_type(inner, item, f"{place}[{index}]", from_file=from_file)
+            _check_value_type(inner, item, f"{where}[{index}]", from_file=from_file)
     elif first in TYPE_NAMES:
-        if not _has_value_type(first, value, from_file=from_file):
+        if not _is_value_of_type(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
             remedy = remedy if first is float else ""
-            raise _make_type_error(TYPE_NAMES[first], value, place, remedy)
+            raise _make_type_error(TYPE_NAMES[first], value, where, remedy)
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_block_class_of_tag(kind.items, value, place), value, place, tagged=several)
+        check_structure(_block_class_of_tag(kind.items, value, where), value, where, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"pass {first.__name__}(...) with fields {fields}"
         expected = " or ".join(block.__name__ for block in kind.items)
-        raise _make_type_error(expected, value, place, remedy)
+        raise _make_type_error(expected, value, where, remedy)
 
 
-def _block_class_of_tag(blocks: tuple[type, ...], value: Any, place: str) -> type:
+def _block_class_of_tag(blocks: tuple[type, ...], value: Any, where: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
         remedy = suggest_name(tag, names, f"use one of !{', !'.join(names)}")
-        raise DrakeTeleopError(f"'!{tag}' is not known", where=place, remedy=remedy)
+        raise DrakeTeleopError(f"'!{tag}' is not known", where=where, remedy=remedy)
     return blocks[names.index(tag) if tag else 0]
 
 
-def _has_value_type(kind: type, value: Any, *, from_file: bool) -> bool:
+def _is_value_of_type(kind: type, value: Any, *, from_file: bool) -> bool:
     if isinstance(value, bool) and kind is not bool:
         return False
     required = {int: numbers.Integral, float: numbers.Real}.get(kind, kind)
@@ -289,9 +289,9 @@ def _is_numeric_text(value: Any) -> bool:
     return True
 
 
-def _make_type_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _make_type_error(expected: str, found: Any, where: str, remedy: str = "") -> DrakeTeleopError:
     shown = f"'{found}'" if isinstance(found, str) else reprlib.repr(found)
-    return DrakeTeleopError(f"expected {expected}, found {shown}", where=place, remedy=remedy)
+    return DrakeTeleopError(f"expected {expected}, found {shown}", where=where, remedy=remedy)
 
 
 _Class = TypeVar("_Class", bound=type)
@@ -349,29 +349,29 @@ def settings(block: _Class) -> _Class:
     Its module must not import `annotations` from `__future__`: Drake reads the fields' types.
     """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
-    block.__str__ = _describe_changed_fields  # type: ignore[assignment]
+    block.__str__ = _describe_non_default_fields  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.docstring_entry) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 
 
-def _describe_changed_fields(self: Any) -> str:
-    return "\n  ".join([type(self).__name__, *_lines_of_changed_fields(self)])
+def _describe_non_default_fields(self: Any) -> str:
+    return "\n  ".join([type(self).__name__, *_lines_of_non_default_fields(self)])
 
 
-def _lines_of_changed_fields(config: Any) -> Iterator[str]:
+def _lines_of_non_default_fields(config: Any) -> Iterator[str]:
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
         if value == _default_value(entry):
             continue
-        blocks = _items_with_places(value, entry.name)
+        blocks = _locations_and_items(value, entry.name)
         if not blocks or not dataclasses.is_dataclass(blocks[0][1]):
             yield f"{entry.name}: {_format_value(value)}"
             continue
         for place, block in blocks:
             yield f"{place}: {type(block).__name__}"
-            yield from (f"  {line}" for line in _lines_of_changed_fields(block))
+            yield from (f"  {line}" for line in _lines_of_non_default_fields(block))
 
 
 def _set_checked_attribute(self: Any, name: str, value: Any) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_LISTED_FILES = 6
-_RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
+_RUST_OS_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
 LOG_PARTS_PATTERN = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
@@ -58,7 +58,7 @@ def wrap_write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        what = f"cannot be written ({_reason_of_failure(error)})"
+        what = f"cannot be written ({_os_error_reason(error)})"
         raise CannotWrite(what, where=str(path)) from error
 
 
@@ -132,7 +132,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        what = f"cannot be created as a folder ({_reason_of_failure(error)})"
+        what = f"cannot be created as a folder ({_os_error_reason(error)})"
         raise CannotWrite(what, where=str(folder), remedy=remedy) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise CannotWrite("is a folder without write permission", where=str(folder), remedy=remedy)
@@ -169,8 +169,8 @@ def remove_log(path: Path) -> None:
         part.unlink()
 
 
-def _reason_of_failure(error: OSError) -> str:
-    if found := _RUST_ERROR_PATTERN.search(str(error)):
+def _os_error_reason(error: OSError) -> str:
+    if found := _RUST_OS_ERROR_PATTERN.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__
 

@@ -51,12 +51,12 @@ def write_report_page_and_pictures(
     write_text(out / "report.html", render_page(package, "report.html.j2", pictures=urls, **values))
 
 
-_SCRIPT_PATTERN = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
+_SCRIPT_ELEMENT_PATTERN = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
 def content_security_policy(page: str, host: str = "") -> str:
     """Return the Content-Security-Policy of a page; `host`: "address:port", or "" for a file."""
-    scripts = (script.replace("\r\n", "\n") for script in _SCRIPT_PATTERN.findall(page))
+    scripts = (script.replace("\r\n", "\n") for script in _SCRIPT_ELEMENT_PATTERN.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     own, stream = ("'self'", f"ws://{host}") if host else ("", "")

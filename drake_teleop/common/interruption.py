@@ -16,14 +16,14 @@ class _DelayedSignalState(threading.local):
     open_contexts, last_signal = 0, 0  # delayed_signals contexts, and the last signal in them
 
 
-_DELAYED_SIGNALS = _DelayedSignalState()
+_DELAYED_SIGNAL_STATE = _DelayedSignalState()
 
 
 def install_interrupt_handlers() -> None:
     """Let SIGTERM, and SIGINT unless ignored, set INTERRUPTED_EVENT and raise KeyboardInterrupt."""
-    signal.signal(signal.SIGTERM, _raise_interrupt)
+    signal.signal(signal.SIGTERM, _handle_interrupt_signal)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _raise_interrupt)
+        signal.signal(signal.SIGINT, _handle_interrupt_signal)
 
 
 @contextmanager
@@ -34,7 +34,7 @@ def raise_interrupt_on_sigint() -> Iterator[None]:
     if before is not signal.default_int_handler or not in_main_thread:
         yield
         return
-    signal.signal(signal.SIGINT, _raise_interrupt)
+    signal.signal(signal.SIGINT, _handle_interrupt_signal)
     try:
         yield
     finally:
@@ -42,12 +42,12 @@ def raise_interrupt_on_sigint() -> Iterator[None]:
         INTERRUPTED_EVENT.clear()
 
 
-def _raise_interrupt(number: int, _frame: Any) -> None:
+def _handle_interrupt_signal(signal_number: int, _frame: Any) -> None:
     INTERRUPTED_EVENT.set()
-    if _DELAYED_SIGNALS.open_contexts:
-        _DELAYED_SIGNALS.last_signal = number
+    if _DELAYED_SIGNAL_STATE.open_contexts:
+        _DELAYED_SIGNAL_STATE.last_signal = signal_number
         return
-    if number == signal.SIGTERM:
+    if signal_number == signal.SIGTERM:
         raise KeyboardInterrupt("SIGTERM")
     raise KeyboardInterrupt
 
@@ -56,10 +56,10 @@ class delayed_signals(ContextDecorator):
     """Context or decorator that delays the KeyboardInterrupt of a signal to the context's end."""
 
     def __enter__(self) -> None:
-        _DELAYED_SIGNALS.open_contexts += 1
+        _DELAYED_SIGNAL_STATE.open_contexts += 1
 
     def __exit__(self, *_: object) -> None:
-        _DELAYED_SIGNALS.open_contexts -= 1
-        if _DELAYED_SIGNALS.last_signal and not _DELAYED_SIGNALS.open_contexts:
-            number, _DELAYED_SIGNALS.last_signal = _DELAYED_SIGNALS.last_signal, 0
-            _raise_interrupt(number, None)
+        _DELAYED_SIGNAL_STATE.open_contexts -= 1
+        if _DELAYED_SIGNAL_STATE.last_signal and not _DELAYED_SIGNAL_STATE.open_contexts:
+            number, _DELAYED_SIGNAL_STATE.last_signal = _DELAYED_SIGNAL_STATE.last_signal, 0
+            _handle_interrupt_signal(number, None)

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-_MAGIC_BYTES = b"PAR1"
-_FOOTER_END_BYTES = 8  # bytes: length of the footer, and magic
+_PARQUET_MAGIC = b"PAR1"
+_FOOTER_TAIL_SIZE_BYTES = 8  # bytes: length of the footer, and magic
 _DATA_PAGE_TYPE, _DICTIONARY_PAGE_TYPE, _DATA_PAGE_V2_TYPE = 0, 2, 3
 _REPETITION_TYPE_REPEATED = 2
 # Type codes of Thrift.
 _TRUE, _FALSE, _BYTE_TYPE, _DOUBLE_TYPE, _BINARY_TYPE, _STRUCT_TYPE = 1, 2, 3, 7, 8, 12
 _INTEGER_TYPES, _LIST_TYPES = (4, 5, 6), (9, 10)
-_MAX_METADATA_NESTING = 32
+_MAX_THRIFT_NESTING_DEPTH = 32
 _MAX_VARINT_BYTES = 10
 
 _ThriftStruct = dict[int, Any]
@@ -37,13 +37,13 @@ def check_parquet_content_sizes(content: bytes | mmap.mmap) -> None:
 
 
 def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
-    end = len(content) - _FOOTER_END_BYTES
-    if end < len(_MAGIC_BYTES) or content[-len(_MAGIC_BYTES) :] != _MAGIC_BYTES:
+    end = len(content) - _FOOTER_TAIL_SIZE_BYTES
+    if end < len(_PARQUET_MAGIC) or content[-len(_PARQUET_MAGIC) :] != _PARQUET_MAGIC:
         raise ValueError("the file does not end with PAR1, as a Parquet file does")
     start = end - int.from_bytes(content[end : end + 4], "little")
-    _require(start >= len(_MAGIC_BYTES), "its footer is longer than the file")
+    _require(start >= len(_PARQUET_MAGIC), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
-    columns = list(_leaf_names_and_is_flat(footer[2]))
+    columns = list(_column_names_and_is_unrepeated(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     same_rows = _read_size(footer, 3, "rows") == sum(rows)
@@ -51,10 +51,10 @@ def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
     for group, count in zip(groups, rows, strict=True):
         _require(len(group[1]) == len(columns), "a row group and the schema have different columns")
         for chunk, (name, is_flat) in zip(group[1], columns, strict=True):
-            _check_column(content, start, chunk[3], name, count if is_flat else None)
+            _check_column_chunk(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _leaf_names_and_is_flat(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
+def _column_names_and_is_unrepeated(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
@@ -68,7 +68,7 @@ def _leaf_names_and_is_flat(schema: list[_ThriftStruct]) -> Iterator[tuple[str, 
             yield element[4].decode(), is_flat
 
 
-def _check_column(
+def _check_column_chunk(
     content: bytes | mmap.mmap, data_end: int, column: _ThriftStruct, name: str, rows: int | None
 ) -> None:
     values = _read_size(column, 5, f"values in {name}")
@@ -110,8 +110,8 @@ def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
     return values
 
 
-def _read_size(struct: _ThriftStruct, number: int, what: str, default: int | None = None) -> int:
-    size = struct[number] if default is None else struct.get(number, default)
+def _read_size(struct: _ThriftStruct, field_id: int, what: str, default: int | None = None) -> int:
+    size = struct[field_id] if default is None else struct.get(field_id, default)
     _require(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
     return int(size)
 
@@ -126,18 +126,18 @@ class _ThriftReader:
         self._content, self.at = content, at
 
     def read_struct(self, depth: int = 0) -> _ThriftStruct:
-        _require(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
+        _require(depth < _MAX_THRIFT_NESTING_DEPTH, "its metadata is nested too deeply")
         fields: _ThriftStruct = {}
         number = 0
         while head := self._read_byte():
-            number = number + (head >> 4) if head >> 4 else self._read_integer()
+            number = number + (head >> 4) if head >> 4 else self._read_zigzag_integer()
             kind = head & 15
             fields[number] = kind == _TRUE if kind <= _FALSE else self._read_value(kind, depth + 1)
         return fields
 
     def _read_value(self, kind: int, depth: int) -> Any:
         if kind in _INTEGER_TYPES:
-            return self._read_integer()
+            return self._read_zigzag_integer()
         if kind == _BINARY_TYPE:
             return self._read_bytes(self._read_varint())
         if kind == _STRUCT_TYPE:
@@ -150,7 +150,7 @@ class _ThriftReader:
         return self._read_bytes(8)
 
     def _read_list(self, depth: int) -> list[Any]:
-        _require(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
+        _require(depth < _MAX_THRIFT_NESTING_DEPTH, "its metadata is nested too deeply")
         head = self._read_byte()
         size = head >> 4 if head >> 4 < 15 else self._read_varint()
         return [self._read_value(head & 15, depth + 1) for _ in range(size)]
@@ -164,7 +164,7 @@ class _ThriftReader:
         self.at += 1
         return self._content[self.at - 1]
 
-    def _read_integer(self) -> int:
+    def _read_zigzag_integer(self) -> int:
         number = self._read_varint()
         return (number >> 1) ^ -(number & 1)
 

@@ -25,20 +25,20 @@ def show_progress(progress: bool | StartStage, *, after: float = 0.0) -> Iterato
         yield progress
     elif not progress:
         yield show_no_progress
-    elif not _is_interactive():
+    elif not _is_console_interactive():
         yield _show_stages_as_lines(after)
     else:
         yield from _show_stages_as_bars(after)
 
 
-def _is_interactive() -> bool:
+def _is_console_interactive() -> bool:
     from rich import get_console
 
     console = get_console()
     return console.is_terminal or console.is_jupyter
 
 
-def _show_stages_as_lines(after: float) -> StartStage:
+def _show_stages_as_lines(delay_s: float) -> StartStage:
     opened = time.monotonic()
 
     def start_stage(name: str) -> UpdateProgress:
@@ -46,7 +46,7 @@ def _show_stages_as_lines(after: float) -> StartStage:
 
         def update(fraction: float, words: str = "") -> None:
             nonlocal printed
-            if not printed and time.monotonic() - opened >= after:
+            if not printed and time.monotonic() - opened >= delay_s:
                 printed = True
                 print(f"{name} ...", file=sys.stderr, flush=True)
 
@@ -56,7 +56,7 @@ def _show_stages_as_lines(after: float) -> StartStage:
     return start_stage
 
 
-def _show_stages_as_bars(after: float) -> Iterator[StartStage]:
+def _show_stages_as_bars(delay_s: float) -> Iterator[StartStage]:
     from rich import progress as rich_progress
     from rich.errors import LiveError
 
@@ -70,7 +70,7 @@ def _show_stages_as_bars(after: float) -> Iterator[StartStage]:
 
     def show_bars_after_delay() -> None:
         nonlocal shown
-        if not shown and time.monotonic() - opened >= after:
+        if not shown and time.monotonic() - opened >= delay_s:
             shown = True
             try:
                 bars.start()

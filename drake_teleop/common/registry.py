@@ -47,11 +47,11 @@ class Registry(dict[str, _Part]):
         if name in self.shipped:
             what = f"'{name}' is the name of a shipped part"
             raise DrakeTeleopError(what, where=self.kind, remedy="use another name")
-        self._check_type(name, part)
+        self._check_part_type(name, part)
         self[name] = part
         return part
 
-    def _check_type(self, name: str, part: Any) -> None:
+    def _check_part_type(self, name: str, part: Any) -> None:
         if self._part_type is None:
             return
         if self._parts_are_classes:
@@ -80,7 +80,7 @@ class Registry(dict[str, _Part]):
         raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (_import_new_scripts() and super().__contains__(name))
+        return super().__contains__(name) or (_import_env_scripts() and super().__contains__(name))
 
     def __missing__(self, name: str) -> _Part:
         return self[self.check(name)]
@@ -108,7 +108,7 @@ def register_from_script(script: Path) -> None:
     os.environ[_SCRIPTS_ENV] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
 
 
-def _import_new_scripts() -> bool:
+def _import_env_scripts() -> bool:
     paths = [Path(path) for path in os.environ.get(_SCRIPTS_ENV, "").split(os.pathsep) if path]
     new = [path for path in paths if path.stem not in sys.modules]
     for path in new:

@@ -81,7 +81,7 @@ def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
 def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
     try:
         node = yaml.compose(text, _YamlLoader)
-        return None if node is None else _NodeConverter(tagged).convert_node(node, where)
+        return None if node is None else _YamlNodeConverter(tagged).convert_node(node, where)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}: " if mark else ""
@@ -159,31 +159,31 @@ def read_text(path: str | Path) -> str:
         raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
 
-class _NodeConverter:
+class _YamlNodeConverter:
     def __init__(self, tagged: bool) -> None:
         self._tagged = tagged
         self._values = 0
 
-    def convert_node(self, node: Any, place: str) -> Any:
+    def convert_node(self, node: Any, where: str) -> Any:
         self._values += 1
         if self._values > _MAX_YAML_VALUES:
-            raise _error_at_node(f"there are more than {_MAX_YAML_VALUES} values", node, place)
+            raise _error_at_node(f"there are more than {_MAX_YAML_VALUES} values", node, where)
         if isinstance(node, yaml.MappingNode):
-            return self._convert_mapping(node, place)
+            return self._convert_mapping(node, where)
         if isinstance(node, yaml.SequenceNode):
             if node.tag != f"{_TAG_PREFIX}seq":
                 what = f"a list cannot have the tag {_quote_value(node.tag)}"
-                raise _error_at_node(what, node, place)
-            return [self.convert_node(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
-        return _convert_scalar(node, place)
+                raise _error_at_node(what, node, where)
+            return [self.convert_node(item, f"{where}[{i}]") for i, item in enumerate(node.value)]
+        return _convert_scalar(node, where)
 
-    def _convert_mapping(self, node: Any, place: str) -> dict[str, Any]:
+    def _convert_mapping(self, node: Any, where: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
                 what = f"a field's name must be a word, not {_quote_value(key.value)}"
-                raise _error_at_node(what, key, place)
-            field = field_location(place, key.value)
+                raise _error_at_node(what, key, where)
+            field = field_location(where, key.value)
             if key.value in found:
                 raise _error_at_node("is defined twice", key, field)
             if key.value == "_tag":
@@ -193,18 +193,18 @@ class _NodeConverter:
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
                 what = f"the tag {_quote_value(node.tag)} is not allowed here"
-                raise _error_at_node(what, node, place, "remove the tag")
+                raise _error_at_node(what, node, where, "remove the tag")
             found["_tag"] = node.tag
         return found
 
 
-def _convert_scalar(node: Any, place: str) -> Any:
+def _convert_scalar(node: Any, where: str) -> Any:
     kind, text = node.tag.removeprefix(_TAG_PREFIX), node.value
     if kind == "str":
         return text
     if kind not in _SCALAR_PATTERNS or not _SCALAR_PATTERNS[kind].match(text):
         what = f"{_quote_value(text)} does not match the tag {_quote_value(node.tag)}"
-        raise _error_at_node(what, node, place)
+        raise _error_at_node(what, node, where)
     if kind == "null":
         return None
     if kind == "bool":
@@ -214,16 +214,16 @@ def _convert_scalar(node: Any, place: str) -> Any:
     digits = text.lstrip("+-")
     if digits.startswith("0") and digits != "0":
         remedy = f"write {digits.lstrip('0') or 0}, or '{text}' in quotes for a word"
-        raise _error_at_node(f"{_quote_value(text)} may be octal or decimal", node, place, remedy)
+        raise _error_at_node(f"{_quote_value(text)} may be octal or decimal", node, where, remedy)
     if len(digits) > _MAX_INTEGER_DIGITS:
         what = f"an integer of {len(digits)} digits is too long (maximum: {_MAX_INTEGER_DIGITS})"
-        raise _error_at_node(what, node, place)
+        raise _error_at_node(what, node, where)
     return int(text)
 
 
-def _error_at_node(what: str, node: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _error_at_node(what: str, node: Any, where: str, remedy: str = "") -> DrakeTeleopError:
     line = node.start_mark.line + 1
-    return DrakeTeleopError(f"{what} (line {line})", where=place, remedy=remedy)
+    return DrakeTeleopError(f"{what} (line {line})", where=where, remedy=remedy)
 
 
 def _quote_value(text: Any) -> str:

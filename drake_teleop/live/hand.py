@@ -38,7 +38,7 @@ TARGET_LEAD_TIME_S = 2.5 / _TRANSLATION_POLE_RAD_S
 _IS_HELD_INDEX, _START_TIME_INDEX, _POLE_INDEX, _TARGET_POSE_INDEX, _PATH_SIZE = 0, 1, 2, 3, 25
 _OFFSET_INDEX, _VELOCITY_INDEX, _ACCELERATION_INDEX = 10, 13, 16
 _ROTATION_INDEX, _RATE_INDEX = 19, 22
-_INTENDED_MOTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
+_NUM_INTENDED_MOTION_VALUES = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 #: Period of the poses [s], and [ms].
 POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
@@ -48,7 +48,7 @@ _WRENCH_LIMIT_FADE_S, _LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4
 _START_POSE_INDEX, _DISPLACEMENT_INDEX, _ROTATION_VECTOR_INDEX = 2, 9, 12
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT_INDEX, _ALLOWED_SHARE_INDEX, _DISPLAY_STATE_SIZE = 6, 7, 8
-_WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
+_INVALID_WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 
 
 @njit(cache=True)
@@ -110,8 +110,8 @@ def _rotation_vector_rate(r, omega):
 
 
 @njit(cache=True)
-def _start_path_into(path, time, motion, target, poles):
-    path[_IS_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, poles
+def _plan_hand_path_into(path, time, motion, target, pole):
+    path[_IS_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, pole
     vectors.copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
     rotation = vectors.quaternion_logarithm(
         vectors.quaternion_product(motion, vectors.conjugate_quaternion(target))
@@ -150,7 +150,7 @@ class LiveHand(operator.Operator):
 
     def __init__(self, config: operator.OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
-        self._scratch, self._mass = np.empty(_INTENDED_MOTION_SIZE), config.hand.mass
+        self._scratch, self._mass = np.empty(_NUM_INTENDED_MOTION_VALUES), config.hand.mass
 
     def _declare_intended_motion_sources(self) -> set[framework.DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
@@ -163,8 +163,8 @@ class LiveHand(operator.Operator):
         """Start a smooth path to the pose X_BE `target` (7,); None: the hand lets go."""
         path = np.zeros(_PATH_SIZE)
         if target is not None:
-            motion = self._current_motion(context)
-            _start_path_into(path, context.get_time(), motion, target, _TRANSLATION_POLE_RAD_S)
+            motion = self._current_intended_motion(context)
+            _plan_hand_path_into(path, context.get_time(), motion, target, _TRANSLATION_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def KeepWrench(
@@ -175,7 +175,7 @@ class LiveHand(operator.Operator):
         if path[_IS_HELD_INDEX] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
-        intention = self._current_motion(context)
+        intention = self._current_intended_motion(context)
         intended, now = tuple(intention[:4]), tuple(pose[:4])
         rotation = vectors.quaternion_logarithm(
             vectors.quaternion_product(intended, vectors.conjugate_quaternion(now))
@@ -191,10 +191,10 @@ class LiveHand(operator.Operator):
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
         target = path[_TARGET_POSE_INDEX:_OFFSET_INDEX].copy()
-        _start_path_into(path, context.get_time(), intention, target, _GRIP_CHANGE_POLE_RAD_S)
+        _plan_hand_path_into(path, context.get_time(), intention, target, _GRIP_CHANGE_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def _current_motion(self, context: Context) -> Array:
+    def _current_intended_motion(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
         _intended_motion_into(path, context.get_time(), self._pose.Eval(context), self._scratch)
         return self._scratch
@@ -205,8 +205,8 @@ class LiveHand(operator.Operator):
         motion = self._pose.Eval(context), self._twist.Eval(context), self._scratch
         _live_hand_wrench_into(path, time, *hand, *motion, output.get_mutable_value())
 
-    def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._current_motion(context)[:7])
+    def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._current_intended_motion(context)[:7])
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
@@ -238,7 +238,7 @@ def _pose_and_twist_on_path_into(path, time, out):
 def _update_displayed_wrench(wrench, is_device_held, period, limits, last_state, state):
     fault = 0.0
     if not are_valid_port_values(wrench):
-        fault = _WRENCH_FAULT_NUMBER
+        fault = _INVALID_WRENCH_FAULT_NUMBER
     enabled = is_device_held and fault == 0.0
     change = _LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S
     allowed = min(max(last_state[_ALLOWED_SHARE_INDEX] + period * change, 0.0), 1.0)

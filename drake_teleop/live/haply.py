@@ -16,7 +16,7 @@ from drake_teleop.live.device_guard import DeviceLimits
 from drake_teleop.live.device_packets import CLUTCH_OPEN_FLAG, DeviceState, valid_state
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
-_START_REMEDY = "start Haply's Inverse Service"
+_START_SERVICE_REMEDY = "start Haply's Inverse Service"
 _VERSE_GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
@@ -79,7 +79,7 @@ class HaplyDevice:
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             what = f"Haply's service does not answer ({error})"
-            raise DrakeTeleopError(what, where=address, remedy=_START_REMEDY) from error
+            raise DrakeTeleopError(what, where=address, remedy=_START_SERVICE_REMEDY) from error
         self._device = ""
 
     def read(self) -> DeviceState | None:
@@ -91,7 +91,7 @@ class HaplyDevice:
             return None
         except ConnectionClosed as error:
             what = "Haply's service has closed the connection"
-            raise DrakeTeleopError(what, where="haply", remedy=_START_REMEDY) from error
+            raise DrakeTeleopError(what, where="haply", remedy=_START_SERVICE_REMEDY) from error
         if message is None:
             return None
         self._device, state = message

@@ -52,7 +52,7 @@ def choices_as_in_scenario(scenario: Scenario) -> dict[str, int]:
     }
 
 
-def _integer_field(default: int, low: int, high: int) -> Any:
+def _integer_field_with_range(default: int, low: int, high: int) -> Any:
     return dataclasses.field(default=default, metadata={"range": (low, high)})
 
 
@@ -76,28 +76,28 @@ class Inputs:
         detection: 1 with contact detection.
     """
 
-    x: int = _integer_field(0, -15_000, 15_000)
-    y: int = _integer_field(0, -15_000, 15_000)
-    z: int = _integer_field(0, -15_000, 15_000)
-    rx: int = _integer_field(0, -10_000, 10_000)
-    ry: int = _integer_field(0, -10_000, 10_000)
-    rz: int = _integer_field(0, -10_000, 10_000)
-    held: int = _integer_field(1, 0, 1)
-    clutch: int = _integer_field(1, 0, 1)
-    sigma: int = _integer_field(0, 0, 300)
-    sigma_weight: int = _integer_field(-1, -1, 300)
-    sigma_object: int = _integer_field(0, 0, 300)
-    gamma: int = _integer_field(100, 0, 300)
-    force_scale: int = _integer_field(5714, 0, 100_000)
-    network: int = _integer_field(0, 0, len(NETWORKS) - 1)
-    delay: int = _integer_field(500, 0, 20_000)
-    jitter: int = _integer_field(20, 0, 100)
-    loss: int = _integer_field(0, 0, 500)
-    method: int = _integer_field(0, 0, 0)  # see `input_range`
-    grip: int = _integer_field(1, 0, len(GRIP_IMPEDANCES) - 1)
-    object: int = _integer_field(0, 0, 1)
-    detection: int = _integer_field(0, 0, 1)
-    sensor: int = _integer_field(0, 0, len(SENSOR_NAMES) - 1)
+    x: int = _integer_field_with_range(0, -15_000, 15_000)
+    y: int = _integer_field_with_range(0, -15_000, 15_000)
+    z: int = _integer_field_with_range(0, -15_000, 15_000)
+    rx: int = _integer_field_with_range(0, -10_000, 10_000)
+    ry: int = _integer_field_with_range(0, -10_000, 10_000)
+    rz: int = _integer_field_with_range(0, -10_000, 10_000)
+    held: int = _integer_field_with_range(1, 0, 1)
+    clutch: int = _integer_field_with_range(1, 0, 1)
+    sigma: int = _integer_field_with_range(0, 0, 300)
+    sigma_weight: int = _integer_field_with_range(-1, -1, 300)
+    sigma_object: int = _integer_field_with_range(0, 0, 300)
+    gamma: int = _integer_field_with_range(100, 0, 300)
+    force_scale: int = _integer_field_with_range(5714, 0, 100_000)
+    network: int = _integer_field_with_range(0, 0, len(NETWORKS) - 1)
+    delay: int = _integer_field_with_range(500, 0, 20_000)
+    jitter: int = _integer_field_with_range(20, 0, 100)
+    loss: int = _integer_field_with_range(0, 0, 500)
+    method: int = _integer_field_with_range(0, 0, 0)  # see `input_range`
+    grip: int = _integer_field_with_range(1, 0, len(GRIP_IMPEDANCES) - 1)
+    object: int = _integer_field_with_range(0, 0, 1)
+    detection: int = _integer_field_with_range(0, 0, 1)
+    sensor: int = _integer_field_with_range(0, 0, len(SENSOR_NAMES) - 1)
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Inputs:
@@ -187,10 +187,10 @@ def inputs_at_displacement(
     return values
 
 
-_WRITER_PACKAGE_AND_VERSION = {"drake_teleop": __version__}
+_VERSION_BY_PACKAGE_NAME = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _WRITER_PACKAGE_AND_VERSION) -> str:
+def csv_header(made_by: Mapping[str, str] = _VERSION_BY_PACKAGE_NAME) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -201,7 +201,7 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(
-    path: Path, made_by: Mapping[str, str] = _WRITER_PACKAGE_AND_VERSION
+    path: Path, made_by: Mapping[str, str] = _VERSION_BY_PACKAGE_NAME
 ) -> list[tuple[int, Inputs]]:
     """Return the recorded changes as (time [ms], inputs); the last is the end.
 
@@ -240,7 +240,7 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
         where = f"{path}:{number}"
         if len(line) != len(_CSV_COLUMNS):
             what = f"has {len(line)} values, must have {len(_CSV_COLUMNS)}, one for each column"
-            raise _invalid_row(what, where)
+            raise _csv_row_error(what, where)
         for column, name in enumerate(_CSV_COLUMNS):
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
@@ -250,17 +250,17 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
             ms, *values = map(int, line)
         except ValueError:
             what = "has a value that is not a whole number (all inputs are integers)"
-            raise _invalid_row(what, where) from None
+            raise _csv_row_error(what, where) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             what = f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)"
-            raise _invalid_row(what, where)
+            raise _csv_row_error(what, where)
         earlier, inputs = ms, dict(zip(INPUT_RANGES, values, strict=True))
         for name in INPUT_RANGES:
             low, high = input_range(name)
             if not low <= inputs[name] <= high:
-                raise _invalid_row(f"{name} = {inputs[name]} is outside {low} to {high}", where)
+                raise _csv_row_error(f"{name} = {inputs[name]} is outside {low} to {high}", where)
         yield ms, Inputs(**inputs)
 
 
-def _invalid_row(what: str, where: str) -> DrakeTeleopError:
+def _csv_row_error(what: str, where: str) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=where, remedy="use the file as recorded")

@@ -31,23 +31,23 @@ SceneFunction = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 
 #: Period of the frames for the page [s].
 FRAME_PERIOD_S = 1 / 60
-_MIN_FRAME_PERIOD_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
+_MIN_TIME_BETWEEN_PAGE_FRAMES_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
 MIN_DISPLAYED_TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
 # of messages.
 _MAX_UNDRIVEN_S, _MAX_SLICES_PER_TICK = 0.25, 4
-_MIN_SHOWN_UNRENDERED_FORCE_N = 0.05  # N, smallest removed force that the page reports
+_MIN_REPORTED_UNRENDERED_FORCE_N = 0.05  # N, smallest removed force that the page reports
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
-_SESSION_FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
+_EXCEPTIONS_THAT_STOP_SESSION = (DrakeTeleopError, RuntimeError, SystemExit)
 
 #: Largest message [bytes]; a longer one closes the connection.
 MAX_MESSAGE_BYTES = 4096
 #: Largest clock time per simulated time.
 MAX_SLOWDOWN = 20.0
 #: Lateness above which lost time is not caught up [s].
-_MAX_CAUGHT_UP_LATENESS_S = 0.1
-_SCHEDULE_STATISTICS_SLICES = 400  # slices
+_MAX_SLICE_DELAY_TO_CATCH_UP_S = 0.1
+_NUM_SLICES_OF_TIMING_STATISTICS = 400  # slices
 
 
 class SliceSchedule:
@@ -61,8 +61,8 @@ class SliceSchedule:
     def __init__(self, slice_s: float, now: float) -> None:
         self.slowdown, self.lost_time_s = 1.0, 0.0
         self._slice = slice_s
-        self._lateness: deque[float] = deque(maxlen=_SCHEDULE_STATISTICS_SLICES)
-        self._starts: deque[float] = deque(maxlen=_SCHEDULE_STATISTICS_SLICES)
+        self._lateness: deque[float] = deque(maxlen=_NUM_SLICES_OF_TIMING_STATISTICS)
+        self._starts: deque[float] = deque(maxlen=_NUM_SLICES_OF_TIMING_STATISTICS)
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -74,7 +74,7 @@ class SliceSchedule:
 
     def begin_slice(self, now: float) -> None:
         late = now - self._due
-        if late > _MAX_CAUGHT_UP_LATENESS_S:
+        if late > _MAX_SLICE_DELAY_TO_CATCH_UP_S:
             self.lost_time_s += late
             self._due = now
         self._lateness.append(late)
@@ -177,9 +177,9 @@ class Live:
 
     def _restart_session(self, now: float) -> None:
         self.stopped = ""
-        self._stop_on_failure(self.end_session)
+        self._run_and_stop_session_on_failure(self.end_session)
         failure = self.stopped
-        self._stop_on_failure(lambda: self._start_session(now))
+        self._run_and_stop_session_on_failure(lambda: self._start_session(now))
         self._refusal = failure
 
     def reject_scene(self, why: str, now: float) -> None:
@@ -205,7 +205,7 @@ class Live:
     def join(self, client: int, now: float) -> None:
         """Add a page; the first one drives (its inputs move the hand)."""
         if self._driver is None:
-            self._set_driver(client, now)
+            self._set_driving_page(client, now)
 
     def leave(self, client: int, now: float) -> None:
         """Remove a page; if it drives, the hand releases the stylus."""
@@ -220,7 +220,7 @@ class Live:
             self.refused += 1
             return
         if "drive" in message and client != self._driver:
-            self._set_driver(client, now)
+            self._set_driving_page(client, now)
         if client != self._driver:
             return
         if "set" in message:
@@ -241,7 +241,7 @@ class Live:
         if "reset" in message:
             self._restart_session(now)
 
-    def _set_driver(self, client: int, now: float) -> None:
+    def _set_driving_page(self, client: int, now: float) -> None:
         self._driver = client
         self._requested = self._session.inputs_at_stylus().with_changes({"clutch": 1})
         self._rates = RateInputs()
@@ -269,14 +269,14 @@ class Live:
             if self.is_halted or self.pace.time_to_next_slice(now) > 0:
                 break
             self.pace.begin_slice(now)
-            self._simulate_slice(now)
+            self._simulate_time_slice(now)
         now = clock()
-        self._wake_if_device_sends(now)
+        self._resume_if_device_sends(now)
         if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
-            self._stop_on_failure(self._session.write_log)
+            self._run_and_stop_session_on_failure(self._session.write_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
-        show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
+        show_now = self._show_now and now >= self._last_frame_at + _MIN_TIME_BETWEEN_PAGE_FRAMES_S
         if now < self._frame_due and not show_now:
             return None
         scheduled = max(self._frame_due + FRAME_PERIOD_S, now - FRAME_PERIOD_S)
@@ -284,7 +284,7 @@ class Live:
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 
-    def _wake_if_device_sends(self, now: float) -> None:
+    def _resume_if_device_sends(self, now: float) -> None:
         if self._link is None or self._link.receive_state(now) is None:
             return
         self._idle_since = now
@@ -292,13 +292,13 @@ class Live:
             self._asleep = False
             self.pace.restart(now)
 
-    def _stop_on_failure(self, action: Callable[[], None]) -> None:
+    def _run_and_stop_session_on_failure(self, action: Callable[[], None]) -> None:
         try:
             action()
-        except _SESSION_FAILURE_EXCEPTIONS as error:
+        except _EXCEPTIONS_THAT_STOP_SESSION as error:
             self.stopped = to_one_line(str(error))
 
-    def _simulate_slice(self, now: float) -> None:
+    def _simulate_time_slice(self, now: float) -> None:
         self._requested = self._rates.advance_inputs(self._requested, 1e-3 * self._slice_ms, now)
         self._show_now |= self._requested.hand_pose_and_held != self._last_target
         self._last_target = self._requested.hand_pose_and_held
@@ -308,7 +308,7 @@ class Live:
             may_jump |= not requested.clutch
         try:
             self._session.apply_inputs(self._limiter.limit_inputs(requested, may_jump=may_jump))
-        except _SESSION_FAILURE_EXCEPTIONS as error:
+        except _EXCEPTIONS_THAT_STOP_SESSION as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
                 self.stopped = to_one_line(str(error))
@@ -317,7 +317,7 @@ class Live:
                 removed = {name: getattr(present, name) for name in live_inputs.STATION_SWAP_INPUTS}
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:
-            self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
+            self._run_and_stop_session_on_failure(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.contact_force() > MIN_DISPLAYED_TOUCH_FORCE_N
             self._show_now |= pressed and not self._touched
             self._touched = pressed
@@ -336,7 +336,7 @@ class Live:
         if self._session.is_channel_filling:
             words = ["a new channel starts: the clutch is open until its packets arrive", *words]
         removed = self._session.force_above_limit()
-        if removed > _MIN_SHOWN_UNRENDERED_FORCE_N:
+        if removed > _MIN_REPORTED_UNRENDERED_FORCE_N:
             words = [f"{removed:.1f} N are not rendered until the hand presses less", *words]
         if self._refusal:
             words = [self._refusal, *words]
@@ -348,7 +348,7 @@ class Live:
             "factor": round(self.pace.real_time_factor * self.pace.slowdown, 3),
             "late": round(1e3 * self.pace.lateness_p99_s(), 1),
             "lost": round(self.pace.lost_time_s, 2),
-            "state": self._state_name(),
+            "state": self._session_state_name(),
             "driver": self._driver,
             "drive": self._drives,
             "scene": self.requested_scene or self.scene,
@@ -357,7 +357,7 @@ class Live:
             "inputs": dict(vars(inputs)),
         }
 
-    def _state_name(self) -> str:
+    def _session_state_name(self) -> str:
         if self.requested_scene:
             return "preparing"
         if self.stopped:
@@ -375,7 +375,7 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        self._stop_on_failure(self.end_session)
+        self._run_and_stop_session_on_failure(self.end_session)
         if self._link is not None:
             self._link.close()
         if self._write_error:
@@ -404,10 +404,10 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     for kind in ("set", "rates"):
         values = message.get(kind)
         if isinstance(values, dict):
-            found[kind] = {name: value for name, value in values.items() if _is_finite(value)}
+            found[kind] = {name: value for name, value in values.items() if _is_valid_number(value)}
     if isinstance(message.get("pause"), bool):
         found["pause"] = message["pause"]
-    if _is_finite(message.get("slow")):
+    if _is_valid_number(message.get("slow")):
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
     if isinstance(message.get("scene"), str) and message["scene"] in SCENE_NAMES:
         found["scene"] = message["scene"]
@@ -417,7 +417,7 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     return found or None
 
 
-def _is_finite(value: Any) -> bool:
+def _is_valid_number(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) < 1e15 and math.isfinite(value)

@@ -52,7 +52,7 @@ class MotionLimiter:
     """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
-        self._axes: dict[str, _AxisLimiter] = {}
+        self._axes: dict[str, _AxisMotionLimiter] = {}
         limits = (
             (("x", "y", "z"), INPUT_UNIT_M, _TOOL_TRANSLATION_LIMITS),
             (("rx", "ry", "rz"), INPUT_UNIT_RAD, _TOOL_ROTATION_LIMITS),
@@ -61,7 +61,7 @@ class MotionLimiter:
             units = slice_s / (unit * max(scale, 1e-3))
             change = slice_s * units * acceleration if device else math.inf
             for name in names:
-                self._axes[name] = _AxisLimiter(units * speed, change, INPUT_RANGES[name])
+                self._axes[name] = _AxisMotionLimiter(units * speed, change, INPUT_RANGES[name])
 
     def limit_inputs(self, inputs: Inputs, *, may_jump: bool) -> Inputs:
         """Return the inputs of the next slice, limited unless the target `may_jump`."""
@@ -71,7 +71,7 @@ class MotionLimiter:
         )
 
 
-class _AxisLimiter:
+class _AxisMotionLimiter:
     def __init__(self, speed: float, change: float, ends: tuple[float, float]) -> None:
         self._speed, self._change, self._ends = speed, change, ends
         self._at = self._target = self._last_change = 0.0
@@ -82,15 +82,15 @@ class _AxisLimiter:
             self._at, self._last_change = target, 0.0
             return target
         behind = last - self._at
-        speed = target - last + math.copysign(self._max_braking_speed(abs(behind)), behind)
-        least, most = (self._max_braking_speed(abs(end - self._at)) for end in self._ends)
+        speed = target - last + math.copysign(self._max_speed_to_stop_within(abs(behind)), behind)
+        least, most = (self._max_speed_to_stop_within(abs(end - self._at)) for end in self._ends)
         speed = min(max(speed, -min(least, self._speed)), min(most, self._speed))
         change = min(max(speed - self._last_change, -self._change), self._change)
         self._last_change += change
         self._at += self._last_change
         return self._at
 
-    def _max_braking_speed(self, distance: float) -> float:
+    def _max_speed_to_stop_within(self, distance: float) -> float:
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

@@ -19,7 +19,7 @@ from drake_teleop.station.scenario import Scenario
 
 LogRows = dict[str, Array]
 
-_SCENE_FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
+_SCENE_DISABLING_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
 # Commands in base64 and their files in the static page of Meshcat.
 _MESHCAT_COMMAND_PATTERN = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
@@ -44,20 +44,20 @@ class PageScene:
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _scene_objects_json(meshcat.StaticHtml())
             self._scene.canvas = _SceneChangeRecorder()  # only this thread may destroy Meshcat
-        except _SCENE_FAILURE_EXCEPTIONS as error:
+        except _SCENE_DISABLING_EXCEPTIONS as error:
             self._report_scene_failure(error)
 
     def scene_values(self, rows: LogRows) -> dict[str, Any]:
         """Return the page's message of the last row: 4x4 poses (column-major), sizes by path."""
-        moves = {} if self.failure else self._poses_and_sizes(rows)
+        moves = {} if self.failure else self._scene_poses_and_sizes_of_last_row(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 
-    def _poses_and_sizes(self, rows: LogRows) -> dict[str, Any]:
+    def _scene_poses_and_sizes_of_last_row(self, rows: LogRows) -> dict[str, Any]:
         moves = _SceneChangeRecorder()
         try:
             self._scene.canvas = moves
             self._scene.show_sample(0.0, rows, -1)
-        except _SCENE_FAILURE_EXCEPTIONS as error:
+        except _SCENE_DISABLING_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._report_scene_failure(error)
             return {}

@@ -64,7 +64,7 @@ class SessionRecord:
             self._append_line(csv_header(versions_and_file_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
-            self._remove_files()
+            self._remove_record_files()
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
@@ -82,12 +82,12 @@ class SessionRecord:
     def close(self, ms: int, inputs: Inputs) -> None:
         """Write the end time [ms] and close the files; remove an empty record."""
         if not ms:
-            return self._remove_files()
+            return self._remove_record_files()
         self.write(ms, inputs)
         with wrap_write_errors(Path(self._file.name)):
             self._file.close()
 
-    def _remove_files(self) -> None:
+    def _remove_record_files(self) -> None:
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):  # the folder contains other files
@@ -107,6 +107,6 @@ class BackgroundLog(LogOnDisk):
     def wait_until_written(self) -> None:
         self._writing.result()
 
-    def _write_part(self, part: SimulationResult) -> None:
+    def _write_log_part(self, part: SimulationResult) -> None:
         self.wait_until_written()
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)

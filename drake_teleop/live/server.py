@@ -51,16 +51,16 @@ from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 
-_HOST = "127.0.0.1"
+_LOOPBACK_ADDRESS = "127.0.0.1"
 _MAX_CONNECTED_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
 _EVENT_LOOP_ITERATIONS_PER_MESSAGE = 3
-_MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
+_MAX_UNSENT_BYTES_OF_PAGE = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
 # All other log entries of websockets are failed connections, which clients cause.
-_LOGGER = logging.getLogger("drake_teleop.live.server")
-_LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
+_WEBSOCKET_LOGGER = logging.getLogger("drake_teleop.live.server")
+_WEBSOCKET_LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
 
 
 class LiveDrive:
@@ -92,13 +92,13 @@ class LiveDrive:
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._page_numbers = itertools.count(1)  # of pages
         self._threads: list[threading.Thread] = []
-        self._start_thread(self._run_thread, setup, record)
+        self._start_thread(self._run_session_and_server, setup, record)
         try:
             self._ready.wait()
         except KeyboardInterrupt:
             self._stop_threads_or_exit_process()
             raise
-        self._raise_failure()
+        self._raise_thread_failure()
 
     def _start_thread(self, work: Callable[..., None], *arguments: Any) -> None:
         self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
@@ -127,7 +127,7 @@ class LiveDrive:
                 pass
         finally:
             self._stop_threads_or_exit_process()
-        self._raise_failure()
+        self._raise_thread_failure()
 
     def announce_and_wait(self, who: str) -> str:
         """Print the page's address; wait for Ctrl-C or SIGTERM and return its name, or "stop"."""
@@ -137,10 +137,10 @@ class LiveDrive:
             self.wait()
             return "stop"
         except KeyboardInterrupt as signal:
-            self._raise_failure()
+            self._raise_thread_failure()
             return str(signal) or "Ctrl-C"
 
-    def _raise_failure(self) -> None:
+    def _raise_thread_failure(self) -> None:
         if self._failed is not None:
             raise self._failed
 
@@ -167,10 +167,10 @@ class LiveDrive:
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" style="width:100%;height:44rem;border:0"></iframe>'
 
-    def _run_thread(self, scenario: Scenario, record: Path | None) -> None:
+    def _run_session_and_server(self, scenario: Scenario, record: Path | None) -> None:
         try:
-            self._live = self._make_live(scenario, record)
-            asyncio.run(self._serve())
+            self._live = self._make_live_session(scenario, record)
+            asyncio.run(self._serve_pages_until_stopped())
         except (Exception, SystemExit) as error:  # SystemExit is a failed assertion of Drake
             self._failed = error
         finally:
@@ -179,17 +179,17 @@ class LiveDrive:
             self._over.set()
             self._ready.set()
 
-    def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
+    def _make_live_session(self, scenario: Scenario, record: Path | None) -> Live:
         show = self._views[SCENE_NAMES[0]].scene_values
         live = Live(scenario, self._load, record, show, time.perf_counter(), self._link)
         self.recorded = live.recorded
         return live
 
-    async def _serve(self) -> None:
+    async def _serve_pages_until_stopped(self) -> None:
         try:
             server = await serve(
-                self._serve_page,
-                _HOST,
+                self._handle_page_connection,
+                _LOOPBACK_ADDRESS,
                 self._port,
                 process_request=self._answer_request,
                 max_size=MAX_MESSAGE_BYTES,
@@ -198,16 +198,16 @@ class LiveDrive:
                 ping_interval=5,
                 ping_timeout=5,
                 close_timeout=_PAGE_CLOSE_TIMEOUT_S,
-                logger=_LOGGER,
+                logger=_WEBSOCKET_LOGGER,
             )
         except OSError as error:
             what, remedy = f"cannot be opened ({error.strerror})", "use another --port"
             raise DrakeTeleopError(what, where=f"port {self._port}", remedy=remedy) from error
         self._port = server.sockets[0].getsockname()[1]
-        self.url = f"http://{_HOST}:{self._port}/?token={self._token}"
+        self.url = f"http://{_LOOPBACK_ADDRESS}:{self._port}/?token={self._token}"
         self._ready.set()
         try:
-            await self._run_loop(server)
+            await self._simulate_and_send_frames(server)
         finally:
             self.ended, self.ms = self._live.stopped, self._live.ms
             try:
@@ -217,23 +217,23 @@ class LiveDrive:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(server.wait_closed(), 2 * _PAGE_CLOSE_TIMEOUT_S)
 
-    async def _run_loop(self, server: Server) -> None:
+    async def _simulate_and_send_frames(self, server: Server) -> None:
         refusal = ""
         with without_garbage_collection():
             while not self._stop.is_set():
                 if self._live.requested_scene:
-                    await self._change_scene()
+                    await self._identify_load_and_change_scene()
                 frame = self._live.tick(time.perf_counter)
                 if frame is not None:
                     pages = [(c, c.transport.get_write_buffer_size()) for c in server.connections]
-                    ready = [c for c, unsent in pages if unsent < _MAX_UNSENT_BYTES]
+                    ready = [c for c, unsent in pages if unsent < _MAX_UNSENT_BYTES_OF_PAGE]
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._link is not None and self._link.refusal != refusal:
                     refusal = self._link.refusal
                     _print_to_stderr(f"a packet of the device was refused: it {refusal}")
-                await self._sleep_until_tick()
+                await self._sleep_until_next_slice_or_frame()
 
-    async def _sleep_until_tick(self) -> None:
+    async def _sleep_until_next_slice_or_frame(self) -> None:
         rest = self._live.time_to_next_tick(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
@@ -241,7 +241,7 @@ class LiveDrive:
         for _ in range(_EVENT_LOOP_ITERATIONS_PER_MESSAGE):
             await asyncio.sleep(0)
 
-    async def _change_scene(self) -> None:
+    async def _identify_load_and_change_scene(self) -> None:
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
         view = self._views[live.requested_scene]
@@ -264,7 +264,7 @@ class LiveDrive:
             return
         for page in tuple(self._pages):
             with contextlib.suppress(ConnectionClosed):
-                await page.send(self._hello_text(page))
+                await page.send(self._hello_message_json(page))
 
     def _start_stoppable_stage(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
@@ -273,37 +273,37 @@ class LiveDrive:
 
         return progress
 
-    def _hello_text(self, page: ServerConnection) -> str:
+    def _hello_message_json(self, page: ServerConnection) -> str:
         return json.dumps({"hello": self._live.hello() | {"you": self._pages[page]}})
 
     def _page_html(self) -> str:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        host = f"{_HOST}:{self._port}"
+        host = f"{_LOOPBACK_ADDRESS}:{self._port}"
         path, _, query = request.path.partition("?")
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
         ours = secrets.compare_digest(token, self._token.encode())
         if request.headers.get_all("Host") != [host] or not ours:
-            return _make_response(HTTPStatus.FORBIDDEN, b"The address requires its token.\n")
+            return _http_response(HTTPStatus.FORBIDDEN, b"The address requires its token.\n")
         if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
                 refusal = b"Only this server's page may open the socket.\n"
-                return _make_response(HTTPStatus.FORBIDDEN, refusal)
+                return _http_response(HTTPStatus.FORBIDDEN, refusal)
             return None
         if path == "/":
             page = self._page_html()
             policy = content_security_policy(page, host)
-            return _make_response(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8", policy)
+            return _http_response(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8", policy)
         if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
-            return _make_response(HTTPStatus.OK, view.objects, "application/json")
+            return _http_response(HTTPStatus.OK, view.objects, "application/json")
         if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
-            return _make_response(HTTPStatus.OK, script, "text/javascript; charset=utf-8")
-        return _make_response(HTTPStatus.NOT_FOUND, b"Not found.\n")
+            return _http_response(HTTPStatus.OK, script, "text/javascript; charset=utf-8")
+        return _http_response(HTTPStatus.NOT_FOUND, b"Not found.\n")
 
-    async def _serve_page(self, connection: ServerConnection) -> None:
+    async def _handle_page_connection(self, connection: ServerConnection) -> None:
         live = self._live
         if len(connection.server.connections) > _MAX_CONNECTED_PAGES:
             await connection.close(1013, "too many pages")
@@ -311,7 +311,7 @@ class LiveDrive:
         number = self._pages[connection] = next(self._page_numbers)
         live.join(number, time.perf_counter())
         try:
-            await connection.send(self._hello_text(connection))
+            await connection.send(self._hello_message_json(connection))
             async for text in connection:
                 live.handle_message(number, text, time.perf_counter())
         except ConnectionClosed:
@@ -340,7 +340,7 @@ def compile_slice_functions(scenario: Scenario, load: IdentifiedLoad | None, dev
     session.inputs_at_stylus()
 
 
-def _make_response(
+def _http_response(
     status: HTTPStatus, body: bytes, kind: str = "text/plain", policy: str = "default-src 'none'"
 ) -> Response:
     headers = {

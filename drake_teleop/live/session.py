@@ -47,15 +47,15 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 _ROWS_PER_LOG_PART = 2000
 # Duration of a change of scales [s]. A moving slider starts a ramp 60 times a second, and ramps
 # start slowly: longer ones would not progress until the slider rests.
-_SCALE_RAMP_S = 0.05
+_SCALE_RAMP_DURATION_S = 0.05
 # Shortest step of error control [s], for real time in contact. A third-order step is stable for
 # vibrations up to 1.7 / step = 1.1 kHz; the ball on a leaf vibrates at up to 700 Hz.
 _MIN_INTEGRATION_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
 _MAX_FORCE_RISE_N = 0.9
 # Duration of short steps after a rejected one [s].
-_SHORT_STEPS_AFTER_REJECTION_S = 4e-3
-_NO_EVENT_STATUS = EventStatus.DidNothing()
+_SHORT_STEPS_DURATION_AFTER_REJECT_S = 4e-3
+_DID_NOTHING_EVENT_STATUS = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
@@ -74,14 +74,14 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
         if number != rejected:
-            rejected, until = number, context.get_time() + _SHORT_STEPS_AFTER_REJECTION_S
+            rejected, until = number, context.get_time() + _SHORT_STEPS_DURATION_AFTER_REJECT_S
             integrator.set_maximum_step_size(shortest)
             integrator.set_fixed_step_mode(True)
         elif context.get_time() >= until:
             until = math.inf
             integrator.set_maximum_step_size(longest)
             integrator.set_fixed_step_mode(False)
-        return _NO_EVENT_STATUS
+        return _DID_NOTHING_EVENT_STATUS
 
     simulator.set_monitor(select_step_mode)
 
@@ -222,7 +222,7 @@ class Session:
             self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._channel_filled_at_ms)
         if inputs.force_scales != before.force_scales:
             scaling, context = self._station.block_and_context("force_scaling")
-            scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_S)
+            scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_DURATION_S)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 
@@ -252,14 +252,14 @@ class Session:
     def advance(self, ms: int = SLICE_MS) -> None:
         end = self.ms + ms
         if self.ms < self._channel_filled_at_ms <= end:
-            self._advance_to(self._channel_filled_at_ms)
+            self._simulate_until(self._channel_filled_at_ms)
             self._station.set_clutch(bool(self.inputs.clutch))
-        self._advance_to(end)
+        self._simulate_until(end)
         if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _ROWS_PER_LOG_PART:
             self._on_disk.write_and_clear_rows()
             self._rows_read = 0
 
-    def _advance_to(self, ms: int) -> None:
+    def _simulate_until(self, ms: int) -> None:
         self.ms = ms
         # The same product as Drake's event times, see `simulate`.
         simulation.advance_without_garbage_collection(self._station.simulator, 1e-3 * ms)

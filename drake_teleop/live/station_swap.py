@@ -22,7 +22,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.wiring import export_outputs
 
 #: Blocks whose parameters change during a live session.
-_BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
+_BLOCKS_WITH_CHANGEABLE_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
 def copy_station_state(
@@ -38,7 +38,7 @@ def copy_station_state(
         _copy_block_state(
             source.GetMyContextFromRoot(old_context),
             block.GetMyMutableContextFromRoot(new_context),
-            names[-1] in _BLOCKS_WITH_CHANGED_PARAMETERS,
+            names[-1] in _BLOCKS_WITH_CHANGEABLE_PARAMETERS,
         )
 
 
@@ -69,15 +69,15 @@ def _copy_block_state(source: Context, target: Context, with_parameters: bool) -
 
 
 @njit(cache=True)
-def _cross_fade_weight(change, time):
-    u = min(max((time - change[0]) / change[1], 0.0), 1.0)
+def _cross_fade_weight(start_and_duration, time):
+    u = min(max((time - start_and_duration[0]) / start_and_duration[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 @njit(cache=True)
-def _cross_fade_into(wrench, before, share, max_force, out):
+def _blend_and_limit_wrench_into(wrench, old, share, max_force, out):
     for i in range(6):
-        out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
+        out[i] = share * wrench[i] + (1.0 - share) * old[i] if share < 1.0 else wrench[i]
     force = _force_norm(out)
     if force > max_force:
         for i in range(6):
@@ -129,7 +129,7 @@ class CrossFade(LeafSystem):
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
         inputs = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc_wrench), inputs)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_fade_and_limit)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_fade_weight_and_max_force)
 
     def StartFade(self, context: Context, start: float, length: float, rendered: Array) -> None:
         """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `length` [s]."""
@@ -147,7 +147,7 @@ class CrossFade(LeafSystem):
         force = _force_norm(self._wrench.Eval(context))
         return max(force - max_force, 0.0) if share == 1.0 else 0.0
 
-    def _update_fade_and_limit(self, context: Context, state: DiscreteValues) -> None:
+    def _update_fade_weight_and_max_force(self, context: Context, state: DiscreteValues) -> None:
         share, max_force = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
@@ -162,4 +162,4 @@ class CrossFade(LeafSystem):
             output.SetFromVector(wrench)
             return
         before = context.get_numeric_parameter(self._change).value()[2:]
-        _cross_fade_into(wrench, before, share, max_force, output.get_mutable_value())
+        _blend_and_limit_wrench_into(wrench, before, share, max_force, output.get_mutable_value())

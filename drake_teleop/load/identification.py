@@ -34,11 +34,11 @@ MAX_IDENTIFIED_STD_SHARE = 0.05
 _MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _G_M_S2 = 0.5, 0.03, 9.81
 _OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 # Names in the file that are computed from the fields.
-_DERIVED_FIELDS = ("mass", "com", "inertia_com", "physically_consistent")
+_DERIVED_FILE_FIELDS = ("mass", "com", "inertia_com", "physically_consistent")
 # Shapes of the numbers in the file, and those with a limit: fourth powers must not overflow.
-_SCALAR_FIELDS = ("condition_number", "delay_s", "mass", "samples")
-_SHAPE_OF_FIELD = dict(phi=(10,), offsets=(6,), residual_rms=(6,), com=(3,), inertia_com=(3, 3))
-_LIMITED_FIELDS, _MAX_FILE_VALUE = ("phi", "offsets", "residual_rms", "delay_s"), 1e9
+_SCALAR_FILE_FIELDS = ("condition_number", "delay_s", "mass", "samples")
+_FILE_FIELD_SHAPES = dict(phi=(10,), offsets=(6,), residual_rms=(6,), com=(3,), inertia_com=(3, 3))
+_LIMITED_FILE_FIELDS, _MAX_FILE_VALUE = ("phi", "offsets", "residual_rms", "delay_s"), 1e9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,7 +115,7 @@ class Identification:
 
     def with_unidentified_load(self) -> Identification:
         """Return the result with all ten parameters of the load marked as not identified."""
-        return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PARAMETER)
+        return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PART_OF_THETA)
 
     def with_nothing_identified(self) -> Identification:
         """Return the result with infinite variances: all `verdicts` are "not"."""
@@ -151,7 +151,7 @@ class Identification:
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
         fields = list(self.__dataclass_fields__)
-        names = *fields[:4], "verdicts", *_DERIVED_FIELDS, *fields[4:]
+        names = *fields[:4], "verdicts", *_DERIVED_FILE_FIELDS, *fields[4:]
         # Infinity becomes null.
         write_json(Path(path), {name: getattr(self, name) for name in names})
 
@@ -159,20 +159,20 @@ class Identification:
     def load(cls, path: str | Path) -> Identification:
         """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
         expect_type((str, Path), path, "load")
-        document = _read_document(path)
-        known = (*cls.__dataclass_fields__, *_DERIVED_FIELDS, "verdicts")
+        document = _read_identification_document(path)
+        known = (*cls.__dataclass_fields__, *_DERIVED_FILE_FIELDS, "verdicts")
         for name in (*known, *document):
             if name not in known:
                 raise _file_error("is not a field of identification.json", f"{path}:{name}")
             if name not in document and name not in _OPTIONAL_FILE_FIELDS:
                 raise _file_error("is missing", f"{path}:{name}")
         names = [name for name in known if name in document]  # phi first
-        fields = {name: _read_field(f"{path}:{name}", name, document[name]) for name in names}
+        fields = {name: _parse_file_field(f"{path}:{name}", name, document[name]) for name in names}
         result = cls(**{name: fields[name] for name in cls.__dataclass_fields__ if name in fields})
         if fields.get("verdicts", list(result.verdicts)) != list(result.verdicts):
             others = "phi, covariance, identifiable or prior_dominated"
             raise _file_error(f"contradicts {others}", f"{path}:verdicts")
-        for name in _DERIVED_FIELDS:
+        for name in _DERIVED_FILE_FIELDS:
             stated, value = fields[name], getattr(result, name)
             is_flag = isinstance(value, bool)
             if not (stated is value if is_flag else np.allclose(stated, value, 1e-6, 1e-9)):
@@ -217,7 +217,7 @@ def natural_scales(phi: Array) -> Array:
     return scale
 
 
-def _read_document(path: str | Path) -> dict[str, Any]:
+def _read_identification_document(path: str | Path) -> dict[str, Any]:
     from drake_teleop.common.texts import read_json  # the import of PyYAML is slow
 
     if not os.path.exists(path):
@@ -233,18 +233,18 @@ def _file_error(what: str, where: str) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=where, remedy="run `identify` again")
 
 
-def _read_field(where: str, name: str, value: Any) -> Any:
-    if name in _SHAPE_OF_FIELD or name in _SCALAR_FIELDS:
-        _check_numbers(where, value)
-        array = finite_array(where, value, *_SHAPE_OF_FIELD.get(name, ()))
-        if name in _LIMITED_FIELDS and np.abs(array).max() > _MAX_FILE_VALUE:
+def _parse_file_field(where: str, name: str, value: Any) -> Any:
+    if name in _FILE_FIELD_SHAPES or name in _SCALAR_FILE_FIELDS:
+        _require_numbers(where, value)
+        array = finite_array(where, value, *_FILE_FIELD_SHAPES.get(name, ()))
+        if name in _LIMITED_FILE_FIELDS and np.abs(array).max() > _MAX_FILE_VALUE:
             raise _file_error(f"has an absolute value above {_MAX_FILE_VALUE:g}", where)
         # The natural scale is proportional to the mass.
         if name == "phi" and check_nonzero_load(where, array)[0] == 0.0:
             raise _file_error("has the mass 0", where)
         return array if array.shape else (int if name == "samples" else float)(array)
     if name == "covariance":
-        return _read_covariance(where, value)
+        return _parse_covariance(where, value)
     if name in ("identifiable", "prior_dominated"):
         flags = value if isinstance(value, list) else []
         if len(flags) != 16 or not all(isinstance(flag, bool) for flag in flags):
@@ -252,7 +252,7 @@ def _read_field(where: str, name: str, value: Any) -> Any:
         return np.array(flags, dtype=bool)
     if name == "degrees_of_freedom":
         given = value if isinstance(value, list) else [""]
-        _check_numbers(where, [v for v in given if v is not None], "a list of 16 numbers or null")
+        _require_numbers(where, [v for v in given if v is not None], "a list of 16 numbers or null")
         degrees = finite_array(where, [1.0 if v is None else v for v in given], 16)
         if (degrees <= 0.0).any():
             raise _file_error(f"has a value that is not positive ({degrees.min():g})", where)
@@ -264,7 +264,7 @@ def _read_field(where: str, name: str, value: Any) -> Any:
     return value
 
 
-def _read_covariance(where: str, value: Any) -> Array:
+def _parse_covariance(where: str, value: Any) -> Array:
     try:
         raw = np.array(value, dtype=object)
     except ValueError:
@@ -273,17 +273,17 @@ def _read_covariance(where: str, value: Any) -> Array:
         raise _file_error("is not a (16, 16) table of numbers", where)
     is_null = np.reshape([each is None for each in raw.flat], (16, 16))
     unknown = np.eye(16, dtype=bool) & is_null
-    _check_numbers(where, raw[~unknown].tolist())
+    _require_numbers(where, raw[~unknown].tolist())
     covariance = finite_array(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
         raise _file_error(f"has a negative variance ({np.diag(covariance).min():g})", where)
     return np.where(unknown, np.inf, covariance)
 
 
-def _check_numbers(where: str, value: Any, expected: str = "") -> None:
+def _require_numbers(where: str, value: Any, expected: str = "") -> None:
     if isinstance(value, list):
         for each in value:
-            _check_numbers(where, each, expected)
+            _require_numbers(where, each, expected)
     elif isinstance(value, bool) or not isinstance(value, (int, float)):
         what = f"is not {expected}" if expected else "contains values that are not numbers"
         raise _file_error(what, where)
@@ -292,7 +292,7 @@ def _check_numbers(where: str, value: Any, expected: str = "") -> None:
 MIN_SIGNIFICANT_STDS = 3.0
 """Distance from zero of a significant value [standard deviations]."""
 
-_IS_LOAD_PARAMETER = np.arange(16) >= 6
+_IS_LOAD_PART_OF_THETA = np.arange(16) >= 6
 
 
 def load_of_object(total: Identification, gripper: Identification) -> Identification:
@@ -314,14 +314,14 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
         phi=phi,
         covariance=covariance,
         identifiable=identifiable,
-        degrees_of_freedom=_degrees_of_freedom_of_difference(total, gripper),
-        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_LOAD_PARAMETER,
+        degrees_of_freedom=_degrees_of_freedom_of_load_difference(total, gripper),
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_LOAD_PART_OF_THETA,
     )
 
 
-def _degrees_of_freedom_of_difference(total: Identification, gripper: Identification) -> Array:
+def _degrees_of_freedom_of_load_difference(total: Identification, gripper: Identification) -> Array:
     a, b = (np.diag(load.covariance) for load in (total, gripper))
-    b = np.where(_IS_LOAD_PARAMETER, b, 0.0)
+    b = np.where(_IS_LOAD_PART_OF_THETA, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)
     a, b = np.where(finite, a, 1.0), np.where(finite, b, 0.0)
     with np.errstate(divide="ignore"):

@@ -28,11 +28,11 @@ from drake_teleop.common.numeric import (
 from drake_teleop.load.identification import Identification, is_precise_enough, mark_undetermined
 from drake_teleop.load.regressor import regressor
 
-_MAX_MOMENT_BLOCKS = 1024
+_MAX_STORED_SAMPLE_BLOCKS = 1024
 SAMPLES_PER_CHUNK = 2**15
 """Samples per pass over a long record."""
 # Smallest root mean square of an excited column [m/s^2, rad/s^2].
-_MIN_RMS_EXCITATION = 1e-9
+_MIN_RMS_OF_EXCITED_COLUMN = 1e-9
 # Smallest relative eigenvalue of the scaled Gram, and largest component of a determined parameter
 # in the null space.
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MAX_DETERMINED_NULL_COMPONENT = 1e-12, 1e-6
@@ -45,7 +45,7 @@ _MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_DISTANCE_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
-_MAX_ROUNDING_ERROR = 1e-6
+_MAX_ROUNDING_OVER_WRENCH = 1e-6
 # Indices of wrench, specific force and products w_i w_j in z.
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
 _OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
@@ -95,7 +95,7 @@ class SecondMoments:
     ) -> None:
         self._resolution = resolution
         self._weights = np.ones(6) if noise is None else positive_array("noise", noise, 6) ** -2.0
-        self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_MOMENT_BLOCKS, 19))
+        self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_STORED_SAMPLE_BLOCKS, 19))
         # Index of the open block, samples of a full block, samples of the open block.
         self._state = np.array([0, 1, 0])
 
@@ -146,7 +146,7 @@ class SecondMoments:
         theta, inverse, undetermined, condition_number = self._minimum_norm_solution()
         if theta[6] == 0.0:
             raise unidentifiable_mass_error("the fitted mass is 0")
-        covariance, degrees = self._covariance_and_degrees(theta, inverse)
+        covariance, degrees = self._covariance_and_dof(theta, inverse)
         covariance = mark_undetermined(covariance, undetermined)
         degrees[undetermined] = np.inf
         return Identification(
@@ -164,12 +164,12 @@ class SecondMoments:
 
     def covariance(self) -> Array:
         """Return the finite covariance (16, 16) of the minimum-norm solution [offsets; phi]."""
-        return self._covariance_and_degrees(*self._minimum_norm_solution()[:2])[0]
+        return self._covariance_and_dof(*self._minimum_norm_solution()[:2])[0]
 
-    def _covariance_and_degrees(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
+    def _covariance_and_dof(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
         variances, degrees, _ = self._long_run_variances(theta, inverse)
         # Contribution of each channel to the covariance, and Satterthwaite's degrees of freedom.
-        parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
+        parts = self._gram_matrix_of_each_channel() * (self._weights**2 * variances)[:, None, None]
         parts = inverse @ parts @ inverse
         shares = np.diagonal(parts, axis1=1, axis2=2)
         if self._resolution is not None:  # three channels share one variance
@@ -186,7 +186,7 @@ class SecondMoments:
     def normal_equations(self) -> tuple[Array, Array]:
         return normal_equations(self._sums, np.diag(self._weights))
 
-    def _channel_grams(self) -> Array:
+    def _gram_matrix_of_each_channel(self) -> Array:
         T = regressor_coefficients()
         return np.asarray(T @ self._sums @ T.transpose(0, 2, 1))
 
@@ -213,7 +213,7 @@ class SecondMoments:
     def _long_run_variances(
         self, theta: Array, inverse: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        grams = self._channel_grams()
+        grams = self._gram_matrix_of_each_channel()
         n = float(self.num_samples)
         square_sums = self.residual_square_sums(theta)
         if self._resolution is not None:
@@ -260,7 +260,7 @@ class SecondMoments:
         weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
         variances = np.where(weaker, longest, variances)
         degrees = np.where(weaker, longest_degrees, degrees)
-        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_ERROR**2 * wrench)
+        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_OVER_WRENCH**2 * wrench)
 
     def _residual_variances_of_poses_at_rest(
         self, square_sums: Array, absorbed: Array, theta: Array
@@ -285,15 +285,15 @@ class SecondMoments:
         variances = np.maximum(squares / np.maximum(degrees, 1.0), min_variance)
         return variances.repeat(3), degrees.repeat(3)
 
-    def _degrees_of_freedom_of_fit(self, between: Array, inverse: Array) -> Array:
-        return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
+    def _degrees_of_freedom_of_fit(self, block_grams: Array, inverse: Array) -> Array:
+        return np.asarray(self._weights * np.einsum("cij,ji->c", block_grams, inverse))
 
     def _unbiased_residual_variances(
-        self, square_sums: Array, count: float, between: Array, grams: Array, inverse: Array
+        self, square_sums: Array, count: float, block_grams: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array, Array]:
         w = self._weights
-        absorbed = self._degrees_of_freedom_of_fit(between, inverse)
-        shares = np.einsum("cij,kji->ck", between, inverse @ grams @ inverse) * w**2
+        absorbed = self._degrees_of_freedom_of_fit(block_grams, inverse)
+        shares = np.einsum("cij,kji->ck", block_grams, inverse @ grams @ inverse) * w**2
         degrees = np.maximum(count - absorbed, 0.0)
         equations = np.diag(count - 2.0 * absorbed) + shares
         if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
@@ -388,15 +388,15 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
     """Return (16,) True for parameters whose influence on the wrench exceeds rounding errors."""
-    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_RMS_EXCITATION**2
+    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_RMS_OF_EXCITED_COLUMN**2
 
 
 def root_of_pseudo_inverse(gram: Array, used: NDArray[np.bool_]) -> Array:
     """Return R (n, rank) with R R^T the pseudo-inverse of the Gram matrix of the `used` columns."""
-    return _root_and_eigensystem(gram, used)[0]
+    return _gram_root_and_null_space(gram, used)[0]
 
 
-def _root_and_eigensystem(gram: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+def _gram_root_and_null_space(gram: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _MIN_RELATIVE_GRAM_EIGENVALUE * eigenvalues[-1]
@@ -407,7 +407,7 @@ def _root_and_eigensystem(gram: Array, used: NDArray[np.bool_]) -> tuple[Array, 
 def _pseudo_inverse(
     gram: Array, unexcited: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_], float]:
-    root, eigenvalues, null = _root_and_eigensystem(gram, ~unexcited)
+    root, eigenvalues, null = _gram_root_and_null_space(gram, ~unexcited)
     undetermined = np.asarray((np.abs(null) > _MAX_DETERMINED_NULL_COMPONENT).any(axis=1))
     return root @ root.T, undetermined, float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
 

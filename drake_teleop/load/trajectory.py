@@ -13,7 +13,7 @@ from drake_teleop.common.files import write_text
 from drake_teleop.common.numeric import Array
 
 _FILE_FIELDS, _FIELDS_PER_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
-_MAX_ABSOLUTE_FILE_NUMBER = 1e6  # of any number in a file [rad, Hz]
+_MAX_ABSOLUTE_VALUE_IN_FILE = 1e6  # of any number in a file [rad, Hz]
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class FourierTrajectory:
             what = f"q0, rho and delta have the shapes {q0.shape}, {rho.shape} and {delta.shape}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
-        wrong = numbers[~(np.abs(numbers) <= _MAX_ABSOLUTE_FILE_NUMBER)]
+        wrong = numbers[~(np.abs(numbers) <= _MAX_ABSOLUTE_VALUE_IN_FILE)]
         if len(wrong):
-            what = f"contains {wrong[0]:g}, outside +-{_MAX_ABSOLUTE_FILE_NUMBER:g}"
+            what = f"contains {wrong[0]:g}, outside +-{_MAX_ABSOLUTE_VALUE_IN_FILE:g}"
             raise DrakeTeleopError(what, where=where, remedy="give angles in rad, Hz")
         if not frequency > 0:
             what, remedy = f"{frequency:g} Hz is not above 0", "give the frequency of a motion"

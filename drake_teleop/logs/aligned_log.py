@@ -27,6 +27,7 @@ from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.motion_checks import pose_unit_or_frame_finding
+from drake_teleop.logs.check.motion_size import too_little_motion
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     PoseMotion,
@@ -44,7 +45,7 @@ _MAX_KNOWN_DELAY_STD_S, _EDGE_MARGIN_OVER_KNOT_SPACING = 0.005, 2.0
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9
-_MIN_POSES_DURATION_S = 4.0  # shorter records have too few frequencies for splines
+_MIN_SPLINE_RECORD_DURATION_S = 4.0  # shorter records have too few frequencies for splines
 # Fewest kept samples, and largest cut-off of the low-pass over their rate; kept samples per chunk,
 # and neighbours for smoothing.
 _MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
@@ -211,21 +212,24 @@ def fit_load_to_posed_log(
     The load is None for a method without splines, a log without poses over 4 s, or an IMU that
     contradicts the poses.
     """
-    is_long = log.t[-1] - log.t[0] >= _MIN_POSES_DURATION_S
+    is_long = log.t[-1] - log.t[0] >= _MIN_SPLINE_RECORD_DURATION_S
     if log.posed is None or log.static or method not in METHODS_WITH_SPLINES or not is_long:
         return None, ()
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)
-    found, source = _fit_with_fallback_delay(log, delay, estimate, 0.0, "undetermined")
+    is_delay_unknown = delay == "auto" and too_little_motion(log) is not None
+    options = 0.0 if is_delay_unknown else delay, estimate, 0.0, "undetermined"
+    found, source = _fit_with_fallback_delay(log, *options)
+    source = "undetermined" if is_delay_unknown else source
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
         if not found.is_imu_consistent_with_poses or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
-    moved, edge = use_spline_motion_and_flag_edges(_reduce_log_rate(log, cutoff_hz), found)
+    moved, edge = use_spline_motion_and_flag_edges(_reduce_sample_rate(log, cutoff_hz), found)
     shown = low_pass_log(moved, cutoff_hz).select_rows(is_far_from_gaps(moved, cutoff_hz) & ~edge)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
-    fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
+    fit = _batch_result_of_pose_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
     if finding is not None or not found.fit.is_explained_by_gains:
         fit = replace(fit, identification=fit.identification.with_unidentified_load())
@@ -236,7 +240,7 @@ def fit_load_to_posed_log(
     return fitted, () if finding is None else (finding,)
 
 
-def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
+def _reduce_sample_rate(log: Log, cutoff_hz: float | None) -> Log:
     stride = len(log) // _MIN_SAMPLES_AT_REDUCED_RATE
     if cutoff_hz is not None:
         stride = min(stride, int(_MAX_CUTOFF_OVER_REDUCED_RATE / (cutoff_hz * log.dt)))
@@ -255,7 +259,7 @@ def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
     return replace(few, wrench=wrench, bridged=bridged)
 
 
-def _batch_result_of_estimate(
+def _batch_result_of_pose_estimate(
     log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
     kept = ~rejected

@@ -25,9 +25,9 @@ MIN_NOISE_FLOOR_SAMPLES = 100
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
 _MIN_NOISE_FLOOR = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
-_GRAVITY_LOW_PASS_HZ = 0.5
+_GRAVITY_LOW_PASS_CUTOFF_HZ = 0.5
 _MAX_QUIET_WRENCH_OVER_NOISE = 4.0
-_CUTOFF_WITHOUT_LOW_PASS_HZ = 30.0  # assumed cut-off without a low-pass
+_ASSUMED_CUTOFF_WITHOUT_FILTER_HZ = 30.0  # assumed cut-off without a low-pass
 _MIN_FLOOR_BLOCK_DURATION_S, _MIN_FLOOR_BLOCKS = 0.1, 20
 _QUIET_HALF_ITERATIONS, _NUM_CONTACT_REMOVAL_ROUNDS = 4, 3
 # The least expected maximum times 1.25 is about `NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES`.
@@ -72,7 +72,7 @@ def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> D
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
     else:
-        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_LOW_PASS_HZ)
+        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_LOW_PASS_CUTOFF_HZ)
     return DetectorSamples(contact, s, omega, alpha, s + gravity)
 
 
@@ -93,7 +93,7 @@ def detect_contact(
     `covariance` (16, 16) is that of [offsets; phi], `residual_rms` (6,) that of the identification
     [N, N m]. `free` contains samples of another log in free motion, and their sample time [s].
     """
-    period = 1.0 / (cutoff_hz or _CUTOFF_WITHOUT_LOW_PASS_HZ)
+    period = 1.0 / (cutoff_hz or _ASSUMED_CUTOFF_WITHOUT_FILTER_HZ)
     inner = _rows_far_from_ends_and_edges(rows, dt, period, edge)
     judged = rows.select_rows(inner)
     if len(judged.contact) < MIN_NOISE_FLOOR_SAMPLES:
@@ -102,7 +102,7 @@ def detect_contact(
     # A held value decays by the factor e within a period.
     if free is None:
         fade = math.exp(-dt / period)
-        floor, threshold, train = _fit_floor_and_threshold_to_log(
+        floor, threshold, train = _fit_noise_floor_and_threshold(
             judged, dt, hold, fade, covariance, statistic
         )
     else:
@@ -114,7 +114,7 @@ def detect_contact(
     values[inner] = detection.statistics_of_log(floor, *judged)
     touched[inner] = _remove_hold_after_contact(detector.detect(*judged), hold)
     if free is None:
-        _remove_marginal_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
+        _remove_brief_weak_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
     return Detection(
         noise_floor=floor,
         statistic=statistic,
@@ -140,7 +140,7 @@ def _rows_far_from_ends_and_edges(
     return slice(int(at[0]), int(at[-1]) + 1) if one_piece else judged
 
 
-def _fit_floor_and_threshold_to_log(
+def _fit_noise_floor_and_threshold(
     rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
@@ -196,7 +196,7 @@ def _remove_hold_after_contact(touched: NDArray[np.bool_], hold: int) -> NDArray
     return touched
 
 
-def _remove_marginal_contacts(
+def _remove_brief_weak_contacts(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in find_runs_of_true(touched):

@@ -36,8 +36,8 @@ DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
 _UNIT_RATIO_TOLERANCE = 1e-3
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
-_FORCE_UNITS = ("N", "kgf", "lbf")
-_TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
+_TRIED_FORCE_UNITS = ("N", "kgf", "lbf")
+_TRIED_TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
 _POSITION_FIELDS = ("pose.position_in_sensor", "imu.position")
 _ROTATION_FIELDS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
 _DECIMALS_OF_FIELD = {"gravity": 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
@@ -185,8 +185,8 @@ def _correct_wrench_sign_and_frame(fields: DescriptionFields, Q: Array) -> None:
 def _correct_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
     force = SI_VALUE_OF_UNIT[fields["wrench.force.unit"]]
     torque = SI_VALUE_OF_UNIT[fields["wrench.torque.unit"]]
-    ratios = [(torque / SI_VALUE_OF_UNIT[u], "wrench.torque.unit", u) for u in _TORQUE_UNITS]
-    ratios += [(SI_VALUE_OF_UNIT[u] / force, "wrench.force.unit", u) for u in _FORCE_UNITS]
+    ratios = [(torque / SI_VALUE_OF_UNIT[u], "wrench.torque.unit", u) for u in _TRIED_TORQUE_UNITS]
+    ratios += [(SI_VALUE_OF_UNIT[u] / force, "wrench.force.unit", u) for u in _TRIED_FORCE_UNITS]
     for ratio, name, unit in ratios:
         if unit != fields[name] and abs(torque_factor / ratio - 1.0) < _UNIT_RATIO_TOLERANCE:
             fields[name] = unit
@@ -238,11 +238,11 @@ def _block_means_of_splines(log: Log, found: PoseEstimate, delay_s: float) -> Bl
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    noise = _noise_of_spline_acceleration(splines)
+    noise = _acceleration_noise_of_splines_m_s2(splines)
     return block_means_of_record(log.t, log.wrench, motion_at, gravity, lost, noise)
 
 
-def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
+def _acceleration_noise_of_splines_m_s2(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BLOCK_MEAN_BANDWIDTH_HZ, 500)
     share = noise_share_passed_by_splines(f, splines.spacing)
     if splines.imu_rows is not None:

@@ -34,7 +34,7 @@ MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
 """Smallest reported share of repeated rows, and smallest number of rows of a reported block."""
 _MAX_DRAFT_CORRECTIONS = 5  # by the data
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
-_CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}
+_COLUMNS_THAT_MARK_CANONICAL_LOG = {"f_x", "tau_x"}
 _INSPECTED_QUANTITIES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
     *("orientation", "position", "gravity"),
@@ -57,7 +57,7 @@ def inspect_command(
         _inspect_described_log(load_description(log), str(log), {}, summary)
     elif (
         not (others or is_bag(log))
-        and (table := read_table(log)).columns.keys() >= _CANONICAL_WRENCH_COLUMNS
+        and (table := read_table(log)).columns.keys() >= _COLUMNS_THAT_MARK_CANONICAL_LOG
     ):
         summary["kind"] = "canonical"
         _inspect_described_log(
@@ -66,7 +66,10 @@ def inspect_command(
     else:
         drafts = [_draft_of_recording(path, out, summary) for path in (log, *others)]
         with output_folder(out):
-            _correct_and_write_draft(join_drafts(drafts), _free_draft_path(out), summary)
+            draft = join_drafts(drafts)
+            _correct_and_write_draft(draft, _find_writable_draft_path(out), summary)
+        more = [{"name": x.name, "message": x.message} for x in draft.findings]
+        summary["findings"] = [*summary["findings"], *more]
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -113,26 +116,26 @@ def _is_number(name: str) -> bool:
     return False
 
 
-def _free_draft_path(out: Path) -> Path:
+def _find_writable_draft_path(out: Path) -> Path:
     names = ("draft.yaml", *(f"draft-{k}.yaml" for k in range(2, 1000)))
-    return next(path for path in map(out.joinpath, names) if _may_be_replaced(path))
+    return next(path for path in map(out.joinpath, names) if _is_missing_or_unchanged_draft(path))
 
 
-def _may_be_replaced(path: Path) -> bool:
+def _is_missing_or_unchanged_draft(path: Path) -> bool:
     if not path.exists():
         return True
     text = path.read_text(encoding="utf-8", errors="replace")
-    return _with_checksum(text.rpartition(_CHECKSUM_LINE_START)[0]) == text
+    return _append_checksum(text.rpartition(_CHECKSUM_LINE_START)[0]) == text
 
 
-def _with_checksum(text: str) -> str:
+def _append_checksum(text: str) -> str:
     return f"{text}{_CHECKSUM_LINE_START}{sha256(text.encode()).hexdigest()[:16]}\n"
 
 
 def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
-    write_text(path, _with_checksum(draft.text()))
+    write_text(path, _append_checksum(draft.text()))
     summary["draft"] = str(path)
-    places = ", ".join(_places_to_fill_in(draft.streams))
+    places = ", ".join(_names_of_fields_to_fill_in(draft.streams))
     lacking = [f"fields that were not recognized: FILL IN {places}"] if places else []
     try:
         load_description(path)
@@ -145,14 +148,14 @@ def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) 
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
         text += f"# {to_one_line(f'INCOMPLETE, this has {message}')}\n"
-    write_text(path, _with_checksum(text))
+    write_text(path, _append_checksum(text))
 
 
-def _places_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
+def _names_of_fields_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
     out = []
     for name, value in fields.items():
         if isinstance(value, dict):
-            out += _places_to_fill_in(value, f"{outer}{name}.")
+            out += _names_of_fields_to_fill_in(value, f"{outer}{name}.")
         elif value == "FILL IN" or (isinstance(value, list) and "FILL IN" in value):
             out.append(f"{outer}{name}")
     return out
@@ -169,9 +172,9 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
         if first is None:
             first, given = finding, dict(summary)
         corrected = corrected.with_finding_corrected(finding)
-        write_text(path, _with_checksum(corrected.text()))
+        write_text(path, _append_checksum(corrected.text()))
     if first is not None and any(finding.name == "misfit" for finding in found):
-        write_text(path, _with_checksum(draft.text()))
+        write_text(path, _append_checksum(draft.text()))
         question = {"name": "misfit", "message": ask_about_correction(first)}
         others = [x for x in given["findings"] if x["message"] != first.message]
         summary |= given | {"findings": [*others, question]}
@@ -185,6 +188,8 @@ def _inspect_described_log(
     for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
+            if note := tables[stream.source].note:
+                findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, source)
         summary["streams"][name] = figures
@@ -290,12 +295,12 @@ def _repeated_rows_findings(
 
 
 def _inspect_clock_and_flag_usable_rows(
-    at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
+    at: str, time: Any, table: Table, num_rows: int, figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
     if time.column is None:
         t = time_stamps_and_num_episodes(time, table, at)[0]
-        figures |= {"rate_hz": time.rate, "duration_s": float(np.ptp(t)) if rows else 0.0}
-        return [], np.ones(rows, bool)
+        figures |= {"rate_hz": time.rate, "duration_s": float(np.ptp(t)) if num_rows else 0.0}
+        return [], np.ones(num_rows, bool)
     stamps, figures["episodes"] = time_stamps_and_num_episodes(time, table, at)
     highest = np.fmax.accumulate(stamps)
     usable = np.isfinite(stamps)

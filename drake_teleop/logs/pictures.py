@@ -43,7 +43,7 @@ _VERDICT_TEXTS = ("identified", "weakly identified", "not identified", "mostly f
 VERDICT_WORDS = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
 _MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
-_MEASURED_COLOUR = "#A3AAB5"
+_MEASURED_CURVE_COLOUR = "#A3AAB5"
 _Curves = list[tuple[str, Array, str]]  # name, values and colour
 
 
@@ -51,7 +51,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
     """Draw measured wrench, load's wrench and residual without offsets; shade rejected samples."""
     log, result = found.log, found.identification
     curves = [
-        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
+        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_CURVE_COLOUR),
         (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
         ("residual", log.wrench - found.predicted, VERMILION),
     ]
@@ -150,8 +150,8 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
 
 def draw_elimination(found: EliminatedLog) -> Figure:
     """Draw force magnitude and the six channels of each wrench; shade contacts."""
-    curves = [("measured, offsets removed", found.measured, _MEASURED_COLOUR)]
-    curves += _weightless_curve(found)
+    curves = [("measured, offsets removed", found.measured, _MEASURED_CURVE_COLOUR)]
+    curves += _curves_without_static_weight(found)
     if found.causal is not None:
         curves.append((f"contact, causal ({found.causal.mode})", found.causal.contact, PURPLE))
     curves.append(("contact wrench", found.contact, BLUE))
@@ -177,7 +177,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     return figure
 
 
-def _weightless_curve(found: EliminatedLog) -> _Curves:
+def _curves_without_static_weight(found: EliminatedLog) -> _Curves:
     weightless = found.gravity_only
     return [] if weightless is None else [("static weight removed", weightless, ORANGE)]
 
@@ -192,8 +192,8 @@ def draw_detection(found: DetectedLog) -> Any:
         top, below = figure.subplots(2, 1, sharex=True)
         raw = eliminated.measured - eliminated.measured[0]
         for name, wrench, colour in (
-            ("measured, tared at the start", raw, _MEASURED_COLOUR),
-            *_weightless_curve(eliminated),
+            ("measured, tared at the start", raw, _MEASURED_CURVE_COLOUR),
+            *_curves_without_static_weight(eliminated),
             ("contact", eliminated.contact, BLUE),
         ):
             top.plot(t, np.linalg.norm(wrench[inner, :3], axis=1), color=colour, label=name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -35,14 +36,17 @@ from drake_teleop.logs.causes.cause import (
     Finding,
     RecordPartWithLoad,
 )
-from drake_teleop.logs.check import edits
-from drake_teleop.logs.check.against_load import lag_findings
+from drake_teleop.logs.causes.explain import MisfitExplanation
+from drake_teleop.logs.check import against_load, edits
+from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, lag_findings
 from drake_teleop.logs.check.conventions import (
     ConventionCheckResult,
     check_conventions_of_file,
     findings_if_load_is_suspicious,
     motion_findings,
 )
+from drake_teleop.logs.check.handedness import left_handed_pose_finding
+from drake_teleop.logs.check.high_pass import high_pass_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
@@ -65,6 +69,7 @@ from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
+_NOTHING_IDENTIFIED_FINDINGS = ("left-handed", "high-pass")
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
@@ -172,91 +177,183 @@ def identify_log(
         checks: result of `check_conventions_of_file` for this log, if known.
     """
     METHODS.check(method, "method")
-    _check_log_arguments(path, cutoff_hz)
+    _check_path_and_cutoff(path, cutoff_hz)
     check = partial(check_conventions_of_file, Path(path)) if checks is None else lambda: checks
-    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
-    fitted, other = fit_load_to_posed_log(log, method, cutoff_hz, delay)
-    if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
-        log = read_log(path, bandwidth_hz=cutoff_hz)
-    raw, fitted = log, fitted or _fit_load_to_motion(log, method, cutoff_hz, delay)
-    motion, delay_s, source = fitted.motion, fitted.delay_s, fitted.delay_source
-    possible = _is_explanation_possible(raw, motion is not None)
-    why = explained_log.explain_log(raw, delay_s, motion) if possible else None
-    still = None
-    stated = () if why is None else why.causes
-    if any(finding.name not in CAUSES_AT_REST for finding in (*other, *stated)):
-        still = too_little_motion(raw)
-    why = why if still is None else None
-    names = {cause.name for cause in why.causes} if why is not None else set()
-    unknown_acceleration = why is not None and why.is_acceleration_missing
-    by_gains = raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
-    if why is not None and by_gains and not unknown_acceleration:
-        why = replace(why, causes=(), explained=True, loads=())
-    more = 0.0 if why is None or not why.causes or source != "estimated" else why.delay_s
-    if abs(more) > _MIN_CORRECTED_DELAY_S and motion is None:
-        fitted = _fit_load_to_motion(raw, method, cutoff_hz, delay_s + more)
-    elif abs(more) > _MIN_CORRECTED_DELAY_S:
-        again, other = fit_load_to_posed_log(raw, method, cutoff_hz, delay_s + more)
-        fitted = again or fitted
-    if unknown_acceleration and source == "estimated":  # an acceleration resembles a delay
-        source, fitted = "undetermined", _fit_load_to_motion(raw, method, cutoff_hz, 0.0)
-    log, result = fitted.log, fitted.fit.identification
-    causes: tuple[Finding, ...] = ()
-    misfit = why if why is not None and why.is_misfit else None
-    errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
-    if still is not None:
-        text = f"payload not identifiable: {still}; {MORE_MOTION_REMEDY}"
-        errors = (Finding("payload", text),)
-        result = result.with_nothing_identified()
-    if not errors and misfit is not None and misfit.causes:
-        errors = motion_findings(check)
-    if unknown_acceleration:  # the residual may be that of the acceleration
-        misfit = None
-    if log.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
-        errors += tuple(edits.correct_accelerometer_unit(log.described, log)[0])
-    if errors:
-        why, result = None, result.with_unidentified_load()
-    note = fitted.fit.note
+    options = method, cutoff_hz
+    raw, fitted, frame_findings = _read_and_fit_load(path, *options, delay)
+    mirrored = _left_handed_pose_finding(raw, fitted)
+    why, too_still = None, None
+    if mirrored is None:
+        why, too_still = _explain_residual(raw, fitted, frame_findings)
     if why is not None:
-        result = explained_log.apply_explanation_to_load(result, why)
-        causes = explained_log.replace_frame_causes(why, other[0]) if other else why.causes
-        note = "" if causes and not why.has_several_gains else note
-        note = explained_log.removed_weight_note(why) if raw.estimated else note
-    log = replace(log, notes=(*log.notes, *([note] if note else [])))
+        fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
+    errors = _errors_beside_the_load(raw, fitted, frame_findings, why, too_still, check)
+    errors = errors if mirrored is None else (mirrored,)
+    causes: tuple[Finding, ...] = ()
+    result, note = fitted.fit.identification, fitted.fit.note
+    accepted = None if errors else why
+    if errors:
+        useless = too_still or errors[0].name in _NOTHING_IDENTIFIED_FINDINGS
+        result = result.with_nothing_identified() if useless else result.with_unidentified_load()
+    if accepted is not None:
+        result, causes, note = _apply_explanation(result, raw, accepted, frame_findings, note)
+    log = replace(fitted.log, notes=(*fitted.log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     findings = errors or causes
     if not findings and not raw.estimated:
-        known_delay = None if source == "undetermined" else delay_s
+        known_delay = None if fitted.delay_source == "undetermined" else fitted.delay_s
         findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
-        findings = findings or other
-        if why is not None and unknown_acceleration and not result.identifiable.all():
-            findings = (*findings, explained_log.missing_acceleration_finding(why))
-    fitted_corrections = [
-        finding
-        for finding in (findings if findings == causes else ())
-        if finding.name not in CAUSES_WITHOUT_CORRECTION
-    ]
-    if misfit is not None and result.identifiable[6:].any():  # vibrations leave a large residual
-        misfit = misfit if fitted_corrections and misfit.is_residual_large else None
-    if misfit is not None and (fitted_corrections or not findings):
-        findings, causes = (explained_log.misfit_finding(misfit, fitted_corrections),), ()
+        findings = findings or frame_findings
+        if accepted and accepted.is_acceleration_missing and not result.identifiable.all():
+            findings = (*findings, explained_log.missing_acceleration_finding(accepted))
+    corrections = [x for x in causes if x.name not in CAUSES_WITHOUT_CORRECTION]
+    misfit = _unexplained_misfit(why, result, corrections)
+    if misfit is not None and (corrections or not findings):
+        findings, causes = (explained_log.misfit_finding(misfit, corrections),), ()
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
         result = result.with_unidentified_load()
-    determined, loads = base_parameters(fitted.fit.equations), () if why is None else why.loads
+    determined = base_parameters(fitted.fit.equations)
+    loads = () if accepted is None else accepted.loads
     if misfit is not None:
         result, loads = result.with_nothing_identified(), ()
         determined = BaseParameters((), (), (), ())
     return IdentifiedLog(
-        *(log, result, predicted, source, fitted.fit.rejected),
+        *(log, result, predicted, fitted.delay_source, fitted.fit.rejected),
         *(determined, findings, causes, loads),
-        delay_std_s=float("nan") if motion is None else motion.delay_std_s,
+        delay_std_s=float("nan") if fitted.motion is None else fitted.motion.delay_std_s,
     )
 
 
-def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
+def _read_and_fit_load(
+    path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
+) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
+    """Return the log as read, its load, and findings on its poses.
+
+    The load is fitted to splines of the poses if they allow it, otherwise to the motion as read.
+    """
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
+    fitted, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay)
+    if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
+        log = read_log(path, bandwidth_hz=cutoff_hz)
+    return log, fitted or _fit_load_to_motion(log, method, cutoff_hz, delay), frame_findings
+
+
+def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
+    if log.posed is None or log.posed.imu is not None or log.static:
+        return None
+    load, shown = fitted.fit.identification, fitted.log
+    residual = contact_wrench(shown.wrench, load.offsets, *shown.motion, load.phi)
+    if against_load.unexplained_share(shown.wrench, residual) < GOOD_UNEXPLAINED:
+        return None
+    splines = None if fitted.motion is None else fitted.motion.splines
+    return left_handed_pose_finding(shown, splines, fitted.delay_s)
+
+
+def _explain_residual(
+    log: Log, fitted: LoadFitOfLog, frame_findings: tuple[Finding, ...]
+) -> tuple[MisfitExplanation | None, str | None]:
+    """Return causes of the residual, or a text if the motion is too small for such causes.
+
+    Gain errors within the stated ones are no causes.
+    """
+    why = None
+    if _is_misfit_explainable(log, fitted.motion is not None):
+        why = explained_log.explain_log(log, fitted.delay_s, fitted.motion)
+    causes = () if why is None else why.causes
+    need_motion = any(x.name not in CAUSES_AT_REST for x in (*frame_findings, *causes))
+    if need_motion and (too_still := too_little_motion(log)) is not None:
+        return None, too_still
+    by_gains = log.gain_std > 0.0 and {x.name for x in causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
+    if why is not None and by_gains and not why.is_acceleration_missing:
+        why = replace(why, causes=(), explained=True, loads=())
+    return why, None
+
+
+def _correct_delay(
+    log: Log,
+    fitted: LoadFitOfLog,
+    frame_findings: tuple[Finding, ...],
+    why: MisfitExplanation,
+    method: str,
+    cutoff_hz: float | None,
+) -> tuple[LoadFitOfLog, tuple[Finding, ...]]:
+    """Return the load and the findings on poses with an estimated delay corrected by `why`.
+
+    Without acceleration a delay is undetermined, because an acceleration resembles one.
+    """
+    source, motion = fitted.delay_source, fitted.motion
+    if source != "estimated":
+        return fitted, frame_findings
+    delay_s = fitted.delay_s + why.delay_s
+    if why.is_acceleration_missing:
+        source, fitted = "undetermined", _fit_load_to_motion(log, method, cutoff_hz, 0.0)
+    elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S and motion is None:
+        fitted = _fit_load_to_motion(log, method, cutoff_hz, delay_s)
+    elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S:
+        again, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay_s)
+        fitted = again or fitted
+    return replace(fitted, delay_source=source, motion=motion), frame_findings
+
+
+def _errors_beside_the_load(
+    raw: Log,
+    fitted: LoadFitOfLog,
+    frame_findings: tuple[Finding, ...],
+    why: MisfitExplanation | None,
+    too_still: str | None,
+    check: Callable[[], ConventionCheckResult],
+) -> tuple[Finding, ...]:
+    """Return errors of motion or units, with which no load may be stated."""
+    errors = tuple(finding for finding in frame_findings if finding.name == "units")
+    if too_still is not None:
+        text = f"payload not identifiable: {too_still}; {MORE_MOTION_REMEDY}"
+        errors = (Finding("payload", text),)
+    elif not errors and why is not None and (why.is_misfit or why.causes):
+        passed = None if raw.static else high_pass_finding(fitted.log, fitted.delay_s)
+        errors = () if passed is None else (passed,)
+        if not errors and why.is_misfit and why.causes:
+            errors = motion_findings(check)
+    if raw.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
+        errors += tuple(edits.correct_accelerometer_unit(raw.described, fitted.log)[0])
+    return errors
+
+
+def _apply_explanation(
+    load: Identification,
+    raw: Log,
+    why: MisfitExplanation,
+    frame_findings: tuple[Finding, ...],
+    note: str,
+) -> tuple[Identification, tuple[Finding, ...], str]:
+    """Return the load fitted with the causes of `why`, these causes, and a note."""
+    causes = why.causes
+    if frame_findings:
+        causes = explained_log.replace_frame_causes(why, frame_findings[0])
+    if raw.estimated:
+        note = explained_log.removed_weight_note(why)
+    elif causes and not why.has_several_gains:
+        note = ""
+    return explained_log.apply_explanation_to_load(load, why), causes, note
+
+
+def _unexplained_misfit(
+    why: MisfitExplanation | None, load: Identification, corrections: list[Finding]
+) -> MisfitExplanation | None:
+    """Return `why` if its residual is neither noise nor an effect of unknown accelerations.
+
+    Vibrations may leave a large residual in a record that identifies the load.
+    """
+    if why is None or not why.is_misfit or why.is_acceleration_missing:
+        return None
+    if load.identifiable[6:].any() and not (corrections and why.is_residual_large):
+        return None
+    return why
+
+
+def _check_path_and_cutoff(path: Any, cutoff_hz: Any) -> None:
     expect_type((str, Path), path, "log", "give the file's name")
     if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_CUTOFF_HZ:
         remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no filter"
@@ -281,7 +378,7 @@ def _fit_load_to_motion(
     return LoadFitOfLog(log, fit, delay_s, source)
 
 
-def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
+def _is_misfit_explainable(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
     if log.static or (high - low <= _CONSTANT_CHANNEL_TOLERANCE * np.maximum(high, -low)).any():
         return False
@@ -302,6 +399,8 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
                 read_log(path)
                 return replace(checks, findings=(Finding("payload", str(error)),))
         return checks
+    if any(x.name in _NOTHING_IDENTIFIED_FINDINGS for x in identified.findings):
+        return replace(checks, findings=identified.findings)
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     no_load = any(cause.name == "no load" for cause in identified.causes)  # explains the record
@@ -374,7 +473,7 @@ def eliminate_log(
         DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
             static poses.
     """
-    _check_log_arguments(path, cutoff_hz)
+    _check_path_and_cutoff(path, cutoff_hz)
     if untouched_s is not None:
         start_s, stop_s = finite_array("untouched_s", untouched_s, 2).tolist()
         untouched_s = start_s, stop_s
@@ -383,7 +482,7 @@ def eliminate_log(
     identification = load if isinstance(load, Identification) else Identification.load(load)
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma}
     given |= {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _checked_scales(given, eta, gripper is not None)
+    scales = _resolve_force_scales(given, eta, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -399,8 +498,8 @@ def eliminate_log(
     reference = None
     if free is not None:
         free_motion = _read_and_eliminate_log(free, *common)
-        _require_motion(free_motion)
-        _require_motion(found)
+        _reject_static_log(free_motion)
+        _reject_static_log(found)
         free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
     if found.log.static:
@@ -419,7 +518,7 @@ def eliminate_log(
     return replace(found, detection=detection)
 
 
-def _require_motion(found: EliminatedLog) -> None:
+def _reject_static_log(found: EliminatedLog) -> None:
     if found.log.static:
         what = "contains only poses at rest (`static`), in which no contact can be detected"
         raise DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
@@ -465,7 +564,7 @@ def _read_and_eliminate_log(
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
-            return residual[_rows_in_span(shown, *untouched_s)].mean(axis=0), 1.0
+            return residual[_rows_in_tare_span(shown, *untouched_s)].mean(axis=0), 1.0
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
@@ -499,7 +598,7 @@ def _read_and_eliminate_log(
         inner: dict[str, Any] = {"contact": late.contact[known], "scaled": late.scaled[known]}
         causal_wrench = replace(late, offsets=causal_offsets, **inner)
     measured = log.wrench - offsets
-    findings = _findings_if_contact_is_large(Path(path), measured, contact, identification)
+    findings = _check_log_if_contact_is_large(Path(path), measured, contact, identification)
     notes = (*log.notes, *notes_on_undetermined_load(identification))
     # A wrong description would explain the clock, too.
     shown = replace(shown, notes=notes if findings else (*notes, *aligned.clock_notes))
@@ -522,7 +621,7 @@ def _read_and_eliminate_log(
     )
 
 
-def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
+def _rows_in_tare_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
         found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
@@ -568,7 +667,7 @@ def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
     )
 
 
-def _findings_if_contact_is_large(
+def _check_log_if_contact_is_large(
     path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
@@ -585,7 +684,7 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=where, remedy="use sigma alone; it scales the inertia")
 
 
-def _checked_scales(
+def _resolve_force_scales(
     given: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
     for name, value in given.items():
@@ -638,7 +737,7 @@ def detect_log(
     found = eliminate_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
-    _require_motion(found)
+    _reject_static_log(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
         remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"

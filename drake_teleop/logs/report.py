@@ -24,7 +24,7 @@ PARAMETER_FORMATS = (
     *(("I", axes, "g m²", 1e3) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
 """Symbol, index, printed unit and its factor from SI of the parameters of Eq. (7)."""
-_STYLE_OF_VERDICT = {"identified": "agrees", "not": "differs"}
+_CSS_CLASS_OF_VERDICT = {"identified": "agrees", "not": "differs"}
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
     for (symbol, index, unit, scale), values, verdict in zip(
         PARAMETER_FORMATS, columns, load.verdicts, strict=True
     ):
-        words, pill = VERDICT_WORDS[verdict], _STYLE_OF_VERDICT.get(verdict, "")
+        words, pill = VERDICT_WORDS[verdict], _CSS_CLASS_OF_VERDICT.get(verdict, "")
         texts = ("–", "", "")
         if verdict != "not" and np.isfinite(values).all():
             # Two digits of the uncertainty determine the decimals of the value.

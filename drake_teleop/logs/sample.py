@@ -46,7 +46,7 @@ _LINK_LENGTHS_M = 0.0, -0.425, -0.3922, 0.0, 0.0, 0.0
 _LINK_TWISTS_RAD = np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0
 HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
 _FOURIER_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])
-_NUM_RECORD_HARMONICS = 6
+_NUM_MOTION_HARMONICS = 6
 TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 """Load phi (10,) of the gripper."""
 
@@ -156,7 +156,7 @@ _Motion: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
 def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
     random = np.random.default_rng([2009, number])
-    return _random_motion(random, 0.5, _NUM_RECORD_HARMONICS, MOTION_PERIOD_S, REST_AT_ENDS_S)
+    return _random_motion(random, 0.5, _NUM_MOTION_HARMONICS, MOTION_PERIOD_S, REST_AT_ENDS_S)
 
 
 def _random_motion(
@@ -190,7 +190,7 @@ def sensor_motion(q: Array, qd: Array, qdd: Array) -> _Motion:
     return *(np.einsum("nji,nj->ni", R, x) for x in (s, omega, alpha)), R, p
 
 
-def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
+def _jittered_time_stamps(rate_hz: float, random: np.random.Generator) -> Array:
     t = np.arange(round((MOTION_PERIOD_S + 2 * REST_AT_ENDS_S) * rate_hz)) / rate_hz
     return t + _MAX_CLOCK_JITTER_S * random.uniform(0, 1, len(t))
 
@@ -200,7 +200,7 @@ def _write_record(
 ) -> None:
     from scipy.spatial.transform import Rotation
 
-    t, motion_at = _jittered_clock(WRENCH_HZ, random), _motion_of_record(row)
+    t, motion_at = _jittered_time_stamps(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
     wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_OFFSETS[row]
     for touch in pushes:
@@ -208,7 +208,7 @@ def _write_record(
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
     _write_columns(out / f"{name}_wrench.csv", "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading])
-    t = _jittered_clock(POSE_HZ, random)
+    t = _jittered_time_stamps(POSE_HZ, random)
     _, _, _, R_WS, p_WS = motion_at(t - POSE_DELAY_S)
     turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
     columns = [t + CLOCK_START_S, 1e3 * p_WS, turn]

@@ -72,12 +72,12 @@ class DelayTracker:
         self._noise = white_wrench_noise(load, dt, cutoff_hz)
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
         self._wrenches = np.zeros((3, 6))
-        self._reset_estimate(-math.inf)
+        self._reset_delay_estimate(-math.inf)
         # Load compiled code before the first sample.
         self.update_delay((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
-        self._reset_estimate(-math.inf)
+        self._reset_delay_estimate(-math.inf)
 
-    def _reset_estimate(self, t: float) -> None:
+    def _reset_delay_estimate(self, t: float) -> None:
         self._t = self._fitted = t
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
         self._delay_error = MAX_DELAY_ERROR_BEFORE_ESTIMATE_S
@@ -92,7 +92,7 @@ class DelayTracker:
             return
         # Another clock, or no explained sample for long.
         if not 0.0 <= t - self._fitted < DELAY_FORGETTING_TIME_S:
-            self._reset_estimate(t)
+            self._reset_delay_estimate(t)
             elapsed = 0.0
         self._t = t
         for row, (_, motion) in zip(self._wrenches, (at, before, after), strict=True):
@@ -118,7 +118,7 @@ class DelayTracker:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
         return bool((np.abs(residual - offsets) < limit).all())
 
-    def _slew_delay(self, elapsed: float) -> None:
+    def _slew_delay(self, elapsed_s: float) -> None:
         if self._samples < _MIN_DELAY_SAMPLES:
             return
         g, r, gg, gr, rr = self._sums / self._count
@@ -130,7 +130,7 @@ class DelayTracker:
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
         self._delay_error = MAX_DELAY_ERROR_BEFORE_ESTIMATE_S
         if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
-            max_change = MAX_DELAY_SLEW * elapsed
+            max_change = MAX_DELAY_SLEW * elapsed_s
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
             tracked = MAX_DELAY_ERROR_AFTER_ESTIMATE_S + abs(correction)
@@ -142,7 +142,7 @@ IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
 """Identity: the sensor's frame is the posed frame."""
 _STREAM_BUFFER_S = 0.5  # buffer of motions and wrenches
 _MIN_MOTION_PERIOD_S, _MAX_TIME_STAMP_S, _MAX_MOTION_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
-_MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
+_NUM_SAMPLES_FOR_MOTION_PERIOD = 20  # for the median period of the motion
 
 
 class ArmKinematics(Protocol):
@@ -199,7 +199,7 @@ class WrenchAndMotionStreams(Source):
         arm = self._arm
         if arm is None:
             return found
-        return [_pose_of_joints(each, arm) for each in found if each.stream != POSE]
+        return [_convert_joints_to_pose(each, arm) for each in found if each.stream != POSE]
 
     def close(self) -> None:
         self._wrench.close()
@@ -207,7 +207,7 @@ class WrenchAndMotionStreams(Source):
             self._motion.close()
 
 
-def _pose_of_joints(reading: Reading, arm: ArmKinematics) -> Reading:
+def _convert_joints_to_pose(reading: Reading, arm: ArmKinematics) -> Reading:
     if reading.stream != JOINTS:
         return reading
     values = np.full(7, np.nan)  # an invalid pose, rejected later
@@ -237,9 +237,9 @@ class MotionWindow:
         self._next_t, self._rows = 0.0, deque[Array](maxlen=self._size)
         self._arrival = -math.inf
 
-    def _measure_period(self, step: float) -> None:
-        self._steps.append(step)
-        if len(self._steps) == _MOTION_PERIOD_MEDIAN_SAMPLES:
+    def _update_motion_period(self, step_s: float) -> None:
+        self._steps.append(step_s)
+        if len(self._steps) == _NUM_SAMPLES_FOR_MOTION_PERIOD:
             self._dt = float(np.median(self._steps))
             self._weights = polynomial_fit_weights(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
@@ -247,7 +247,7 @@ class MotionWindow:
 
     def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
         """Add a sample; return new times [s], motions [s, omega, alpha, gravity (of poses)]."""
-        row = self._row_of_valid_motion(sample)
+        row = self._motion_row_if_valid(sample)
         if row is None:
             return []
         last = self._last
@@ -255,7 +255,7 @@ class MotionWindow:
         if step <= 0.0 and sample.arrival - self._arrival <= STALE_AGE_S:
             return []  # out of order or repeated
         if not self._dt and _MIN_MOTION_PERIOD_S <= step <= STALE_AGE_S:
-            self._measure_period(step)
+            self._update_motion_period(step)
         if self._last is None or not 0.0 < step <= STALE_AGE_S:
             self.reset()
             self._next_t, last = sample.t, (sample.t, row)
@@ -271,7 +271,7 @@ class MotionWindow:
             self._next_t += self._dt
         return found
 
-    def _row_of_valid_motion(self, sample: Reading) -> Array | None:
+    def _motion_row_if_valid(self, sample: Reading) -> Array | None:
         values = sample.values
         plausible = abs(sample.t) < _MAX_TIME_STAMP_S and (np.abs(values) < _MAX_MOTION_VALUE).all()
         if sample.flags or not plausible:
@@ -366,7 +366,7 @@ class ReadingAssembler(Source):
             for t, motion in self._window.motions_completed_by(sample):
                 self._store_motion(t + shift, motion)
         found = []
-        while self._pending and (reading := self._complete_reading(self._pending[0])) is not None:
+        while self._pending and (reading := self._assemble_reading(self._pending[0])) is not None:
             self._pending.popleft()
             found.append(reading)
         return found
@@ -382,7 +382,7 @@ class ReadingAssembler(Source):
             while t - motions[0][0] > _STREAM_BUFFER_S:
                 motions.popleft()
 
-    def _complete_reading(self, sample: Reading) -> Reading | None:
+    def _assemble_reading(self, sample: Reading) -> Reading | None:
         values, flags, motions = np.zeros(NUM_READING_VALUES), sample.flags, self._motions
         values[:6] = sample.values
         if not math.isfinite(sample.t):

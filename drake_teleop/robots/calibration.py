@@ -168,7 +168,7 @@ def advise_motion(
 
 
 def _information_of_advised_motions(
-    up: Array, noise: Array, rate: float
+    up: Array, noise_std: Array, rate_hz: float
 ) -> Iterator[tuple[str, Array]]:
     s0 = _GRAVITY_M_S2 * up / max(float(np.linalg.norm(up)), 1e-9)
     t = np.arange(_ADVISED_MOTION_SAMPLES) * (_ADVISED_MOTION_S / _ADVISED_MOTION_SAMPLES)
@@ -186,8 +186,8 @@ def _information_of_advised_motions(
             )
             V = regressor(s, np.outer(speed, e), np.outer(change, e))
             rows = np.concatenate([np.tile(np.eye(6), (_ADVISED_MOTION_SAMPLES, 1, 1)), V], axis=2)
-            rows = (rows / noise[:, np.newaxis]).reshape(-1, 16)
-            share = rate * _ADVISED_MOTION_S / _ADVISED_MOTION_SAMPLES
+            rows = (rows / noise_std[:, np.newaxis]).reshape(-1, 16)
+            share = rate_hz * _ADVISED_MOTION_S / _ADVISED_MOTION_SAMPLES
             yield words.format(axis=axis), share * (rows.T @ rows)
 
 

@@ -26,8 +26,8 @@ TESTED_RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
 MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
-_TEST_TRIGGER_FLAGS = int(streams.ReadingFlag.IN_CONTACT | streams.ReadingFlag.OTHER_LOAD)
-_UNTESTED_READING_FLAGS = ~int(streams.NONZERO_WRENCH_FLAGS)
+_CHANGE_TEST_TRIGGER_FLAGS = int(streams.ReadingFlag.IN_CONTACT | streams.ReadingFlag.OTHER_LOAD)
+_FLAGS_EXCLUDED_FROM_TEST = ~int(streams.NONZERO_WRENCH_FLAGS)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_TEST_SPACING_S, _MAX_PAUSE_IN_FLAGGED_TIME_S, _MIN_REPORTED_CHANGE_SPACING_S = 10.0, 1.0, 1.0
 _MIN_TESTED_RECORD_S, _KIND_LIKELIHOOD_RATIO = 4.0, 40.0
@@ -51,7 +51,7 @@ class ZeroAndLoadMonitor:
         self._reported: list[float] = []
 
     def add_reading(self, reading: streams.Reading, output_flags: int) -> None:
-        if output_flags & _UNTESTED_READING_FLAGS:
+        if output_flags & _FLAGS_EXCLUDED_FROM_TEST:
             return
         if not 0.0 < reading.t - self._last < MIN_CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
@@ -59,7 +59,7 @@ class ZeroAndLoadMonitor:
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
         self._count += 1
-        if output_flags & _TEST_TRIGGER_FLAGS:
+        if output_flags & _CHANGE_TEST_TRIGGER_FLAGS:
             self._last_flagged = t
             if self._flagged_since > t:
                 self._flagged_since, self._next_attempt = t, t + MIN_FLAGGED_TIME_S
@@ -68,8 +68,8 @@ class ZeroAndLoadMonitor:
         if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
             spacing_s = max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since))
             self._next_attempt = t + min(spacing_s, _MAX_TEST_SPACING_S)
-            find = _find_changes_in_process if self._live else find_zero_and_load_changes
-            self._pending = self._executor.submit(find, self._recorded_rows(), self._dt)
+            find = _find_changes_in_subprocess if self._live else find_zero_and_load_changes
+            self._pending = self._executor.submit(find, self._rows_in_time_order(), self._dt)
         if self._pending is not None and (self._pending.done() or not self._live):
             self._report_changes(self._pending)
             self._pending = None
@@ -80,7 +80,7 @@ class ZeroAndLoadMonitor:
             self._report_changes(self._pending)
         self._executor.shutdown()
 
-    def _recorded_rows(self) -> Array:
+    def _rows_in_time_order(self) -> Array:
         first = self._count % len(self._rows)
         if self._count <= len(self._rows):
             return self._rows[: self._count].copy()
@@ -98,7 +98,7 @@ class ZeroAndLoadMonitor:
                 self._report(words)
 
 
-def _find_changes_in_process(rows: Array, dt: float) -> list[TimedChangeText]:
+def _find_changes_in_subprocess(rows: Array, dt: float) -> list[TimedChangeText]:
     done = subprocess.run(
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),

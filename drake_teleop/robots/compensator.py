@@ -38,22 +38,22 @@ TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
 SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 """Arguments of `Compensator.set_scales`."""
-_MAX_FORCE_AND_TORQUE_DRIFT = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
-MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_FORCE_AND_TORQUE_DRIFT, 3)
+_MAX_OFFSET_DRIFTS_N_AND_NM = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
+MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_OFFSET_DRIFTS_N_AND_NM, 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_CHECK_READINGS, _RATE_CHECK_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_STAMP_S = 1e12  # [s]
 _ZERO_GRAVITY = np.zeros(3)
-_MAX_READING_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
+_MAX_ABS_READING_VALUES_SI = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `ReadingFlag` takes a microsecond.
 _DAMAGED_FLAG = int(ReadingFlag.DAMAGED)
 _STALE_FLAG = int(ReadingFlag.STALE)
 _CLIPPED_FLAG = int(ReadingFlag.CLIPPED)
-_NONZERO_WRENCH_FLAGS = int(NONZERO_WRENCH_FLAGS)
-_GAP_FLAG = int(ReadingFlag.GAP)
+_FLAGS_WITH_NONZERO_OUTPUT_WRENCH = int(NONZERO_WRENCH_FLAGS)
+_INTERPOLATED_GAP_FLAG = int(ReadingFlag.GAP)
 _WRONG_RATE_FLAG = int(ReadingFlag.WRONG_RATE)
 _IN_CONTACT_FLAG = int(ReadingFlag.IN_CONTACT)
-_FLAG_OF_PROBLEM = {
+_FLAG_OF_READING_PROBLEM = {
     kernel.VALUE_NOT_FINITE: ReadingFlag.NOT_FINITE,
     kernel.VALUE_TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
     kernel.VALUE_AT_RANGE: ReadingFlag.SATURATED,
@@ -63,7 +63,7 @@ _FLAG_OF_PROBLEM = {
 _MAX_REST_WRENCH_RMS_OVER_RESIDUAL, _MIN_REST_WRENCH_RMS_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
-class _RateCheck:
+class _ReadingRateCheck:
     def __init__(self, dt: float) -> None:
         self._dt, self._readings = dt, max(_RATE_CHECK_READINGS, round(_RATE_CHECK_S / dt))
         self._start_t, self._start_number = 0.0, 0
@@ -117,7 +117,7 @@ class Compensator:
             ahead = self.lag_s if predicted else 0.0
             self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if sensor_range is None else np.array(sensor_range, float)
-        self._largest = _MAX_READING_VALUES.copy()
+        self._largest = _MAX_ABS_READING_VALUES_SI.copy()
         self._largest[:6] = np.minimum(self._largest[:6], 2.0 * self._range)
         noise_limit = _MAX_REST_WRENCH_RMS_OVER_RESIDUAL * load.residual_rms
         self._noise_limit = np.maximum(noise_limit, _MIN_REST_WRENCH_RMS_LIMIT)
@@ -126,14 +126,14 @@ class Compensator:
         self._number, self._t, self._now = -1, 0.0, -math.inf
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
-        self._rate = _RateCheck(dt)
+        self._rate = _ReadingRateCheck(dt)
         self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_READING_VALUES + 6))
         self.good_readings_in_row = 0
         # Load compiled code now; otherwise the first readings would be stale.
         values = np.zeros(NUM_READING_VALUES)
         kernel.reading_problem(values, self._largest, self._range)
         kernel.clip_wrenches(self._contact_and_scaled_wrench(values, _ZERO_GRAVITY), self._range)
-        self._tare_problem_step_and_offsets()
+        self._check_tare_and_calc_new_offsets()
         self._reset_filters()
         self.good_readings_in_row = 0
 
@@ -173,16 +173,16 @@ class Compensator:
 
     def step(self, reading: Reading, now: float) -> CompensatedWrench:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
-        flags = self._reading_flags(reading, now)
-        invalid = flags & ~_NONZERO_WRENCH_FLAGS
-        if invalid & ~_GAP_FLAG:
-            return self._zero_output(flags)
+        flags = self._check_reading_and_update_clock(reading, now)
+        invalid = flags & ~_FLAGS_WITH_NONZERO_OUTPUT_WRENCH
+        if invalid & ~_INTERPOLATED_GAP_FLAG:
+            return self._make_zero_wrench(flags)
         if now - self._now > STALE_AGE_S:
             self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
         self._delay_line.append(self._contact_and_scaled_wrench(reading.values, reading.gravity))
         if invalid:
-            return self._zero_output(flags)
+            return self._make_zero_wrench(flags)
         if self._watch is not None:
             flags |= self._watch.reading_flags(reading.values)
         if self._detector is not None:
@@ -195,7 +195,7 @@ class Compensator:
 
     def stale_output(self, now: float) -> CompensatedWrench | None:
         """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
-        return self._zero_output(_STALE_FLAG) if now - self._now > STALE_AGE_S else None
+        return self._make_zero_wrench(_STALE_FLAG) if now - self._now > STALE_AGE_S else None
 
     def time_to_stale(self, now: float) -> float:
         return max(0.0, self._now + STALE_AGE_S - now)
@@ -204,7 +204,7 @@ class Compensator:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_readings_in_row < len(self._tare_rows):
             return f"refused: fewer than {TARE_REST_S:g} s of valid readings so far"
-        problem, step, offsets = self._tare_problem_step_and_offsets()
+        problem, step, offsets = self._check_tare_and_calc_new_offsets()
         if problem == kernel.TARE_IN_MOTION:
             return "refused: the sensor moves"
         if problem == kernel.TARE_WRENCH_VARIES:
@@ -223,7 +223,7 @@ class Compensator:
         self.good_readings_in_row = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
-    def _tare_problem_step_and_offsets(self) -> tuple[int, Array, Array]:
+    def _check_tare_and_calc_new_offsets(self) -> tuple[int, Array, Array]:
         (mean, squares), offsets = np.zeros((2, NUM_READING_VALUES + 6)), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             kernel.add_to_statistics(row, float(number), mean, squares)
@@ -231,7 +231,7 @@ class Compensator:
         problem = kernel.update_tare_offsets(count, mean, squares, self._noise_limit, offsets)
         return problem, mean[NUM_READING_VALUES:], offsets
 
-    def _reading_flags(self, reading: Reading, now: float) -> int:
+    def _check_reading_and_update_clock(self, reading: Reading, now: float) -> int:
         flags = reading.flags
         if flags & _DAMAGED_FLAG:
             return _DAMAGED_FLAG
@@ -241,7 +241,7 @@ class Compensator:
         elif abs(reading.t) > _MAX_TIME_STAMP_S and problem != kernel.VALUE_NOT_FINITE:
             problem = kernel.VALUE_TOO_LARGE
         if problem:
-            flags |= int(_FLAG_OF_PROBLEM[problem])
+            flags |= int(_FLAG_OF_READING_PROBLEM[problem])
         if problem in (kernel.VALUE_NOT_FINITE, kernel.VALUE_TOO_LARGE):
             return flags
         ahead = now - reading.t
@@ -250,28 +250,28 @@ class Compensator:
         # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
         lost = now - self._now > STALE_AGE_S
         if started and reading.number <= self._number and (abs(step) > MIN_CLOCK_JUMP_S or lost):
-            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
+            return self._reset_clock_to_reading(reading, ahead, flags | int(ReadingFlag.RESTART))
         if started and (abs(ahead - self._min_offset) > MIN_CLOCK_JUMP_S or (step <= 0.0 and lost)):
-            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
+            return self._reset_clock_to_reading(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         if started and step <= 0.0:
             return flags | int(ReadingFlag.REORDERED)
         if started and reading.number <= self._number:
-            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
+            return self._reset_clock_to_reading(reading, ahead, flags | int(ReadingFlag.RESTART))
         drift = MAX_CLOCK_DRIFT * self._dt if started else 0.0
         self._min_offset = min(ahead, self._min_offset + drift)
         if ahead - self._min_offset <= STALE_AGE_S:
             self._last_in_time = now
         elif now - self._last_in_time > MIN_CLOCK_JUMP_S:
-            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
+            return self._reset_clock_to_reading(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         else:
             flags |= _STALE_FLAG
         return flags | self._rate.wrong_rate_flag(reading)
 
-    def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
-        self._min_offset, self._number, self._t = ahead, reading.number, reading.t
+    def _reset_clock_to_reading(self, reading: Reading, offset_s: float, flags: int) -> int:
+        self._min_offset, self._number, self._t = offset_s, reading.number, reading.t
         self._rate.reset()
         self.good_readings_in_row = 0
-        self._now = self._last_in_time = reading.t + ahead
+        self._now = self._last_in_time = reading.t + offset_s
         self._reset_filters()
         return flags
 
@@ -295,6 +295,6 @@ class Compensator:
         self.good_readings_in_row += 1
         return out
 
-    def _zero_output(self, flags: int) -> CompensatedWrench:
+    def _make_zero_wrench(self, flags: int) -> CompensatedWrench:
         self.good_readings_in_row, number = 0, max(0, self._number)
         return CompensatedWrench(number, self._t, np.zeros(6), np.zeros(6), int(flags))

@@ -21,7 +21,7 @@ from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import UdpSink, UdpSource, UdpWrenchPoseSource
 
 _REPLAY_PREFIX = "replay:"
-_PLACEHOLDER_RATE_HZ = 1000.0
+_UNUSED_RATE_OF_STAMPED_SOURCES_HZ = 1000.0
 
 
 def open_source(
@@ -49,7 +49,7 @@ def open_source(
         _refuse_motion_options(address, **motion_options)
         path = address.removeprefix(_REPLAY_PREFIX)
         return ReplayLogSource(path, load, cutoff_hz=cutoff_hz, delay=delay, real_time=real_time)
-    source = _open_streams(address, rate_hz, **motion_options)
+    source = _open_wrench_and_motion_source(address, rate_hz, **motion_options)
     weight_removed = load is not None and load.weight_removed
     if not isinstance(source, assembly.WrenchAndMotionStreams):
         if weight_removed:
@@ -64,7 +64,7 @@ def open_source(
         cutoff_hz=cutoff_hz,
         delay_s=delay,
         track=track,
-        X_FS=_pose_from_option(motion_options.get("sensor_pose")),
+        X_FS=_sensor_pose_from_option(motion_options.get("sensor_pose")),
         weight_removed=weight_removed,
     )
 
@@ -78,10 +78,10 @@ def open_source_and_recorder(
         source = open_source(address, None, real_time=real_time, **motion_options)
         return source, Recorder(sensor_range=sensor_range)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _PLACEHOLDER_RATE_HZ
-    source = _open_streams(address, rate_hz, **motion_options)
+    rate_hz = None if kind == "netft" else _UNUSED_RATE_OF_STAMPED_SOURCES_HZ
+    source = _open_wrench_and_motion_source(address, rate_hz, **motion_options)
     two_clocks = isinstance(source, assembly.WrenchAndMotionStreams) and source.two_clocks
-    X_FS = _pose_from_option(motion_options.get("sensor_pose"))
+    X_FS = _sensor_pose_from_option(motion_options.get("sensor_pose"))
     return source, Recorder(source.streams, sensor_range, X_FS, two_clocks=two_clocks)
 
 
@@ -92,12 +92,12 @@ def is_file_address(address: str) -> bool:
 def open_sink(address: str) -> Sink:
     kind = _address_scheme(address) or Path(address).suffix
     if kind not in SINKS:
-        remedy = f"give {_address_forms(SINKS)}"
+        remedy = f"give {_list_address_prefixes(SINKS)}"
         raise DrakeTeleopError("is not the address of a sink", where=address, remedy=remedy)
     return SINKS[kind](address)
 
 
-def _address_forms(table: Registry[Any]) -> str:
+def _list_address_prefixes(table: Registry[Any]) -> str:
     return ", ".join(f"{name}://" if name[0].isalnum() else name for name in table)
 
 
@@ -121,7 +121,7 @@ def _refuse_motion_options(address: str, **motion_options: Any) -> None:
         raise DrakeTeleopError(what, where=address, remedy=f"remove {' and '.join(given)}")
 
 
-def _open_streams(
+def _open_wrench_and_motion_source(
     address: str,
     rate_hz: float | None,
     *,
@@ -152,12 +152,12 @@ def _open_registered_source(address: str, rate_hz: float | None, joints: tuple[s
     kind = _address_scheme(address)
     if kind not in SOURCES:
         other = "" if kind == "replay" else ", or replay:LOG"  # a log has no separate motion
-        remedy = f"give {_address_forms(SOURCES)}{other}"
+        remedy = f"give {_list_address_prefixes(SOURCES)}{other}"
         raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
     return SOURCES[kind](address, rate_hz, joints)
 
 
-def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
+def _sensor_pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return assembly.IDENTITY_POSE if sensor_pose is None else assembly.pose_from_rpy(sensor_pose)
 
 

@@ -120,7 +120,7 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
     return [*warnings, format.note] if format.note else warnings
 
 
-def _make_template_writer(name: str) -> Callable[[ExportedLoad], str]:
+def _make_template_renderer(name: str) -> Callable[[ExportedLoad], str]:
     def numbers(values: Iterable[float], separator: str = ", ") -> str:
         return separator.join(repr(float(value) + 0.0) for value in values)
 
@@ -137,20 +137,20 @@ def _make_template_writer(name: str) -> Callable[[ExportedLoad], str]:
     return write
 
 
-_SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
-_SENSOR_FORMAT_OPTIONS: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
-_SHIPPED_FORMATS: dict[str, dict[str, Any]] = {
+_RENAME_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
+_DEFAULTS_OF_SENSOR_FORMATS: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
+_FORMAT_OPTIONS: dict[str, dict[str, Any]] = {
     "ur": {"comment": "#"},
     "franka": {"note": "transformation is the identity: use that of your end effector"},
     "xarm": {"inertia": False, "comment": "#"},
     "kth": {
-        **_SENSOR_FORMAT_OPTIONS,
+        **_DEFAULTS_OF_SENSOR_FORMATS,
         "offsets": True,
-        "note": f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+        "note": f"{_RENAME_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
         " compensated force is twice the weight, change the sign of the mass",
     },
-    "ft_tools": _SENSOR_FORMAT_OPTIONS | {"offsets": True},
-    "ros2-admittance": _SENSOR_FORMAT_OPTIONS | {"note": _SENSOR_FRAME_NOTE},
+    "ft_tools": _DEFAULTS_OF_SENSOR_FORMATS | {"offsets": True},
+    "ros2-admittance": _DEFAULTS_OF_SENSOR_FORMATS | {"note": _RENAME_FRAME_NOTE},
     "bota": {
         "of_sensor": True,
         "offsets": True,
@@ -162,7 +162,7 @@ _SHIPPED_FORMATS: dict[str, dict[str, Any]] = {
 }
 FORMATS = Registry(
     "export format",
-    {name: Format(_make_template_writer(name), **each) for name, each in _SHIPPED_FORMATS.items()},
+    {name: Format(_make_template_renderer(name), **each) for name, each in _FORMAT_OPTIONS.items()},
     Format,
 )
 """Export formats by name."""

@@ -28,11 +28,11 @@ class _WrenchChannelSink:
         options = {"schema": json.loads(schema.read_bytes()), "context": self._context}
         self._channel = foxglove.Channel(WRENCH_TOPIC, **options)
 
-    def _log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
+    def _log_wrench(self, out: CompensatedWrench, time_ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
-        self._channel.log(json.dumps(data).encode(), log_time=ns)
+        self._channel.log(json.dumps(data).encode(), log_time=time_ns)
 
 
 class FoxgloveSink(_WrenchChannelSink):

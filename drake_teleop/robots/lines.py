@@ -112,16 +112,16 @@ class TableSink:
     def write(self, out: CompensatedWrench) -> None:
         self._rows.append(out)
         if time.monotonic() >= self._due:
-            self._write_rows()
+            self._write_buffered_rows()
 
     def close(self) -> None:
         if self._rows or not self._written:
-            self._write_rows()
+            self._write_buffered_rows()
 
-    def _write_rows(self) -> None:
+    def _write_buffered_rows(self) -> None:
         import polars as pl
 
-        rows, table = len(self._rows), pl.DataFrame(self._buffered_columns())
+        rows, table = len(self._rows), pl.DataFrame(self._columns_of_buffered_wrenches())
         if not self._written:
             files.remove_log(self._path)
         if self._path.suffix == ".parquet":
@@ -142,7 +142,7 @@ class TableSink:
         del self._rows[:rows]
         self._due = time.monotonic() + self._period
 
-    def _buffered_columns(self) -> dict[str, np.ndarray]:
+    def _columns_of_buffered_wrenches(self) -> dict[str, np.ndarray]:
         rows = self._rows
         columns = {
             "t": np.array([row.t for row in rows], float),

@@ -20,7 +20,7 @@ REQUEST_FORMAT = struct.Struct(">HHI")
 RECORD_FORMAT = struct.Struct(">III6i")
 """RDT sequence, F/T sequence, status, and the wrench in counts."""
 START_COMMAND, STOP_COMMAND = 2, 0
-_REQUEST_HEADER = 0x1234
+_RDT_REQUEST_HEADER = 0x1234
 _SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
 _STREAM_REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
 _MAX_RECORDS_PER_CALL = 256
@@ -40,7 +40,7 @@ class NetFtSource(Source):
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
-            page = _read_counts_and_rate(parsed)
+            page = _fetch_counts_per_unit_and_rate(parsed)
             counts, rate = counts or page[:2], rate or page[2:]
         self.dt = 1.0 / rate[0]
         self._per_count = sign / np.repeat(counts, 3)
@@ -95,14 +95,14 @@ class NetFtSource(Source):
 
     def _send_command(self, command: int) -> None:
         with suppress(OSError):  # no box yet
-            self._socket.send(REQUEST_FORMAT.pack(_REQUEST_HEADER, command, 0))
+            self._socket.send(REQUEST_FORMAT.pack(_RDT_REQUEST_HEADER, command, 0))
 
     def close(self) -> None:
         self._send_command(STOP_COMMAND)
         self._socket.close()
 
 
-def _read_counts_and_rate(address: Address) -> list[float]:
+def _fetch_counts_per_unit_and_rate(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
     connection = HTTPConnection(address.host, timeout=_SETTINGS_PAGE_TIMEOUT_S)
@@ -133,7 +133,7 @@ def parse_counts_and_rate(content: bytes) -> list[float]:
 
 
 _MIN_PERIOD_MEASUREMENT_S, _MAX_PERIOD_MEASUREMENT_S = 1.0, 10.0  # span of our clock
-_SAMPLE_NUMBER_RESTART_STEP_S = 1.0  # a larger step of the number is a restart
+_MAX_SAMPLE_NUMBER_STEP_S = 1.0  # a larger step of the number is a restart
 
 
 class SampleClock:
@@ -150,7 +150,7 @@ class SampleClock:
     def time_of_sample(self, number: int, now: float) -> float:
         """Return the time [s] of a sample received at `now` [s] of a monotonic clock."""
         step = number - self._number
-        if self._first is None or abs(step) * self._dt > _SAMPLE_NUMBER_RESTART_STEP_S:
+        if self._first is None or abs(step) * self._dt > _MAX_SAMPLE_NUMBER_STEP_S:
             self._first = number, now
         elif now - self._first[1] >= _MIN_PERIOD_MEASUREMENT_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])

@@ -28,7 +28,7 @@ from drake_teleop.robots.streams import (
     ReadingFlag,
 )
 
-_UNRECORDED_READING_FLAGS = (
+_FLAGS_OF_REJECTED_READINGS = (
     ReadingFlag.DAMAGED
     | ReadingFlag.NOT_FINITE
     | ReadingFlag.OUT_OF_RANGE
@@ -45,7 +45,7 @@ _LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
 }
 _GRAVITY_M_S2 = 9.81  # as in `compensate`
 _QUATERNION_NORM_TOLERANCE = 0.01
-_NEW_CLOCK_CONFIRMATION_SAMPLES = 50  # successive samples that confirm another clock
+_NUM_SAMPLES_THAT_CONFIRM_NEW_CLOCK = 50  # successive samples that confirm another clock
 
 
 class Recorder:
@@ -80,10 +80,10 @@ class Recorder:
         self.log_file_name = "log.yaml" if tables else "log.parquet"
         self.file_names = self.log_file_name, *(f"{each}.parquet" for each in tables)
         self.left_out, self.clock_changes = 0, 0
-        self._part, self._other_clock = self._make_empty_part(), self._make_empty_part()
+        self._part, self._other_clock = self._make_empty_record(), self._make_empty_record()
         self._longest = self._part
 
-    def _make_empty_part(self) -> dict[str, _SampleSeries]:
+    def _make_empty_record(self) -> dict[str, _SampleSeries]:
         return {stream: _SampleSeries() for stream in self._streams}
 
     def add(self, reading: Reading) -> None:
@@ -91,7 +91,7 @@ class Recorder:
         if stream not in self._part:
             return
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
-        valid = finite and not reading.flags & _UNRECORDED_READING_FLAGS
+        valid = finite and not reading.flags & _FLAGS_OF_REJECTED_READINGS
         if stream == POSE:
             valid &= abs(float(np.linalg.norm(values[:4])) - 1.0) < _QUATERNION_NORM_TOLERANCE
         elif stream in (WRENCH, WRENCH_AND_MOTION):
@@ -105,22 +105,22 @@ class Recorder:
             self.left_out += len(other.t)
             other = self._other_clock[stream] = _SampleSeries()
         self.left_out += not (samples if same_clock else other).add_if_newer(reading)
-        if len(other.t) == _NEW_CLOCK_CONFIRMATION_SAMPLES:
+        if len(other.t) == _NUM_SAMPLES_THAT_CONFIRM_NEW_CLOCK:
             self.clock_changes += 1
-            self._longest = self._longest_part()
-            self._part, self._other_clock = self._other_clock, self._make_empty_part()
+            self._longest = self._longest_record()
+            self._part, self._other_clock = self._other_clock, self._make_empty_record()
 
-    def _longest_part(self) -> dict[str, _SampleSeries]:
-        return max(self._part, self._longest, key=_min_stream_duration_s)
+    def _longest_record(self) -> dict[str, _SampleSeries]:
+        return max(self._part, self._longest, key=_duration_of_shortest_stream_s)
 
     @property
     def longest_part_s(self) -> float:
-        return _min_stream_duration_s(self._longest_part())
+        return _duration_of_shortest_stream_s(self._longest_record())
 
     def write(self, path: Path) -> None:
         import polars as pl
 
-        part = self._longest_part()
+        part = self._longest_record()
         if WRENCH_AND_MOTION in part:
             t, values = part[WRENCH_AND_MOTION].times_and_values(NUM_READING_VALUES, self.left_out)
             wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
@@ -133,9 +133,9 @@ class Recorder:
             t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + (shift - start)} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
-        write_text(path, to_yaml_text(self._log_description()))
+        write_text(path, to_yaml_text(self._make_log_description()))
 
-    def _log_description(self) -> dict[str, Any]:
+    def _make_log_description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY_M_S2}
         for stream in self._streams:
             found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}}
@@ -173,5 +173,5 @@ class _SampleSeries:
         return np.array(self.t), np.array(self._values).reshape(-1, width)
 
 
-def _min_stream_duration_s(part: dict[str, _SampleSeries]) -> float:
-    return min(samples.t[-1] - samples.t[0] if samples.t else 0.0 for samples in part.values())
+def _duration_of_shortest_stream_s(record: dict[str, _SampleSeries]) -> float:
+    return min(samples.t[-1] - samples.t[0] if samples.t else 0.0 for samples in record.values())

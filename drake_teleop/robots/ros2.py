@@ -92,9 +92,9 @@ class MessageConverter:
     def readings_of_message(self, name: str, data: Any, number: int) -> list[Reading]:
         """Return the readings of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
         if name == "tf":
-            samples = self._pose_from_transforms(data)
+            samples = self._stamped_poses_of_transforms(data)
         else:
-            values = self._message_values(name, data)
+            values = self._reading_values_of_message(name, data)
             samples = [] if values is None else [(data.header.stamp, values)]
         stream = _STREAM_OF_TOPIC.get(name, name)
         return [
@@ -108,7 +108,7 @@ class MessageConverter:
             link = _pose_array(each.transform.translation, each.transform.rotation)
             self._links[each.child_frame_id] = each.header.frame_id, link
 
-    def _message_values(self, name: str, data: Any) -> Array | None:
+    def _reading_values_of_message(self, name: str, data: Any) -> Array | None:
         if name == WRENCH:
             return self._sign * _concatenate_xyz(data.wrench.force, data.wrench.torque)
         if name == POSE:
@@ -120,7 +120,7 @@ class MessageConverter:
             return np.array([positions[joint] for joint in self._joints], float)
         return _concatenate_xyz(data.linear_acceleration, data.angular_velocity)
 
-    def _pose_from_transforms(self, data: Any) -> list[tuple[Any, Array]]:
+    def _stamped_poses_of_transforms(self, data: Any) -> list[tuple[Any, Array]]:
         newest = {each.child_frame_id: each for each in data.transforms}
         self.add_transforms(data)
         if not self._frames:
@@ -147,10 +147,10 @@ def _pose_array(p: Any, q: Any) -> Array:
     return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
 
 
-def _compose_poses(a: Array, b: Array) -> Array:
-    q = tuple(a[:4].tolist())
-    p = rotate_vector(q, tuple(b[4:].tolist()))
-    return np.array([*quaternion_product(q, tuple(b[:4].tolist())), *(a[4:] + p)])
+def _compose_poses(X_AB: Array, X_BC: Array) -> Array:
+    q = tuple(X_AB[:4].tolist())
+    p = rotate_vector(q, tuple(X_BC[4:].tolist()))
+    return np.array([*quaternion_product(q, tuple(X_BC[:4].tolist())), *(X_AB[4:] + p)])
 
 
 class RosNode:
@@ -221,16 +221,16 @@ class Ros2Source(streams.Source):
         self._counts: Counter[str] = Counter()
         self._node, self._next_spin = shared_node(domain), 0.0
         self._subscriptions = [
-            self._subscribe_and_get_receiver(name, classes[name], topic)
+            self._create_subscription_and_callback(name, classes[name], topic)
             for name, topic in topics.items()
         ]
 
     @delayed_signals()
     def read(self, timeout_s: float) -> list[Reading] | None:
-        self._take_messages()
+        self._take_queued_messages()
         if not self._found:
             self._node.spin(timeout_s)
-            self._take_messages()
+            self._take_queued_messages()
         elif time.monotonic() >= self._next_spin:  # services, under a constant load
             self._node.spin(0.0)
             self._next_spin = time.monotonic() + _MAX_SERVICE_SPIN_PERIOD_S
@@ -240,7 +240,7 @@ class Ros2Source(streams.Source):
     def close(self) -> None:
         self._node.close()
 
-    def _take_messages(self) -> None:
+    def _take_queued_messages(self) -> None:
         # An executor needs 0.3 ms to find each message; taking those that are there needs 0.02 ms.
         for subscription, receive in self._subscriptions:
             with subscription.handle:
@@ -250,7 +250,7 @@ class Ros2Source(streams.Source):
                         break
                     receive(*taken)
 
-    def _subscribe_and_get_receiver(
+    def _create_subscription_and_callback(
         self, name: str, kind: Any, topic: str
     ) -> tuple[Any, Callable[..., None]]:
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -302,7 +302,7 @@ class Ros2Sink:
     @delayed_signals()
     def write(self, out: streams.CompensatedWrench) -> None:
         message, ns = self._message, time.time_ns()
-        _set_stamp(message.header, ns)
+        _set_header_stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
         force, torque = message.wrench.force, message.wrench.torque
         force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
@@ -311,12 +311,12 @@ class Ros2Sink:
         now = time.monotonic()
         if out.flags != self._flags or now >= self._next:
             self._flags, self._next = out.flags, now + _MAX_DIAGNOSTICS_PERIOD_S
-            self._diagnostics.publish(self._diagnostics_message(out, ns))
+            self._diagnostics.publish(self._make_diagnostics_message(out, ns))
 
     def close(self) -> None:
         self._node.close()
 
-    def _diagnostics_message(self, out: streams.CompensatedWrench, ns: int) -> Any:
+    def _make_diagnostics_message(self, out: streams.CompensatedWrench, ns: int) -> Any:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
         if out.flags & ~streams.NONZERO_WRENCH_FLAGS:
@@ -330,9 +330,9 @@ class Ros2Sink:
             values=values,
         )
         message = self._kinds.DiagnosticArray(status=[status])
-        _set_stamp(message.header, ns)
+        _set_header_stamp(message.header, ns)
         return message
 
 
-def _set_stamp(header: Any, ns: int) -> None:
-    header.stamp.sec, header.stamp.nanosec = divmod(ns, 10**9)
+def _set_header_stamp(header: Any, time_ns: int) -> None:
+    header.stamp.sec, header.stamp.nanosec = divmod(time_ns, 10**9)

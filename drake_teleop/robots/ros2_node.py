@@ -97,10 +97,10 @@ class ServedCompensator:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
-    def _make_service_callback(self, act: Callable[[], str]) -> Callable[[Any, Any], Any]:
+    def _make_service_callback(self, action: Callable[[], str]) -> Callable[[Any, Any], Any]:
         def answer(_request: Any, response: Any) -> Any:
             try:
-                response.message = act()
+                response.message = action()
             except DrakeTeleopError as error:
                 response.message = f"refused: {error}"
             response.success = not response.message.startswith("refused")

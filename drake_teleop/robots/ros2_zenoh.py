@@ -27,7 +27,7 @@ from drake_teleop.robots.ros2 import (
 from drake_teleop.robots.streams import CompensatedWrench, Reading, Source
 
 DEFAULT_ROUTER_PORT = 7447
-_NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
+_SEQUENCE_NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
 _ATTACHMENT_FORMAT = struct.Struct("<qqB16s")
 _OLD_ATTACHMENT_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
 _MAX_QUEUED_MESSAGES = 4096  # newer ones are dropped
@@ -92,7 +92,7 @@ def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
 
 def number_in_attachment(attached: bytes) -> int | None:
     if len(attached) == _ATTACHMENT_FORMAT.size:
-        return int(_NUMBER_AND_TIME_FORMAT.unpack_from(attached)[0])
+        return int(_SEQUENCE_NUMBER_AND_TIME_FORMAT.unpack_from(attached)[0])
     number = attached.removeprefix(_OLD_ATTACHMENT_PREFIX)[:8]
     if attached.startswith(_OLD_ATTACHMENT_PREFIX) and len(number) == 8:
         return int.from_bytes(number, "little", signed=True)
@@ -147,7 +147,7 @@ class ZenohSource(Source):
         self._session = open_session(parsed)
         for stream, topic in topics.items():
             key = topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream])
-            self._session.declare_subscriber(key, partial(self._enqueue, stream))
+            self._session.declare_subscriber(key, partial(self._enqueue_message, stream))
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         found: list[Reading] = []
@@ -162,7 +162,7 @@ class ZenohSource(Source):
     def close(self) -> None:
         self._session.close()
 
-    def _enqueue(self, stream: str, sample: Any) -> None:
+    def _enqueue_message(self, stream: str, sample: Any) -> None:
         if self._queue.qsize() < _MAX_QUEUED_MESSAGES:
             attachment = sample.attachment
             attachment = b"" if attachment is None else attachment.to_bytes()

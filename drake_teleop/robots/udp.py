@@ -28,7 +28,7 @@ READING_FORMAT = struct.Struct("<4sIQd15d")
 WRENCH_POSE_FORMAT = struct.Struct("<4sIQd13d")
 WRENCH_FORMAT = struct.Struct("<4sIQd12d")
 _READING_TAG, _WRENCH_POSE_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
-_PACKET_HEADER = struct.Struct("<4sIQd")
+_HEADER_FORMAT = struct.Struct("<4sIQd")
 _MAX_PACKETS_PER_CALL = 256
 _SOCKET_BUFFER_BYTES = 1 << 20  # a tenth of a second at 8 kHz
 _SATURATED_FLAG = int(ReadingFlag.SATURATED)
@@ -43,8 +43,8 @@ def unpack_reading(packet: bytes) -> Reading:
     """Return the reading in a packet, flagged as damaged if its length or tag is wrong."""
     if len(packet) != READING_FORMAT.size or packet[:4] != _READING_TAG:
         return DAMAGED_READING
-    _, flags, number, t = _PACKET_HEADER.unpack_from(packet)
-    values = np.frombuffer(packet, "<f8", 15, _PACKET_HEADER.size).astype(np.float64)
+    _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
+    values = np.frombuffer(packet, "<f8", 15, _HEADER_FORMAT.size).astype(np.float64)
     return Reading(number, t, values, flags & _SATURATED_FLAG)
 
 
@@ -56,15 +56,15 @@ def pack_wrench_and_pose(wrench: Reading, pose: Reading) -> bytes:
 def unpack_wrench_and_pose(packet: bytes) -> list[Reading]:
     if len(packet) != WRENCH_POSE_FORMAT.size or packet[:4] != _WRENCH_POSE_TAG:
         return [DAMAGED_WRENCH_READING]
-    _, flags, number, t = _PACKET_HEADER.unpack_from(packet)
-    values = np.frombuffer(packet, "<f8", 13, _PACKET_HEADER.size).astype(np.float64)
+    _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
+    values = np.frombuffer(packet, "<f8", 13, _HEADER_FORMAT.size).astype(np.float64)
     wrench = Reading(number, t, values[:6], flags & _SATURATED_FLAG, stream=WRENCH)
     return [wrench, Reading(number, t, values[6:], stream=POSE)]
 
 
 def pack_wrench(out: CompensatedWrench) -> bytes:
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
-    return _PACKET_HEADER.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
+    return _HEADER_FORMAT.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
 def unpack_wrench(packet: bytes) -> CompensatedWrench:

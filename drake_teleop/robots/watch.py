@@ -27,7 +27,7 @@ LOAD_WRENCH_ERROR_FRACTION = 0.02
 MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
 # Accuracy at which another load would replace the present one.
-_UNREACHABLE_MASS_STD_RATIO = 1e-12
+_MASS_STD_RATIO_TO_NEVER_REPLACE_LOAD = 1e-12
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
@@ -50,7 +50,7 @@ class ContactAndLoadMonitor:
             np.zeros(9),
             dt,
             relative_wrench_error=LOAD_WRENCH_ERROR_FRACTION,
-            mass_std_ratio=_UNREACHABLE_MASS_STD_RATIO,
+            mass_std_ratio=_MASS_STD_RATIO_TO_NEVER_REPLACE_LOAD,
         )
         self._phi = phi_with_inertia_replaced(load)[0]
         self._covariance = limit_covariance_to_scales(self._phi, load.covariance)
@@ -77,7 +77,7 @@ class ContactAndLoadMonitor:
 MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
-_CONTACT_STATISTIC = "level"
+_CONTACT_STATISTIC_NAME = "level"
 _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
 
@@ -122,11 +122,11 @@ class StreamContactDetector:
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = detection.fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
         threshold = max(
-            detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(_CONTACT_STATISTIC)
+            detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(_CONTACT_STATISTIC_NAME)
         )
         following = dt / MEAN_WRENCH_TIME_CONSTANT_S
         self._settings = detection.ContactDetector(
-            floor, threshold, statistic=_CONTACT_STATISTIC, hold=hold, following=following
+            floor, threshold, statistic=_CONTACT_STATISTIC_NAME, hold=hold, following=following
         ).settings
         self.restart()
         self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading

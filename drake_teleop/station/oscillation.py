@@ -26,7 +26,7 @@ _MIN_OSCILLATION_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 # A touch begins where the force exceeds this share of the largest force within the time around it.
 _MIN_TOUCH_FORCE_SHARE_OF_PEAK, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
 _MIN_TOUCH_INTERVAL_S = 0.005  # closer touches are bounces of one touch-down
-_MAX_TOUCH_INTERVAL_S = 0.2  # of a series: 5 Hz
+_MAX_TOUCH_INTERVAL_OF_CHATTER_S = 0.2  # of a series: 5 Hz
 # Smallest number of touches, duration [s] and force [N] of a series.
 _MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.5
 # Largest time between a touch and the reversal of the command that explains it [s].
@@ -153,10 +153,10 @@ def find_contact_chatter(t: Array, force: Array, command_reversals: Array) -> li
         force: (N,) magnitude of the contact force [N].
         command_reversals: times of the command's reversals [s].
     """
-    touches = _find_touches(t, force)
+    touches = _find_touch_start_times(t, force)
     touches = remove_times_near_causes(touches, command_reversals, _MAX_TOUCH_TO_COMMAND_REVERSAL_S)
     found = []
-    for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
+    for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_OF_CHATTER_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:
             continue
         start, stop = float(series[0]), float(series[-1])
@@ -167,7 +167,7 @@ def find_contact_chatter(t: Array, force: Array, command_reversals: Array) -> li
     return found
 
 
-def _find_touches(t: Array, force: Array) -> Array:
+def _find_touch_start_times(t: Array, force: Array) -> Array:
     if len(t) < 2:
         return np.empty(0)
     rows = 2 * round(_PEAK_FORCE_WINDOW_S / (t[1] - t[0])) + 1

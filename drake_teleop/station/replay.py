@@ -43,15 +43,15 @@ _TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
 _MASTER_BASE_P_WB = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
 _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
-_CAMERA_SHIFT_WITHOUT_DEVICE_W = np.array([-0.3, 0.0, 0.0])  # of camera and target
+_CAMERA_SHIFT_WITHOUT_DEVICE_W_M = np.array([-0.3, 0.0, 0.0])  # of camera and target
 _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
 _WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
 _STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
-_GRIP_P_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
+_HAND_GRIP_P_E_M = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
 _ARM_WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
-_WRIST_ARROW_OFFSET_W = np.array([0.07, -0.09, 0.0])
-_TIP_ARROW_OFFSET_W = np.array([-0.06, 0.0, 0.0])
+_WRIST_ARROW_OFFSET_W_M = np.array([0.07, -0.09, 0.0])
+_TIP_ARROW_OFFSET_W_M = np.array([-0.06, 0.0, 0.0])
 
 # Required signals, and signals that are shown if they were recorded.
 _REQUIRED_SIGNALS = ("slave_state", "measured_wrench_S", "load_estimate")
@@ -68,7 +68,7 @@ def replay_command(
         out: output folder: replay.html, or one file per log for several logs.
         scenario: shipped scenario or YAML file; by default the YAML file beside the log.
     """
-    logs = _find_logs(run)
+    logs = _find_logs_of_run(run)
     for folder in {run, *(log.parent for log in logs)}:
         files.refuse_to_replace_inputs(out / "summary.json", folder / "summary.json")
     films = []
@@ -76,7 +76,7 @@ def replay_command(
         for log in logs:
             path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
             result = SimulationResult.scan_parquet(log)
-            write_replay(path, result, LoadScenario(scenario or _find_scenario(log)))
+            write_replay(path, result, LoadScenario(scenario or _find_scenario_file_of_log(log)))
             films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
             if not quiet:
                 print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
@@ -114,7 +114,7 @@ def write_replay(
         scenario.description or "A run of the station",
         times,
         slow_motion,
-        displayed_numbers=_displayed_numbers(signals),
+        displayed_numbers=_displayed_force_norms(signals),
         shaded_spans=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm per newton of the force at the slave.",),
         curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
@@ -127,7 +127,7 @@ def write_replay(
     film.write(path, make_scene)
 
 
-def _displayed_numbers(signals: Signals) -> list[replay_file.DisplayedNumber]:
+def _displayed_force_norms(signals: Signals) -> list[replay_file.DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
     forces = [("Measured at the wrist", measured, BLUE)]
     if "contact_wrench_S" in signals:
@@ -140,7 +140,7 @@ def _displayed_numbers(signals: Signals) -> list[replay_file.DisplayedNumber]:
     ]
 
 
-def _find_logs(run: Path) -> list[Path]:
+def _find_logs_of_run(run: Path) -> list[Path]:
     if not os.path.exists(run):
         what = "there is no such file or folder"
         raise DrakeTeleopError(what, where=str(run), remedy="give the folder of a run")
@@ -159,7 +159,7 @@ def _find_logs(run: Path) -> list[Path]:
     return logs
 
 
-def _find_scenario(log: Path) -> Path:
+def _find_scenario_file_of_log(log: Path) -> Path:
     for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
         if path.exists():
             return path
@@ -236,13 +236,13 @@ class ReplayScene:
         for path, body in self._bodies.items():
             self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), replay_time)
         if self._arrows:
-            self._show_arrows(replay_time, signals, sample)
+            self._show_force_arrows(replay_time, signals, sample)
 
-    def _show_arrows(self, replay_time: float, signals: Signals, sample: int) -> None:
+    def _show_force_arrows(self, replay_time: float, signals: Signals, sample: int) -> None:
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _ARM_WRIST_P_S + _WRIST_ARROW_OFFSET_W,
-            "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
+            "wrist": X_WS @ _ARM_WRIST_P_S + _WRIST_ARROW_OFFSET_W_M,
+            "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W_M,
         }
         if self._device is not None:
             *_, hand, grip = self._device
@@ -279,7 +279,7 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
     to_plant_positions = serial_joint_angles if is_phantom else np.copy
-    return master, to_plant_positions, plant.GetFrameByName("stylus", master), _GRIP_P_E
+    return master, to_plant_positions, plant.GetFrameByName("stylus", master), _HAND_GRIP_P_E_M
 
 
 def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
@@ -302,5 +302,5 @@ def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_tabl
             centre = stand.centre_x, stand.centre_y, stand.height / 2
             draw_box(f"plinth_{k}" if k else "plinth", size, centre, _STEEL_COLOUR)
     replay_file.set_plain_background(meshcat)
-    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W
+    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W_M
     meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

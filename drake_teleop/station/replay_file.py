@@ -99,15 +99,15 @@ class ReplayFile:
         collects = gc.isenabled()
         gc.disable()
         try:
-            page = self._record_scene(make_scene)
+            page = self._record_scene_html(make_scene)
             gc.collect()
         finally:
             if collects:
                 gc.enable()
         make_folder(path.parent)
-        write_text(path, self._add_player(page))
+        write_text(path, self._add_player_to_page(page))
 
-    def _record_scene(self, make_scene: Callable[[Meshcat], ShowFrame]) -> str:
+    def _record_scene_html(self, make_scene: Callable[[Meshcat], ShowFrame]) -> str:
         with silence_drake_log():  # no client connects to its server
             meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
         show = make_scene(meshcat)
@@ -124,7 +124,7 @@ class ReplayFile:
     def _recorded_time_span_s(self) -> float:
         return max(float(self.times[-1] - self.times[0]), 1e-3)
 
-    def _add_player(self, page: str) -> str:
+    def _add_player_to_page(self, page: str) -> str:
         start = float(self.times[0])
         film = {
             "title": self.title,

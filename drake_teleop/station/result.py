@@ -301,14 +301,14 @@ class SimulationResult:
         width = max((len(name) for name in self.signals), default=0)
         lines = [f"SimulationResult: {self._time_range_text()}"]
         for spec in self.specs:
-            text = f"  {spec.name:{width}}  {_components_text(spec)}  {spec.description}"
+            text = f"  {spec.name:{width}}  {_components_and_units_text(spec)}  {spec.description}"
             lines.append(text.rstrip())
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         left, rows = " style='text-align:left'", ""
         for spec in self.specs:
-            texts = spec.name, _components_text(spec), spec.description
+            texts = spec.name, _components_and_units_text(spec), spec.description
             name, components, description = map(html.escape, texts)
             rows += f"<tr><td{left}><code>{name}</code></td><td{left}>{components}</td>"
             rows += f"<td{left}>{description}</td></tr>"
@@ -340,7 +340,7 @@ def _block_extremes(t: Array, values: Array) -> tuple[Array, Array]:
     return np.repeat(t[starts], 2), np.ravel(extremes, order="F")
 
 
-def _components_text(spec: Signal) -> str:
+def _components_and_units_text(spec: Signal) -> str:
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)

@@ -31,16 +31,16 @@ Warnings = Iterator[tuple[str, Spans, str]]
 
 _MIN_WARNING_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
-_MAX_CLOSED_SPAN_GAP_S = 0.05  # shorter gaps between time spans are closed
+_MAX_GAP_OF_JOINED_SPANS_S = 0.05  # shorter gaps between time spans are closed
 _SHARE_AT_LIMIT = 1 - 1e-9  # share from which a limit counts as reached (rounding)
 _SHARE_AT_MOTOR_LIMIT = 0.999  # of a leader's motors, which the joints' motion changes
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
-_MIN_COMMAND_LAG_M = 2e-3
+_MIN_WARNED_COMMAND_LAG_M = 2e-3
 _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = np.deg2rad(1.0), np.deg2rad(0.2)
 _LEDGER_COMMAND_SETTLING_TIME_S = 0.05  # with sufficient energy
 _DEGREES_PER_RAD = 180 / np.pi
-_MIN_JOINT_OSCILLATION_RAD = np.deg2rad(0.1)
-_NUM_SETTLING_TIME_CONSTANTS = 6.0  # of the position loop, until the error is 0.3 %
+_MIN_JOINT_OSCILLATION_SWING_RAD = np.deg2rad(0.1)
+_SETTLING_TIME_IN_TIME_CONSTANTS = 6.0  # of the position loop, until the error is 0.3 %
 _MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 _MIN_FORCE_OSCILLATION_CYCLES = 4
 _MIN_POWER_SHARE_OF_OSCILLATION = 0.5  # near its frequency; white noise has less than 0.3
@@ -55,9 +55,9 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     """
     found = chain(
         _check_faults(result),
-        _check_limits(result, scenario, arm),
-        _check_channel(result, scenario),
-        _check_joints(result, scenario, arm),
+        _check_reached_limits(result, scenario, arm),
+        _check_channel_silence_and_lag(result, scenario),
+        _check_joint_motion(result, scenario, arm),
         _check_hand_oscillation(result),
         _check_contact_chatter(result),
         _check_rendered_force_oscillation(result),
@@ -74,7 +74,7 @@ def find_spans(t: Array, flags: Flags, min_duration: float = 0.0) -> Spans:
     """
     spans: Spans = []
     for start, stop in contact_spans(t, flags):
-        if spans and start - spans[-1][1] < _MAX_CLOSED_SPAN_GAP_S:
+        if spans and start - spans[-1][1] < _MAX_GAP_OF_JOINED_SPANS_S:
             start = spans.pop()[0]
         spans.append((start, stop))
     return [(start, stop) for start, stop in spans if stop - start >= min_duration]
@@ -101,7 +101,7 @@ def _check_faults(result: SimulationResult) -> Warnings:
             yield f"a fault: {meaning},", find_spans(t, happened), ""
 
 
-def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
+def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     t, flag = result.t, result["saturated"][:, 0]
     spans = find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
     yield "the wrist sensor saturates", spans, "move more slowly, or use larger sensor ranges"
@@ -148,7 +148,7 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         )
 
 
-def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
+def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario) -> Warnings:
     if "ports" not in result:
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
@@ -219,7 +219,7 @@ def _pose_parts_with_lag_limits(
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
     wanted, turned = (doubled_quaternions(pose, command) for pose in (command, actual))
     return (
-        (command[:, 4:], actual[:, 4:], _MIN_COMMAND_LAG_M, "mm", 1e3),
+        (command[:, 4:], actual[:, 4:], _MIN_WARNED_COMMAND_LAG_M, "mm", 1e3),
         (wanted, turned, _MIN_COMMAND_LAG_RAD, "degrees", _DEGREES_PER_RAD),
     )
 
@@ -228,23 +228,23 @@ def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joints(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
+def _check_joint_motion(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+    window = _SETTLING_TIME_IN_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
     window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
-        least = _MIN_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD
+        least = _MIN_WARNED_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD
         spans = find_spans(t, far > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         advice = "move more slowly, or increase the bandwidth of joint_control"
         yield f"joint {k + 1} is up to {way} behind its command", spans, advice
-    least = _MIN_JOINT_OSCILLATION_RAD
+    least = _MIN_JOINT_OSCILLATION_SWING_RAD
     oscillating = oscillation.flag_unexplained_oscillation(t, command, actual, least)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     advice = "change the bandwidth of joint_control, or damp the touched object"

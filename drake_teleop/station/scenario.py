@@ -45,7 +45,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
-_MAX_CONTACT_STEP_S = 1.25e-4
+_MAX_STEP_IN_CONTACT_S = 1.25e-4
 _MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at the hand
 
 
@@ -156,9 +156,9 @@ class Scenario:
             if sum(isinstance(thing, kind) for thing in self._environments) > 1:
                 what = f"the scenario has more than one {name} (one is permitted)"
                 raise DrakeTeleopError(what, where=f"{where}:environment", remedy="keep one")
-        _check_task(self, where)
+        _check_operator_task(self, where)
         _check_integration_step(self, where)
-        _check_channel(self, where)
+        _check_channel_and_passivity(self, where)
 
 
 def check_scenario(scenario: Any) -> None:
@@ -282,7 +282,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     return scenario
 
 
-def _check_task(scenario: Scenario, where: str) -> None:
+def _check_operator_task(scenario: Scenario, where: str) -> None:
     if scenario.operator.task is None:
         return
     check_target_beyond_standoff(scenario.operator.task, f"{where}:operator.task")
@@ -297,13 +297,13 @@ def _check_task(scenario: Scenario, where: str) -> None:
 def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     fixed = simulation.integrator != "runge_kutta3"
-    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_CONTACT_STEP_S:
+    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_STEP_IN_CONTACT_S:
         what = f"fixed steps of {simulation.max_step:g} s are too long for contact"
-        remedy = f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3"
+        remedy = f"set it to {_MAX_STEP_IN_CONTACT_S:g}, or integrator: runge_kutta3"
         raise DrakeTeleopError(what, where=f"{where}:simulation.max_step", remedy=remedy)
 
 
-def _check_channel(scenario: Scenario, where: str) -> None:
+def _check_channel_and_passivity(scenario: Scenario, where: str) -> None:
     for line in scenario.channel.networks_of_directions(f"{where}:channel"):
         line.check(f"{where}:channel")
         timeout = scenario.channel.timeout or MAX_TIMEOUT_S

@@ -17,7 +17,7 @@ from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 _MAX_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
-_YAML_FILE_HEAD = """\
+_YAML_FILE_HEADING = """\
 # Each field has its value, [the permitted values] and its meaning. Omitted fields have their
 # defaults. Lines that begin with # are fields and blocks that this scenario does not use; remove
 # the # to use them.
@@ -26,7 +26,7 @@ _YAML_FILE_HEAD = """\
 
 def to_commented_yaml(scenario: Scenario) -> str:
     """Return the scenario as YAML text; a comment explains each field."""
-    return _YAML_FILE_HEAD + "\n".join(_block_lines(scenario)) + "\n"
+    return _YAML_FILE_HEADING + "\n".join(_yaml_of_block(scenario)) + "\n"
 
 
 def _texts_in(value: Any) -> list[str]:
@@ -69,7 +69,7 @@ def comment_of_field(entry: FieldInfo) -> str:
     return f"[{allowed_values(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
 
 
-def _block_lines(config: Any) -> list[str]:
+def _yaml_of_block(config: Any) -> list[str]:
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {format_yaml_value(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
@@ -80,7 +80,7 @@ def _block_lines(config: Any) -> list[str]:
     lines = []
     for entry in entries:
         if entry.kind == "block":
-            lines += _nested_block_lines(entry)
+            lines += _yaml_of_nested_block(entry)
             continue
         line = f"{starts[entry.name]:{column}}  # {comment_of_field(entry)}"
         of_preset = preset is not None and entry.default == getattr(preset, entry.name)
@@ -88,22 +88,22 @@ def _block_lines(config: Any) -> list[str]:
     return lines
 
 
-def _nested_block_lines(entry: FieldInfo) -> list[str]:
+def _yaml_of_nested_block(entry: FieldInfo) -> list[str]:
     if entry.default:
-        return _field_lines(entry, entry.default)
+        return _yaml_of_field(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.list_depth:
-        return _prefix_lines("# ", _field_lines(entry, blocks))
-    return [line for block in blocks for line in _prefix_lines("# ", _field_lines(entry, block))]
+        return _prefix_lines("# ", _yaml_of_field(entry, blocks))
+    return [line for block in blocks for line in _prefix_lines("# ", _yaml_of_field(entry, block))]
 
 
-def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
+def _yaml_of_field(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.list_depth:
         head = f"{entry.name}:{_yaml_tag(entry, value)}  # {entry.meaning}"
-        return [head, *_prefix_lines("  ", _block_lines(value))]
+        return [head, *_prefix_lines("  ", _yaml_of_block(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_yaml_tag(entry, item)}", *_prefix_lines(" " * 4, _block_lines(item))]
+        lines += [f"  -{_yaml_tag(entry, item)}", *_prefix_lines(" " * 4, _yaml_of_block(item))]
     return lines
 
 

@@ -149,10 +149,10 @@ class LogOnDisk:
     def write_and_keep_rows(self) -> int:
         """Write the rows in memory as a part that the next write replaces; return their number."""
         part = self._convert(read_recorded_signals(self._simulator, self._start))
-        self._write_part(part)
+        self._write_log_part(part)
         return len(part.t)
 
-    def _write_part(self, part: SimulationResult) -> None:
+    def _write_log_part(self, part: SimulationResult) -> None:
         # `BackgroundLog` replaces this by a thread that writes.
         part.write_part(self._folder, self._rows)
 

@@ -22,7 +22,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
     def _declare_step(self, results: list[Array], num_states: int, period: float) -> None:
         """Declare the discrete states and the `period` [s] of their step.
 
-        `results` are initial values of the arrays of `_advance`; the first `num_states` are states.
+        Initial `results` of `_advance_states_and_outputs`; the first `num_states` are states.
         """
         # Integers are faster than Drake's own indices.
         self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
@@ -46,14 +46,14 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
         self.DeclareVectorOutputPort(name, part.stop - part.start, copy_part, self._after_step)
 
     @abstractmethod
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         """Advance the states `results[:num_states]` by a period; write the others, outputs."""
 
     def _calc_step(self, context: Context, step: AbstractValue) -> None:
         results = step.get_mutable_value()
         for state, index in zip(results, self._states, strict=False):
             state[:] = context.get_discrete_state(index).value()
-        self._advance(context, results)
+        self._advance_states_and_outputs(context, results)
 
     def _step_results(self, context: Context) -> list[Array]:
         results: list[Array] = self.get_cache_entry(self._step).Eval(context)

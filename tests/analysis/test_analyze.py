@@ -23,7 +23,7 @@ PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 def coarse_maps():
     """Use coarse maps: test_maps.py tests them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analyze, "_POINTS_PER_MAP_AXIS", 12)
+        patch.setattr(analyze, "_NUM_POINTS_PER_MAP_AXIS", 12)
         yield
 
 

@@ -40,8 +40,8 @@ def test_covering_damping_compensates_the_energy_of_the_delay(wall, round_trip):
     model = dataclasses.replace(FIRM, wall_stiffness=wall, sigma=1.0)
     damping = covering_damping(model, round_trip)
     # At a wall the worst frequency is nearly 0, which takes too long to simulate.
-    worst = one_dof._RESISTANCE_FREQUENCIES_RAD_S[
-        np.argmin(one_dof._displayed_resistance(model, round_trip))
+    worst = one_dof._IMPEDANCE_FREQUENCIES_RAD_S[
+        np.argmin(one_dof._displayed_impedance_real_part(model, round_trip))
     ]
     frequency = max(worst / (2 * np.pi), 0.5)
     assert damping > 1.0

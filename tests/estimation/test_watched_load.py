@@ -19,9 +19,9 @@ from drake_teleop.load.online.watched import (
     STATE_LEARNING,
     STATE_OTHER_LOAD,
     STATE_SETTLED,
-    _is_com_of_change_within_reach,
-    _update_and_test_force_change,
-    _update_and_test_rest,
+    _is_com_of_load_change_near_sensor,
+    _update_force_change_detector,
+    _update_rest_detector,
     initial_monitor_memory,
     monitor_load,
 )
@@ -114,7 +114,7 @@ def test_rest_is_300_ms_without_rotation_and_change_of_direction(omega, drift, r
     memory, sample = np.zeros(MEMORY_SIZE), np.zeros(15)
     for k in range(1000):
         sample[6:12] = [3.0 + 1e-3 * drift * k, 0.0, 9.3, 0.0, omega, 0.0]
-        found = _update_and_test_rest(memory, sample, 1e-3)
+        found = _update_rest_detector(memory, sample, 1e-3)
         assert found is False or k > 300
     assert found == rests
 
@@ -125,7 +125,7 @@ def test_grasped_or_released_object_is_within_1_m_of_the_sensor(mass, distance, 
     known, new = np.full(16, 3.0), np.full(16, 3.0)
     new[6] += mass
     new[7:10] += mass * distance * np.array([0.6, 0.0, -0.8])
-    assert _is_com_of_change_within_reach(known, new) == near
+    assert _is_com_of_load_change_near_sensor(known, new) == near
 
 
 def test_force_changes_count_after_the_low_pass_has_settled():
@@ -133,7 +133,7 @@ def test_force_changes_count_after_the_low_pass_has_settled():
     for age in range(600):
         force = 2.0 if age < 5 else 1.0 if age >= 300 else 0.0
         residual = np.array([0.0, force, 0.0, 0.0, 0.0, 0.0])
-        found.append(_update_and_test_force_change(memory, residual, float(age), period))
+        found.append(_update_force_change_detector(memory, residual, float(age), period))
     changed = 300 + round(1e3 * 0.05 * np.log(2.0))  # the low-pass reaches 0.5 N
     assert not any(found[: changed + 90]) and all(found[changed + 110 :])
 

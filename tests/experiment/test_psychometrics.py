@@ -22,7 +22,7 @@ def test_next_level_minimises_the_expected_entropy():
     def expected(level: float) -> float:
         """Return the expected entropy of the threshold, by explicit updates of the grid."""
         posterior = psi._posterior
-        p = float((psi._grid_probability(level) * posterior).sum())
+        p = float((psi._correct_probability_on_grid(level) * posterior).sum())
         after = []
         for correct in (True, False):
             other = PsiMethod(0.2, 20.0)

@@ -76,7 +76,7 @@ def test_simulated_insertion_averages_the_contact_force_over_20_ms_as_for_people
     procedure = SimpleNamespace(
         trial_number=0, interval=1, participant=1, experiment=Experiment(seed=0)
     )
-    inserted = simulated._insert_peg(apparatus, procedure)
+    inserted = simulated._simulate_peg_insertion(apparatus, procedure)
     assert inserted.force_N == pytest.approx((19 * 3.0 + math.hypot(3.0, 90.0)) / 20)
     assert inserted.done and inserted.time_s == 2.0
 

@@ -35,7 +35,7 @@ class MovingHand:
     def intention(self, time: float) -> list[np.ndarray]:
         """Return the intended quaternion (4,), position [m], twist (6,) and acceleration (3,)."""
         self.context.SetTime(time)
-        return np.split(self.hand._current_motion(self.context).copy(), [4, 7, 13])
+        return np.split(self.hand._current_intended_motion(self.context).copy(), [4, 7, 13])
 
     def move_to(
         self, time: float, orientation: tuple[float, ...], position: tuple[float, ...]

@@ -128,7 +128,7 @@ def test_a_target_that_is_set_ends_a_rate(scenario, load):
     for text in ({"rates": {"x": 5000}}, {"set": {"x": 300}}):
         live.handle_message(1, json.dumps(text), 0.0)
         for _ in range(4):
-            live._simulate_slice(0.0)
+            live._simulate_time_slice(0.0)
     assert live.frame()["inputs"]["x"] == 300
 
 
@@ -173,7 +173,7 @@ def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
         link._handle_packet(packet, ("127.0.0.1", 9), now)
         if now >= due:
             for _ in range(burst):
-                live._simulate_slice(now)
+                live._simulate_time_slice(now)
             due += burst * 2e-3 / rate
             rendered.append(live.frame()["f"][2][1])
     live.close()

@@ -14,7 +14,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import fit_candidates
 from drake_teleop.logs.causes.cause import loads_between_changes, name_misfit_causes
 from drake_teleop.logs.causes.changes import find_contact_spans, fit_steps_at_middle_of_ramps
-from drake_teleop.logs.causes.explain import _apply_fitted_delay
+from drake_teleop.logs.causes.explain import _refit_with_delay_removed
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
 from drake_teleop.logs.causes.state import FittedModel, score_statistic
@@ -123,10 +123,10 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
 
     state = FittedModel.fit_record(with_delay(before), LoadModel())
     assert state.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
-    after, delay = _apply_fitted_delay(state, before, with_delay)
+    after, delay = _refit_with_delay_removed(state, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
     assert (abs(after.x[DELAY_INDEX]) < 5e-4) == moves
-    assert _apply_fitted_delay(state, before, None) == (state, before)
+    assert _refit_with_delay_removed(state, before, None) == (state, before)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e2])

@@ -19,7 +19,7 @@ from drake_teleop.logs.causes.instants import (
     delay_of_linear_fit,
 )
 from drake_teleop.logs.causes.intervals import (
-    _phi_variances_by_rejected_causes,
+    _load_variances_by_rejected_causes,
     widening_factor_by_misfit,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
@@ -250,14 +250,14 @@ def test_rejected_causes_widen_the_load_by_their_score_or_smaller_residual():
         (0.0, 0.4, 1.0),
     ):
         rejected = [Candidate("drift", fit(3.0, ratio), score)]
-        found = _phi_variances_by_rejected_causes(fit(0.0, 1.0), rejected)
+        found = _load_variances_by_rejected_causes(fit(0.0, 1.0), rejected)
         np.testing.assert_allclose(found, share * (3.0**2 + 4.0))
 
 
 @pytest.mark.parametrize("longer", [5.0, 0.0])
 def test_samples_near_the_ends_of_wrench_and_poses_are_not_used(monkeypatch, longer):
     """Knots are 0.2 s apart; the poses are longer than the wrench, or as long."""
-    monkeypatch.setattr(explained_log, "_noise_of_spline_acceleration", lambda splines: 0.0)
+    monkeypatch.setattr(explained_log, "_acceleration_noise_of_splines_m_s2", lambda splines: 0.0)
     splines = SimpleNamespace(
         quaternion=lambda t: Rotation.from_matrix(moving(t)[3]).as_quat(scalar_first=True),
         position=lambda t: moving(t)[4],

@@ -208,7 +208,7 @@ def test_a_killed_run_continues_to_the_same_bytes(
     description.write_text(json.dumps(LEROBOT))
     options: dict[str, Any] = {"identify": True, "description": description, "quiet": True}
     dataset_command(source, tmp_path / "whole", **options)
-    judged, left = [], command._judge_episode
+    judged, left = [], command._write_verdict_of_episode
 
     def judge(task: Any, work: Path, number: int) -> None:
         if len(judged) == 1:
@@ -216,7 +216,7 @@ def test_a_killed_run_continues_to_the_same_bytes(
         judged.append(number)
         left(task, work, number)
 
-    monkeypatch.setattr(command, "_judge_episode", judge)
+    monkeypatch.setattr(command, "_write_verdict_of_episode", judge)
     out = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
         dataset_command(source, out, **options)

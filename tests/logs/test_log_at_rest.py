@@ -12,6 +12,7 @@ from planted import OFFSETS, PHI, Columns, written
 
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs import aligned_log
 from drake_teleop.logs.check import against_load
 from drake_teleop.logs.check.against_load import LoadFitQuality
 from drake_teleop.logs.check.motion_size import motion_rms, too_little_motion
@@ -67,12 +68,33 @@ def test_slow_rotation_corrects_the_sign(tmp_path: Path, noise_mm: float) -> Non
 
 
 def test_noise_of_poses_is_no_motion(tmp_path: Path) -> None:
-    still = read_log(written(tmp_path, sway(0.0, 0.3), imu=False))
-    assert motion_rms(still) < (0.03, 0.03)
+    still = read_log(written(tmp_path, sway(0.0, 3.0), imu=False))
+    rms_m_s2, rms_rad_s = motion_rms(still)
+    assert rms_m_s2 < 0.06 and rms_rad_s < 0.02
     assert "hardly moves" in str(too_little_motion(still))
+    assert too_little_motion(read_log(written(tmp_path, sway(25.0, 0.05), imu=False))) is None
     moving = read_log(written(tmp_path, sway(60.0, 0.3), imu=False))
     assert motion_rms(moving)[0] == pytest.approx(0.06 * 9.81 / np.sqrt(2) * 1.4, rel=0.3)
     assert too_little_motion(moving) is None
+
+
+@pytest.mark.parametrize(("size_mrad", "noise_mm"), [(0.0, 0.1), (3.0, 0.05), (10.0, 0.3)])
+def test_record_at_rest_has_one_pose_fit_and_no_search_over_wrench_edits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size_mrad: float, noise_mm: float
+) -> None:
+    pose_fits, load_fits = [], []
+
+    def count(module: Any, name: str, calls: list[int]) -> None:
+        function = getattr(module, name)
+        counted = lambda *a, **k: (calls.append(1), function(*a, **k))[1]  # noqa: E731
+        monkeypatch.setattr(module, name, counted)
+
+    count(aligned_log, "estimate_from_poses", pose_fits)
+    count(against_load, "_fit_load_to_samples", load_fits)
+    found = check_log(written(tmp_path, sway(size_mrad, noise_mm), imu=False))
+    assert [finding.name for finding in found.findings] == ["payload"]
+    assert len(pose_fits) == 1
+    assert len(load_fits) < 10
 
 
 def test_correction_with_an_implausible_mass_is_not_stated() -> None:

@@ -49,7 +49,7 @@ def test_failing_check_does_not_stop_identify(sample_tables, error, monkeypatch)
         raise error("of our own")
 
     monkeypatch.setattr(processing, "check_conventions_of_file", fail)
-    monkeypatch.setattr(conventions, "_are_signals_suspicious", lambda _: True)
+    monkeypatch.setattr(conventions, "_has_dead_channel_or_imu_finding", lambda _: True)
     assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
 
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import yaml
 from known_motion import GRAVITY_W
+from planted import good, written
 from scipy.spatial.transform import Rotation
 from test_causes_remedies import COM, INERTIA, MASS, NOISE, OFFSETS, Record, turned
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
+from drake_teleop.logs.read.reading import read_log
 
 
 def identify(folder: Path, record: Record) -> IdentifiedLog:
@@ -59,6 +61,19 @@ def test_unknown_translation_corrects_neither_torque_unit_nor_pose_frame(
     assert_nothing_is_certain_and_wrong(found, torque_factor)
     assert found.delay_source == "undetermined"
     assert [x.name for x in check_log(tmp_path / "log.yaml").findings] == ["acceleration"]
+
+
+@pytest.mark.parametrize("has_position", [True, False])
+@pytest.mark.parametrize("has_accelerometer", [True, False])
+def test_acceleration_is_unknown_without_position_and_accelerometer(
+    tmp_path: Path, has_position: bool, has_accelerometer: bool
+) -> None:
+    path = written(tmp_path, good(), imu=has_accelerometer)
+    description = yaml.safe_load(path.read_text())
+    if not has_position:
+        del description["pose"]["position"]
+    path.write_text(yaml.safe_dump(description))
+    assert read_log(path).is_acceleration_unknown == (not has_position and not has_accelerometer)
 
 
 @pytest.mark.parametrize(

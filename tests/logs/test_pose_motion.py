@@ -30,10 +30,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import use_spline_motion_and_flag_edges
-from drake_teleop.logs.explained_log import _noise_of_spline_acceleration
+from drake_teleop.logs.explained_log import _acceleration_noise_of_splines_m_s2
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
-    _taper_zero_in_gaps,
+    _taper_excluding_gaps,
     estimate_from_poses,
 )
 from drake_teleop.logs.pose_motion.linear_model import (
@@ -49,8 +49,8 @@ from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.rigid import (
     RigidParameters,
     UnitsAndAxes,
-    _add_rigid_step,
-    _parameter_errors_of_unit_gains,
+    _add_increments,
+    _parameter_errors_by_unit_gain_errors,
     _residual_and_derivative,
     _RigidFitData,
     _solve_rigid_fit,
@@ -138,7 +138,7 @@ def test_400_ms_beside_gaps_of_the_poses_and_lost_samples_have_no_weight(delay, 
     poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept])
     gap = np.searchsorted(poses.t, 7.0)
     first, last = poses.t[gap - 1] - delay, poses.t[gap] - delay
-    taper = _taper_zero_in_gaps(WrenchGrid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
+    taper = _taper_excluding_gaps(WrenchGrid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
     near = (t > first - 0.399) & (t < last + 0.399)
     assert (taper[near] == 0.0).all() if excluded else taper[near].min() > 0.99
     assert (taper[np.abs(t - 12.0) < 0.05] == 0.0).all()
@@ -186,7 +186,7 @@ def test_noise_of_the_acceleration_of_splines_is_predicted(rate, spacing, noise)
     splines = PoseSplines(Poses(t, position, np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))), spacing)
     at = np.arange(2.0, 58.0, 0.002)
     acceleration = np.diff(splines.position(at), 2, axis=0) / 0.002**2
-    predicted = _noise_of_spline_acceleration(splines)
+    predicted = _acceleration_noise_of_splines_m_s2(splines)
     assert predicted == pytest.approx(np.sqrt(np.mean(acceleration**2)), rel=0.1)
 
 
@@ -252,7 +252,7 @@ def test_columns_are_derivatives_of_the_residual(rho, r, k):
     state = RigidParameters(TRUTH, 1e-3, r, R)
     step = np.zeros(23)
     step[k] = 1e-5
-    ahead, behind = (_residual_and_derivative(_add_rigid_step(state, x))[1] for x in (step, -step))
+    ahead, behind = (_residual_and_derivative(_add_increments(state, x))[1] for x in (step, -step))
     derivative = (ahead - behind) / 2e-5
     np.testing.assert_allclose(_residual_and_derivative(state)[0][:, k], -derivative, atol=1e-6)
 
@@ -294,7 +294,7 @@ def test_deviations_of_the_frame_match_the_scatter():
     for k in range(6):
         step = np.zeros(23)
         step[17 + k] = 1e-6
-        states = [_add_rigid_step(found.free_frame_fit.parameters, x) for x in (step, -step)]
+        states = [_add_increments(found.free_frame_fit.parameters, x) for x in (step, -step)]
         ahead, behind = (-state.R_PS.T @ state.p_PoSo_P for state in states)
         place[:, k] = (ahead - behind) / 2e-6
     covariance = place @ found.free_frame_fit.covariance[17:, 17:] @ place.T
@@ -499,7 +499,7 @@ def test_gain_effects_predict_the_change_of_the_estimate():
     none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = fit_coefficients(spectra).noise_power
     solution = _solve_rigid_fit(_RigidFitData(Z, none, levels, free, power), start)
-    effects = _parameter_errors_of_unit_gains(solution, Z).reshape(23, 6, 6)
+    effects = _parameter_errors_by_unit_gain_errors(solution, Z).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)

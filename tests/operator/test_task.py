@@ -131,7 +131,7 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     assert decision._contact_force_at_tool_along_approach(packed, person, felt) == pytest.approx(
         -force_W @ axis
     )
-    across, size = decision._lateral_contact_force_W_and_size.py_func(packed, person, felt)
+    across, size = decision._lateral_contact_force_W_and_norm.py_func(packed, person, felt)
     np.testing.assert_allclose(across, force_W - (force_W @ axis) * axis, atol=1e-12)
     assert size == pytest.approx(np.linalg.norm(across))
 
@@ -141,7 +141,7 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     training = decision.OperatorTraining(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_operator_parameters(training, Perception(), movement), []
-    monkeypatch.setattr(decision, "_to_hand_motion", decision._to_hand_motion.py_func)
+    monkeypatch.setattr(decision, "_tool_to_hand_motion", decision._tool_to_hand_motion.py_func)
     monkeypatch.setattr(decision, "_draw_normal_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._plan_submovement.py_func(

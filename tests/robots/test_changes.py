@@ -227,11 +227,11 @@ def test_record_contains_the_last_20_s_after_a_clock_change() -> None:
     row = np.zeros(15)
     for k, t in enumerate([0.0, *(50.0 + DT * np.arange(11_000))]):
         sought.add_reading(Reading(k, t, row + t), int(ReadingFlag.STALE if k == 500 else 0))
-    seen = sought._recorded_rows()[:, 0]
+    seen = sought._rows_in_time_order()[:, 0]
     assert len(seen) == 10_000 and (np.diff(seen) > 0.0).all()
     assert seen[-1] == pytest.approx(50.0 + DT * 10_999)
     sought.add_reading(Reading(0, 3.0, row), 0)
-    assert sought._recorded_rows()[:, 0].tolist() == [3.0]
+    assert sought._rows_in_time_order()[:, 0].tolist() == [3.0]
 
 
 @pytest.mark.slow

@@ -394,7 +394,7 @@ def test_input_not_finite_gives_no_sample():
     context = run.sensor.GetMyMutableContextFromRoot(run.simulator.get_mutable_context())
     values = run.sensor.AllocateDiscreteVariables()
     values.SetFrom(context.get_discrete_state())
-    run.sensor._update_state(context, values)
+    run.sensor._update_sample(context, values)
     context.SetDiscreteState(values)
     assert reading(run, "status")[0] > LOST_SAMPLE_FLAG
     np.testing.assert_array_equal(reading(run, "measured_wrench_S"), before)

@@ -43,8 +43,8 @@ def is_absolutely_stable(H: Complex) -> BooleanArray:
     return _is_criterion_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
 
 
-def _is_criterion_met(H: Complex, criterion: Array, criterion_size: Array) -> BooleanArray:
-    met = criterion >= -_RELATIVE_ROUNDING_TOLERANCE * criterion_size
+def _is_criterion_met(H: Complex, criterion: Array, term_magnitude: Array) -> BooleanArray:
+    met = criterion >= -_RELATIVE_ROUNDING_TOLERANCE * term_magnitude
     for port in (H[..., 0, 0], H[..., 1, 1]):
         met &= port.real >= -_RELATIVE_ROUNDING_TOLERANCE * np.abs(port)
     return met
@@ -184,8 +184,8 @@ def singular_value_in_ranges(
 
     Below 1: no hand and environment in these ranges oscillate at `omega`.
     """
-    z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
-    e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
+    z, r1 = (values[..., :, None] for values in _discs_around_rectangle(hand.corners(omega)))
+    e, r2 = (values[..., None, :] for values in _discs_around_rectangle(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     reduction = 1 / (1 + h22 * e)
     displayed = z + h11 - h12 * h21 * e * reduction
@@ -201,7 +201,7 @@ def singular_value_in_ranges(
     return np.min(mu, axis=(-2, -1))
 
 
-def _enclosing_discs(corners: Complex) -> tuple[Complex, Array]:
+def _discs_around_rectangle(corners: Complex) -> tuple[Complex, Array]:
     half = (corners[..., 2:3] - corners[..., :1]) / 2
     # Centres of the discs, from few to many half diagonals beside the range.
     right = half.real + np.abs(half) * np.array([0.3, 1.0, 3.0, 10.0, 100.0])

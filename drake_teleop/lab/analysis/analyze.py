@@ -35,9 +35,9 @@ MAX_COMPARED_OMEGA_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison o
 #: Frequencies of the analysis [rad/s].
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
-_MAX_FITTED_OMEGA_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
-_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
-_MEASURING_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
+_MAX_IMPEDANCE_FIT_OMEGA_RAD_S = 2 * np.pi * 5.0  # limit of the fit of mass, damping and stiffness
+_NUM_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
+_PROBING_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def analyze_command(
@@ -294,13 +294,13 @@ def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
-        grip: _find_stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
+        grip: _find_max_stable_wall_stiffness(axis_with_grip(axis, grip), sampling)
         for grip in GRIP_IMPEDANCES
     }
     return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
 
 
-def _find_stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
+def _find_max_stable_wall_stiffness(axis: OneAxis, sampling: Sampling) -> float:
     stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
     walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
     loop = cut_loop.cut_loop(dataclasses.replace(axis, **walls), sampling)
@@ -309,7 +309,7 @@ def _find_stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str, Any]:
-    fitted = OMEGA <= _MAX_FITTED_OMEGA_RAD_S
+    fitted = OMEGA <= _MAX_IMPEDANCE_FIT_OMEGA_RAD_S
     figures: dict[str, Any] = {}
     for name, one in (("free", axis), ("wall", contact)):
         environment = environment_impedance(one, S_AT_OMEGA)
@@ -367,7 +367,7 @@ def measure_free_impedance(
     estimate = true_load(scenario)
     if not scenario.wrist_sensor.ideal:
         estimate[:6] = scenario.wrist_sensor.offset
-    found = measure_frequency_response(smooth, along, _MEASURING_MULTI_SINE, load_estimate=estimate)
+    found = measure_frequency_response(smooth, along, _PROBING_MULTI_SINE, load_estimate=estimate)
     # Held force: its component at the frequency itself, as in the two-port.
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
@@ -387,7 +387,7 @@ def measure_free_impedance(
 def parameter_maps(
     axis: OneAxis, contact: OneAxis, sampling: Sampling, stage: StartStage
 ) -> dict[str, dict[str, StabilityMap]]:
-    n, tool = _POINTS_PER_MAP_AXIS, axis.tool_mass
+    n, tool = _NUM_POINTS_PER_MAP_AXIS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)
     walls = np.geomspace(100.0, 1e5, n)
     # The sensor's low-pass has to stay below half of its rate.

@@ -18,7 +18,7 @@ from drake_teleop.lab.analysis import period_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 
 # Frequencies of the search as angles of z: five decades up to half the hand's rate.
-_SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
+_GAIN_CROSSING_SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
 # More angles near a pole, as multiples of its distance from the unit circle.
 _POLE_ANGLE_OFFSET_FACTORS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
@@ -48,7 +48,7 @@ class CutLoop:
         _find_gain_crossings_into(
             open_multipliers.reshape(-1, n),
             closed_multipliers.reshape(-1, n),
-            _SEARCH_ANGLES_RAD,
+            _GAIN_CROSSING_SEARCH_ANGLES_RAD,
             found.reshape(3, -1, _MAX_GAIN_CROSSINGS),
         )
         return cls(open_multipliers, closed_multipliers, np.broadcast_to(period_s, shape), *found)
@@ -82,22 +82,22 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < 1e-9:  # no loop
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    crossings = _zero_crossing_fractions(log_gain)
-    lag = np.mod(_interpolate_at_fractions(np.unwrap(angle), crossings), 2 * np.pi)
+    crossings = _zero_crossing_interval_fractions(log_gain)
+    lag = np.mod(_interpolate_in_intervals(np.unwrap(angle), crossings), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
-    factor = np.exp(-_interpolate_at_fractions(log_gain, fraction))
+    fraction = np.where(is_jump, np.nan, _zero_crossing_interval_fractions(angle))
+    factor = np.exp(-_interpolate_in_intervals(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _zero_crossing_fractions(value: Array) -> Array:
+def _zero_crossing_interval_fractions(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _interpolate_at_fractions(value: Array, fraction: Array) -> Array:
+def _interpolate_in_intervals(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
@@ -122,18 +122,18 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 @njit(cache=True)
-def _response_at(closed, opened, angle, radius):
+def _response_at(zeros, poles, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
-    for i in range(opened.shape[0]):
-        ratio *= (z - closed[i]) / (z - opened[i])
+    for i in range(poles.shape[0]):
+        ratio *= (z - zeros[i]) / (z - poles[i])
     return 1.0 - ratio
 
 
 @njit(cache=True)
-def _find_gain_crossings_into(opened, closed, angles, found):
-    for n in range(opened.shape[0]):
-        poles, zeros, count = opened[n], closed[n], 0
+def _find_gain_crossings_into(open_multipliers, closed_multipliers, angles, found):
+    for n in range(open_multipliers.shape[0]):
+        poles, zeros, count = open_multipliers[n], closed_multipliers[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
         value = _response_at(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
         before, size = 0.0, abs(value)
@@ -141,12 +141,12 @@ def _find_gain_crossings_into(opened, closed, angles, found):
         if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        more = _add_pole_angles(angles, poles)
+        more = _add_angles_near_poles(angles, poles)
         at, values = _add_gain_extremes_and_get_responses(more, poles, zeros)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
-            size, phase = abs(value), _unwrap_phase(value, last_phase)
+            size, phase = abs(value), _phase_near(value, last_phase)
             if (size > 1.0) != (last_size > 1.0) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
@@ -156,7 +156,7 @@ def _find_gain_crossings_into(opened, closed, angles, found):
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _unwrap_phase(_response_at(zeros, poles, low, 1.0), last_phase)
+                found[1, n, count] = _phase_near(_response_at(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -166,7 +166,7 @@ def _find_gain_crossings_into(opened, closed, angles, found):
 
 
 @njit(cache=True)
-def _add_pole_angles(angles, poles):
+def _add_angles_near_poles(angles, poles):
     pole_angles, offsets = np.abs(np.angle(poles)), np.abs(1.0 - np.abs(poles))
     more = (pole_angles + _POLE_ANGLE_OFFSET_FACTORS.reshape(-1, 1) * offsets).ravel()
     inside = (more > angles[0]) & (more < math.pi)
@@ -205,6 +205,6 @@ def _add_gain_extremes_and_get_responses(angles, poles, zeros):
 
 
 @njit(cache=True)
-def _unwrap_phase(value, near):
+def _phase_near(value, reference):
     phase = math.atan2(value.imag, value.real)
-    return phase + 2.0 * math.pi * np.rint((near - phase) / (2.0 * math.pi))
+    return phase + 2.0 * math.pi * np.rint((reference - phase) / (2.0 * math.pi))

@@ -19,7 +19,7 @@ from drake_teleop.station.slave.arm import jacobian
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
 
-_NUM_PHASE_DRAWS = 300  # number of random phase sets; the one with the lowest peak is used
+_NUM_PHASE_SETS = 300  # number of random phase sets; the one with the lowest peak is used
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class MultiSine:
 
     def _phases_with_lowest_peak(self) -> Array:
         k = self.odd_multiples_of_base_rate()
-        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_NUM_PHASE_DRAWS, len(k)))
+        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_NUM_PHASE_SETS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])
         angle = 2 * np.pi * np.outer(u, k)
         peaks = [np.abs(np.cos(angle + draw).sum(axis=1)).max() for draw in draws]

@@ -48,10 +48,10 @@ _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", 
 
 # Difference steps: truncation error grows with their square, rounding error with their inverse.
 _ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
-_HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
+_WRENCH_DIFFERENCE_STEPS = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 = 20.0  # of a joint: within the motors' torque
-_JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
-_MAX_CHANGE_TO_STEP_RATIO_AT_REST = 1e-6  # change in one period over difference step
+_MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
+_MAX_RELATIVE_STATE_CHANGE_AT_REST = 1e-6  # change in one period over difference step
 _MAX_EQUILIBRIUM_NEWTON_STEPS = 8
 _TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = 0.3, 0.1  # motion, then rest
 
@@ -187,7 +187,7 @@ class _PeriodSimulator:
         self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 / gain)
         self._joint_step = self._command_step
         if smooth.surroundings is not None:
-            self._joint_step = min(self._command_step, _JOINT_DIFFERENCE_STEP_IN_CONTACT)
+            self._joint_step = min(self._command_step, _MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT)
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
@@ -274,7 +274,7 @@ class _PeriodSimulator:
         self._fix_input_port("slave_plant", "applied_spatial_force", [self._push])
         self._fix_input_port("wrist_sensor", "applied_wrench_W", push)
 
-    def _run_one_period(self) -> Array:
+    def _simulate_period_and_get_state(self) -> Array:
         # At this time no event of noise or log interferes.
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
@@ -320,7 +320,7 @@ class _PeriodSimulator:
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
             self._apply_input_changes(np.zeros(24))
-            self._run_one_period()
+            self._simulate_period_and_get_state()
         x = self._balance_hand_force_and_get_state()
         return self._find_equilibrium_state_and_derivatives(x)
 
@@ -337,8 +337,8 @@ class _PeriodSimulator:
             A, C = self.differentiate_by_state(x)
             free = slave & _states_affecting_outputs(A, C)
             self._set_state(x)
-            moved = self._run_one_period() - x
-            if (np.abs(moved) < _MAX_CHANGE_TO_STEP_RATIO_AT_REST * self._sizes)[free].all():
+            moved = self._simulate_period_and_get_state() - x
+            if (np.abs(moved) < _MAX_RELATIVE_STATE_CHANGE_AT_REST * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
@@ -351,7 +351,7 @@ class _PeriodSimulator:
         def outputs_and_end_state(change: Array) -> Array:
             self._set_state(x + change)
             outputs = self._evaluate_outputs()
-            return np.concatenate([outputs, self._run_one_period()])
+            return np.concatenate([outputs, self._simulate_period_and_get_state()])
 
         self._apply_input_changes(np.zeros(24))
         C, A = np.split(_central_difference_jacobian(outputs_and_end_state, self._steps), [30])
@@ -361,10 +361,10 @@ class _PeriodSimulator:
         def end_state(change: Array) -> Array:
             self._set_state(x)
             self._apply_input_changes(change)
-            return self._run_one_period()
+            return self._simulate_period_and_get_state()
 
         pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
-        steps = np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
+        steps = np.concatenate([_WRENCH_DIFFERENCE_STEPS, pose, _WRENCH_DIFFERENCE_STEPS, tool])
         return _central_difference_jacobian(end_state, steps)
 
 

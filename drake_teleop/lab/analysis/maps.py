@@ -51,7 +51,7 @@ def stability_map(
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
     def evaluate(x: Array, y: Array) -> tuple[OneAxis, CutLoop, NDArray[np.int64]]:
-        changed_axis, loop = _set_values_and_open_loop(axis, sampling, {x_name: x, y_name: y})
+        changed_axis, loop = _apply_values_and_cut_loop(axis, sampling, {x_name: x, y_name: y})
         return changed_axis, loop, cut_loop.count_unstable_multipliers(loop, changed_axis.delay)
 
     points = np.stack(np.meshgrid(xs, ys), axis=-1)
@@ -102,7 +102,7 @@ def _check_parameter_values(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _set_values_and_open_loop(
+def _apply_values_and_cut_loop(
     axis: OneAxis, sampling: Sampling, values: dict[str, Any]
 ) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():

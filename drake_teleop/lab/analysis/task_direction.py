@@ -103,13 +103,13 @@ def task_direction(
         sigma=sigma,
         gamma=gamma,
         delay=0.5 * (forward.delay + backward.delay),
-        wall_stiffness=_stiffness_of_leaf_or_wall(scenario),
+        wall_stiffness=_environment_stiffness(scenario),
         wall_damping=0.0 if sheet is None else float(sheet.damping),
     )
     return TaskDirection(axis, hand_B, tool_W, float(mass_acceleration / mobility))
 
 
-def _stiffness_of_leaf_or_wall(scenario: Scenario) -> float:
+def _environment_stiffness(scenario: Scenario) -> float:
     if scenario.first_sheet_spring is not None:
         return float(scenario.first_sheet_spring.stiffness)
     wall = scenario.surroundings
@@ -120,7 +120,7 @@ def _stiffness_of_leaf_or_wall(scenario: Scenario) -> float:
 
 
 def _device_mass_and_damping(
-    scenario: Scenario, displacement_B: Array, n: Array
+    scenario: Scenario, displacement_B: Array, direction_B: Array
 ) -> tuple[float, float]:
     hand = scenario.operator.hand
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
@@ -128,8 +128,8 @@ def _device_mass_and_damping(
     device = scenario.master.device(hand.mass, hand.inertia)
     q = device.inverse_kinematics(start)
     J, M = device.jacobian(q), device.mass_matrix(q)
-    rate = np.linalg.solve(M, J.T @ n)  # of the joints, for a unit force
-    mobility = n @ J @ rate
+    rate = np.linalg.solve(M, J.T @ direction_B)  # of the joints, for a unit force
+    mobility = direction_B @ J @ rate
     damping = rate @ device.damping_matrix(q) @ rate / mobility**2
     return float(1 / mobility - hand.mass), float(damping)
 

@@ -42,7 +42,7 @@ JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
-_SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+_INJECTED_ENERGY_STUDY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of every run: a quarter (sensor) or half of those of the shipped scenarios.
 _COMPARISON_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
@@ -78,8 +78,8 @@ def compare_command(
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
-        limits = _run_one_dof_study(methods, seed, jobs, stage)
-        released = _run_release_study(networks, methods, seed, jobs, stage)
+        limits = _run_round_trip_study(methods, seed, jobs, stage)
+        released = _run_release_and_tap_study(networks, methods, seed, jobs, stage)
         runs, traces = _run_station_study(base, networks, methods, jobs, stage)
         covering = _run_injected_energy_study(stage)
     summary = {
@@ -156,7 +156,7 @@ def simulate_press(
     setup, task = whole_station.press_scenario(scenario, channel, passivity, leaf)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
-        result, found = _run_while_stable(station, setup, task)
+        result, found = _simulate_press_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = whole_station.force_and_energy_traces(result, setup)
@@ -174,7 +174,7 @@ def simulate_press(
     return row | {"error": None}, shown
 
 
-def _run_while_stable(
+def _simulate_press_while_stable(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, RunMeasures]:
     settle = scenario.simulation.settle
@@ -233,31 +233,31 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
         release_speed=float(np.abs(np.diff(after)).max() / PERIOD_S),
         release_way=float(np.abs(after - after[0]).max()),
         tap_shares=tuple(
-            _tap_impulse_share(found, scale, rate, 0.5 * round_trip)
+            _displayed_share_of_tap_impulse(found, scale, rate, 0.5 * round_trip)
             for found, rate in zip(tapping, TAP_RATES_HZ, strict=True)
         ),
         leaked=max(0.0, *(-r.least_energy_sum(one_dof.AT_SLAVE) for r in (released, *tapping))),
     )
 
 
-def _intended_tap_motion(rate: float, round_trip: float) -> Array:
-    t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD_S)) * PERIOD_S - 0.5
-    moving = (t > 0.0) & (t < _NUM_TAPS / rate)
-    x = np.where(moving, -_TAP_AMPLITUDE_ABOUT_WALL_M * np.sin(2 * np.pi * rate * t), 0.0)
+def _intended_tap_motion(tap_hz: float, round_trip: float) -> Array:
+    t = np.arange(round((1.0 + _NUM_TAPS / tap_hz + round_trip + 1.0) / PERIOD_S)) * PERIOD_S - 0.5
+    moving = (t > 0.0) & (t < _NUM_TAPS / tap_hz)
+    x = np.where(moving, -_TAP_AMPLITUDE_ABOUT_WALL_M * np.sin(2 * np.pi * tap_hz * t), 0.0)
     return np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
 
 
-def _tap_impulse_share(
-    run: one_dof.OneDofRun, scale: float, rate: float, one_way_delay_s: float
+def _displayed_share_of_tap_impulse(
+    run: one_dof.OneDofRun, force_scale: float, tap_hz: float, one_way_delay_s: float
 ) -> float:
     first = int(np.argmax(run.wall_force < 0.0))
-    second = first + round(0.75 / rate / PERIOD_S)  # between first and second contact
-    pressed = scale * run.wall_force[second:].sum()
+    second = first + round(0.75 / tap_hz / PERIOD_S)  # between first and second contact
+    pressed = force_scale * run.wall_force[second:].sum()
     displayed = run.hand_force[second + round(one_way_delay_s / PERIOD_S) :].sum()
     return float(max(displayed / pressed, 0.0)) if pressed < 0.0 else 0.0
 
 
-def _run_one_dof_study(
+def _run_round_trip_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = [
@@ -282,7 +282,7 @@ def _run_one_dof_study(
     ]
 
 
-def _run_release_study(
+def _run_release_and_tap_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
@@ -316,14 +316,14 @@ def _run_station_study(
 
 def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
-    for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
+    for done, (sigma, round_trip, wall) in enumerate(_INJECTED_ENERGY_STUDY_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
         row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.AT_SLAVE))
         row["damping_Ns_per_m"] = one_dof.covering_damping(model, round_trip)
         rows.append(row)
-        progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))
+        progress((done + 1) / len(_INJECTED_ENERGY_STUDY_CASES))
     return rows
 
 

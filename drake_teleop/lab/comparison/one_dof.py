@@ -36,8 +36,8 @@ _SUBSTEPS_PER_CHANNEL_PERIOD = 20
 _DEVICE_FRICTION_SPEED_M_S, _SLAVE_FRICTION_SPEED_M_S = 5e-3, 1e-3
 AT_HAND, AT_COMMAND, AT_MOTOR, AT_SLAVE = range(4)  #: places of the energy balances
 
-_RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD_S, 20000) * 2 * np.pi  # rad/s
-_MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
+_IMPEDANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD_S, 20000) * 2 * np.pi  # rad/s
+_MAX_PEAK_TO_PEAK_AT_REST_M = 0.5e-3  # m, peak to peak at rest
 TAP_RATES_HZ = (1.0, 1.5)  #: Hz
 WRIST_TO_TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest position, intended depth
@@ -210,7 +210,7 @@ def run_one_dof(
     # These methods use the motor's force, which is held over a period; the others interpolate the
     # command over it.
     held = METHODS[passivity.method].balance_at_motors and not model.ideal_servo
-    rows = _simulate_steps(
+    rows = _simulate_one_dof_run(
         methods.step_addresses(passivity.method), tuple(map(float, numbers)), held, p, *lines,
         *states, ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
@@ -233,8 +233,8 @@ def operator_intent(task: Task = Task()) -> Array:
     return np.stack([x, np.gradient(x, PERIOD_S)], axis=1)
 
 
-def _smooth_ramp(t: Array, start: float, length: float) -> Array:
-    u = np.clip((t - start) / length, 0.0, 1.0)
+def _smooth_ramp(t: Array, start: float, duration: float) -> Array:
+    u = np.clip((t - start) / duration, 0.0, 1.0)
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
@@ -285,8 +285,8 @@ def measures_of_traces(
     start = round(task.press_start / dt)
     return RunMeasures(
         stable=bool(
-            hunting < _MAX_MOTION_AT_REST_M
-            and turning < _MAX_MOTION_AT_REST_M / WRIST_TO_TIP_DISTANCE_M
+            hunting < _MAX_PEAK_TO_PEAK_AT_REST_M
+            and turning < _MAX_PEAK_TO_PEAK_AT_REST_M / WRIST_TO_TIP_DISTANCE_M
         ),
         hunting=hunting,
         turning=turning,
@@ -302,11 +302,11 @@ def measures_of_traces(
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
-    return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
+    return max(0.0, -float(_displayed_impedance_real_part(model, round_trip).min()))
 
 
-def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
-    s = 1j * _RESISTANCE_FREQUENCIES_RAD_S
+def _displayed_impedance_real_part(model: OneDof, round_trip: float) -> Array:
+    s = 1j * _IMPEDANCE_FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
     closed_loop = 1.0 if model.ideal_servo else K / slave
@@ -325,9 +325,9 @@ def _detrended_range(x: Array) -> float:
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_delay_in_samples(hand_force: Array, pressed: Array, steady: float) -> float:
-    level, sign = 0.5 * abs(steady), np.sign(steady)
-    exceeds, displayed = pressed * sign > level, hand_force * sign > level
+def _rise_delay_in_samples(hand_force: Array, contact_force: Array, steady_force: float) -> float:
+    level, sign = 0.5 * abs(steady_force), np.sign(steady_force)
+    exceeds, displayed = contact_force * sign > level, hand_force * sign > level
     start = int(np.argmax(exceeds))
     if not exceeds.any() or displayed[max(start - 1, 0)] or not displayed[start:].any():
         return float("nan")
@@ -335,9 +335,9 @@ def _rise_delay_in_samples(hand_force: Array, pressed: Array, steady: float) -> 
 
 
 @njit(cache=True)
-def _simulate_steps(
-    steps, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
-    course,
+def _simulate_one_dof_run(
+    steps, model, holds_motor_force, p, forward_line, backward_line, forward, backward, ends, start,
+    timeout, course,
 ):  # fmt: skip
     device_mass, friction, slave_mass, K, D, ideal, slave_friction, lag = model[:8]
     tool_mass, wall_damping, scale, sigma, gamma = model[8:13]
@@ -390,7 +390,7 @@ def _simulate_steps(
                 v_new = (command - before) / PERIOD_S
                 a_s, v_s = (v_new - v_s) / PERIOD_S if i == 0 else a_s, v_new
             else:
-                if not held:
+                if not holds_motor_force:
                     servo_force = K * (before + share * (command - before) - x_s) - D * v_s
                 motor = motor + dt / lag * (servo_force - motor) if lag > dt else servo_force
                 a_s = (motor - max(push, 0.0)) / slave_mass
@@ -424,9 +424,9 @@ def _wall_force(stiffness, damping, depth, speed):
 
 
 @njit(cache=True)
-def _mean_of_positive_part_of_ramp(a, b):
-    if a >= 0.0 and b >= 0.0:
-        return 0.5 * (a + b)
-    if a <= 0.0 and b <= 0.0:
+def _mean_of_positive_part_of_ramp(start, end):
+    if start >= 0.0 and end >= 0.0:
+        return 0.5 * (start + end)
+    if start <= 0.0 and end <= 0.0:
         return 0.0
-    return 0.5 * max(a, b) ** 2 / abs(b - a)
+    return 0.5 * max(start, end) ** 2 / abs(end - start)

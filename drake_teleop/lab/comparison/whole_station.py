@@ -33,7 +33,7 @@ _TIP_LEAF_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the s
 _LEAF_SPRING_LENGTH_M, _LEAF_WIDTH_M = 0.12, 0.05  # m
 # m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 # needs 9,000 to 16,000 steps per second instead of 1,500.
-_LEAF_SLIP_SPEED_M_S = 1e-3
+_LEAF_STICTION_TOLERANCE_M_S = 1e-3
 #: Leaves by name: thickness [m], light enough not to oscillate.
 LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
@@ -91,7 +91,7 @@ def press_scenario(
         length=_LEAF_SPRING_LENGTH_M,
         width=_LEAF_WIDTH_M,
         thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
-        slip_speed=_LEAF_SLIP_SPEED_M_S,
+        slip_speed=_LEAF_STICTION_TOLERANCE_M_S,
     )
     scenario = replace(
         base.without_environment(),
@@ -168,7 +168,7 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
     gamma = scenario.force_scaling.scales().gamma
-    power = scenario.force_scaling.force_scale * gamma / _kinematic_scales(scenario)
+    power = scenario.force_scaling.force_scale * gamma / _nonzero_kinematic_scales(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
@@ -209,7 +209,7 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
     wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
     wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
-    power = scenario.force_scaling.force_scale / _kinematic_scales(scenario)
+    power = scenario.force_scaling.force_scale / _nonzero_kinematic_scales(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
@@ -218,14 +218,14 @@ def start_energy(scenario: Scenario) -> Array:
 
     Columns: translation, rotation.
     """
-    scales = _kinematic_scales(scenario)
+    scales = _nonzero_kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     return 2 * methods.initial_method_memory(scenario.passivity.method, p, pose)[STORED_ENERGY]
 
 
-def _kinematic_scales(scenario: Scenario) -> Array:
+def _nonzero_kinematic_scales(scenario: Scenario) -> Array:
     scales = scenario.kinematic_scaling.scales
     return np.where(scales > 0.0, scales, 1.0)
 

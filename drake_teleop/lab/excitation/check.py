@@ -130,11 +130,11 @@ def _evaluate_limited_quantities(
         if k % 200 == 0:
             progress(k / len(q))
     progress(1.0)
-    sensor = _force_and_motion_norms(M_S, *kinematics.swapaxes(0, 1))
+    sensor = _wrench_and_motion_norms(M_S, *kinematics.swapaxes(0, 1))
     return torque, sensor, workspace, clearance, nearest
 
 
-def _force_and_motion_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
+def _wrench_and_motion_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))

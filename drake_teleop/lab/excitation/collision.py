@@ -98,7 +98,7 @@ _MIN_POSTURES_NEAR_CONTACT = 5  # for a correction
 # Pairs whose capsules are near in fewer postures count although their shapes were never near.
 _MAX_POSTURE_SHARE_OF_RARE_CONTACT = 0.05
 
-_TABLE_NAME = "drake_teleop_table"
+_TABLE_SHAPE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
 _BOX_FOR_HALF_SPACE = geometry.Box(10, 10, 1)
 _POSE_OF_BOX_FOR_HALF_SPACE = RigidTransform([0, 0, -0.5])
@@ -124,10 +124,10 @@ class CollisionScene:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
-        _add_load(self.plant, instance, self.sensor_frame, extra_phi)
-        _complete_and_check_shapes(self.plant, self.scene_graph, visuals_collide, where)
+        _add_load_body(self.plant, instance, self.sensor_frame, extra_phi)
+        _add_collision_shapes_and_check_sizes(self.plant, self.scene_graph, visuals_collide, where)
         world, table = self.plant.world_body(), geometry.HalfSpace()
-        _add_shape(self.plant, world, RigidTransform(), table, _TABLE_NAME)
+        _add_collision_shape(self.plant, world, RigidTransform(), table, _TABLE_SHAPE_NAME)
         finalize_without_limit_warnings(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
@@ -180,7 +180,7 @@ class CollisionScene:
                 names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
                 touching.append(" and ".join(names))
             if touch or neighbours:
-                _exclude_pair(manager, a, b)
+                _exclude_collision_pair(manager, a, b)
                 del distances[a, b]
         return distances, sorted(set(touching))
 
@@ -205,7 +205,7 @@ class CollisionScene:
                 X_WL = RigidTransform(RotationMatrix(R_WL.reshape(3, 3)), p_WL)
             X_LG = X_WL.InvertAndCompose(X_WB) @ inspector.GetPoseInFrame(shape)
             capsules[shape] = row, bounding_capsule(inspector.GetShape(shape)).transformed(X_LG)
-            if inspector.GetName(shape).endswith(_TABLE_NAME):
+            if inspector.GetName(shape).endswith(_TABLE_SHAPE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _find_largest_enclosing_shape(shape, capsules) for shape in capsules}
         outer_shapes = sorted(set(outer.values()), key=geometry.GeometryId.get_value)
@@ -259,10 +259,10 @@ def _exclude_coaxial_pairs(
         first = of_pair[:_NUM_COAXIALITY_POSTURES]
         if first.max() < min(MIN_CLEARANCE_M, first.min() + _MIN_PAIR_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
-            _exclude_pair(manager, a, b)
+            _exclude_collision_pair(manager, a, b)
 
 
-def _exclude_pair(
+def _exclude_collision_pair(
     manager: geometry.CollisionFilterManager, a: geometry.GeometryId, b: geometry.GeometryId
 ) -> None:
     exclude = geometry.CollisionFilterDeclaration().ExcludeBetween
@@ -281,7 +281,7 @@ def _find_largest_enclosing_shape(
     return max(holding, key=lambda entry: entry[:2])[2]
 
 
-def _add_load(
+def _add_load_body(
     plant: MultibodyPlant, instance: tree.ModelInstanceIndex, frame: tree.Frame, phi: Array
 ) -> None:
     mass, unit = float(phi[0]), inertia_about_origin(phi) / phi[0]
@@ -292,7 +292,7 @@ def _add_load(
     plant.AddJoint(weld)
 
 
-def _complete_and_check_shapes(
+def _add_collision_shapes_and_check_sizes(
     plant: MultibodyPlant, scene_graph: geometry.SceneGraph, visuals_collide: bool, where: str
 ) -> None:
     inspector = scene_graph.model_inspector()
@@ -303,11 +303,11 @@ def _complete_and_check_shapes(
             if isinstance(shape := inspector.GetShape(solid), geometry.HalfSpace):
                 X_BG = inspector.GetPoseInFrame(solid)
                 scene_graph.RemoveRole(plant.get_source_id(), solid, geometry.Role.kProximity)
-                _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
+                _add_collision_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
         visuals = plant.GetVisualGeometriesForBody(body) if visuals_collide or not solids else ()
         for k, visual in enumerate(visuals):
             X_BG, shape = inspector.GetPoseInFrame(visual), inspector.GetShape(visual)
-            _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
+            _add_collision_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
         for shape in map(inspector.GetShape, plant.GetCollisionGeometriesForBody(body)):
             if isinstance(shape, geometry.HalfSpace):  # replaced by a plate
                 continue
@@ -319,7 +319,7 @@ def _complete_and_check_shapes(
                 raise DrakeTeleopError(what, where=where, remedy="give all lengths in metres")
 
 
-def _add_shape(
+def _add_collision_shape(
     plant: MultibodyPlant,
     body: tree.RigidBody,
     X_BG: RigidTransform,

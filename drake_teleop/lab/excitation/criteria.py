@@ -26,7 +26,7 @@ INFORMATION_SAMPLE_RATE_HZ = 1000.0  #: sample rate of A16 and D16 [Hz]
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
 _MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
 _MAX_COM_ERROR_M = 1e-3
-_MAX_OFFSET_ERRORS = (0.1, 0.005)
+_MAX_OFFSET_ERRORS_N_NM = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
 _MIN_EIGENVALUE_RATIO = 1e-13
 
@@ -67,7 +67,7 @@ class Criterion:
         if name == "kappa_w10":
             columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
-            columns = _acceptable_errors(scales.nominal_phi)
+            columns = _acceptable_parameter_errors(scales.nominal_phi)
         self._columns = columns
 
     def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
@@ -144,10 +144,10 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
     g_omega[2] = 2 * z * zz + x * xz + y * yz
 
 
-def _acceptable_errors(phi: Array) -> Array:
+def _acceptable_parameter_errors(phi: Array) -> Array:
     inertia = _MAX_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
     mass, moment = _MAX_RELATIVE_MASS_ERROR * phi[0], _MAX_COM_ERROR_M * phi[0]
-    return np.repeat([*_MAX_OFFSET_ERRORS, mass, moment, inertia], [3, 3, 1, 3, 6])
+    return np.repeat([*_MAX_OFFSET_ERRORS_N_NM, mass, moment, inertia], [3, 3, 1, 3, 6])
 
 
 def _smooth_maximum_and_weights(values: Array, sharpness: float) -> tuple[float, Array]:

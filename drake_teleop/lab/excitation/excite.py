@@ -19,7 +19,7 @@ from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
-_MOTION_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
+_AMPLITUDE_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
 _MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKED_CANDIDATES = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
@@ -78,7 +78,7 @@ def excite(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.criterion_value for iterate in found), default=np.inf))
-        small = _shrinking_motions_about_start_posture(robot, found, problem, seed)
+        small = _fallback_motions_about_start_posture(robot, found, problem, seed)
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
     excitation = assemble_excitation(robot, criterion, found, trajectory, uses)
     if not np.isfinite(excitation.values[criterion]):
@@ -170,14 +170,14 @@ def _feasible_candidates(
         if iterate.criterion_value < _MIN_CRITERION_RATIO_OF_CANDIDATES * last[iterate.start_index]:
             continue
         last[iterate.start_index] = iterate.criterion_value
-        for factor in _MOTION_SHRINK_FACTORS:
+        for factor in _AMPLITUDE_SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_limit_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 break
 
 
-def _shrinking_motions_about_start_posture(
+def _fallback_motions_about_start_posture(
     robot: Robot,
     iterates: list[optimizer.FeasibleIterate],
     problem: optimizer.DesignProblem,

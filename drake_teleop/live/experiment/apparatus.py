@@ -19,7 +19,7 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-_MAX_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
+_MAX_FORCE_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
 _FORCE_AVERAGING_TIME_S, _MIN_TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
@@ -60,7 +60,7 @@ class Apparatus:
         if condition.eta is None:
             sigma = share
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
-        return {name: min(round(value), _MAX_SCALE_PERCENT) for name, value in values.items()}
+        return {name: min(round(value), _MAX_FORCE_SCALE_PERCENT) for name, value in values.items()}
 
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
@@ -132,9 +132,9 @@ class IntervalLog:
         self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
         self._rendered.append(rows["force_to_master"][:, :3])
         if self._insert is not None and not self.done_at:
-            self._detect_slot_floor(self._insert, rows)
+            self._detect_arrival_at_slot_floor(self._insert, rows)
 
-    def _detect_slot_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
+    def _detect_arrival_at_slot_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.p_WTip_start

@@ -30,12 +30,12 @@ from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
 #: Pause between the intervals of a trial [s].
-_INTERVAL_PAUSE_S = 0.8
-_SHOWN_FRAME_KEYS = (
+_INTERSTIMULUS_PAUSE_S = 0.8
+_FRAME_KEYS_SHOWN_TO_PARTICIPANT = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_HIDDEN_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
+_HIDDEN_FRAME_KEY_PLACEHOLDERS = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
 
 #: Names of the inputs that move the hand.
 PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
@@ -79,7 +79,7 @@ class GuidedExperiment:
             with_interval_seed(self._apparatus.scenario, procedure),
             self._apparatus.load,
             self._drives / name,
-            self._log_and_show_rows,
+            self._log_rows_and_return_scene_values,
             now,
             self._link,
             log=False,
@@ -89,7 +89,7 @@ class GuidedExperiment:
         if self._driver is not None:
             self._live.join(self._driver, now)
 
-    def _log_and_show_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _log_rows_and_return_scene_values(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add_rows(rows)
         hidden = ("measured_wrench_S", "load_estimate")
         return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
@@ -103,18 +103,18 @@ class GuidedExperiment:
 
     def join(self, client: int, now: float) -> None:
         if self._driver is None:
-            self._set_driver(client, now)
+            self._set_driving_page(client, now)
 
-    def _set_driver(self, client: int, now: float) -> None:
-        self._remove_driver(now)
+    def _set_driving_page(self, client: int, now: float) -> None:
+        self._remove_driving_page(now)
         self._driver = client
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
         if client == self._driver:
-            self._remove_driver(now)
+            self._remove_driving_page(now)
 
-    def _remove_driver(self, now: float) -> None:
+    def _remove_driving_page(self, now: float) -> None:
         if self._driver is None:
             return
         self._live.leave(self._driver, now)
@@ -141,7 +141,7 @@ class GuidedExperiment:
             self.refused += 1
             return
         if "drive" in message and client != self._driver:
-            self._set_driver(client, now)
+            self._set_driving_page(client, now)
         if client != self._driver:
             return
         procedure = self._procedure
@@ -182,7 +182,7 @@ class GuidedExperiment:
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP_PHASE and now - self._phase_start >= _INTERVAL_PAUSE_S:
+        if self._procedure.phase == GAP_PHASE and now - self._phase_start >= _INTERSTIMULUS_PAUSE_S:
             self._procedure.start_second_interval()
             self._live.pace.restart(now)
         if self._is_interval_running:
@@ -216,8 +216,8 @@ class GuidedExperiment:
         inputs = vars(Inputs()) | {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
-            **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
-            **_HIDDEN_FRAME_VALUES,
+            **{name: inner[name] for name in _FRAME_KEYS_SHOWN_TO_PARTICIPANT if name in inner},
+            **_HIDDEN_FRAME_KEY_PLACEHOLDERS,
             "f": [rendered] * 3,
             "scene": "own",
             "state": "stopped" if inner["stopped"] else "running",
@@ -264,7 +264,7 @@ class ExperimentDrive(LiveDrive):
         first = self._stations[0, 0]
         compile_slice_functions(first.scenario, first.load, device)
 
-    def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
+    def _make_live_session(self, scenario: Scenario, record: Path | None) -> Any:
         scenes = [view.scene_values for view in self._views.values()]
         now = time.perf_counter()
         return GuidedExperiment(self._procedure, self._stations, scenes, now, self._link)

@@ -49,10 +49,10 @@ class PsiMethod:
         shape = (_NUM_GRID_THRESHOLDS, len(_GRID_SLOPES), len(_GRID_LAPSE_RATES))
         self._posterior = np.full(shape, 1.0 / math.prod(shape))
         # P(correct) as (levels, thresholds, slopes and lapses).
-        p_correct = np.stack([self._grid_probability(x) for x in self.levels])
+        p_correct = np.stack([self._correct_probability_on_grid(x) for x in self.levels])
         self._p_correct = p_correct.reshape(_NUM_STIMULUS_LEVELS, _NUM_GRID_THRESHOLDS, -1)
 
-    def _grid_probability(self, level: float) -> Array:
+    def _correct_probability_on_grid(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
@@ -68,7 +68,7 @@ class PsiMethod:
         return float(self.levels[np.argmin(lost)])
 
     def update_posterior(self, level: float, correct: bool) -> None:
-        p = self._grid_probability(level)
+        p = self._correct_probability_on_grid(level)
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 

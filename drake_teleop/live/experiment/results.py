@@ -19,13 +19,13 @@ from drake_teleop.live.experiment.store import TrialRow, TrialStore, table_schem
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_DRAWN_QUANTITIES = (
+_PLOTTED_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_DONE_SHARE_QUANTITY = "share of trials done"
+_COMPLETED_SHARE_QUANTITY = "share of trials done"
 
 
 class ResultRow(NamedTuple):
@@ -57,7 +57,7 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    values, share = [r.value for r in one], quantity == _DONE_SHARE_QUANTITY
+                    values, share = [r.value for r in one], quantity == _COMPLETED_SHARE_QUANTITY
                     over = _mean_with_interval(values, share=share)
                     trials = sum(r.trials for r in one)
                     found.append(ResultRow(kind, condition.name, 0, trials, quantity, *over))
@@ -73,7 +73,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
 
         share = binomtest(len(done), len(rows))
         interval = share.proportion_ci(method="wilson")
-        found = {_DONE_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
+        found = {_COMPLETED_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -107,15 +107,15 @@ def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:
     )
     write_table(store.folder / "trials.csv", store.trials_table())
     write_table(store.folder / "results.csv", table)
-    _write_picture(store.folder / "results.png", experiment, found)
+    _write_results_plot(store.folder / "results.png", experiment, found)
     return table
 
 
-def _write_picture(path: Path, experiment: Experiment, found: list[ResultRow]) -> None:
+def _write_results_plot(path: Path, experiment: Experiment, found: list[ResultRow]) -> None:
     from drake_teleop.common.style import Picture, plot_style
 
     quantities = {r.quantity for r in found}
-    shown = [quantity for quantity in _DRAWN_QUANTITIES if quantity in quantities]
+    shown = [quantity for quantity in _PLOTTED_QUANTITIES if quantity in quantities]
     if not shown:
         return
     names = [condition.name for condition in experiment.conditions]

@@ -71,9 +71,9 @@ def simulate_participant(
         if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                result = _insert_peg(apparatus, procedure)
+                result = _simulate_peg_insertion(apparatus, procedure)
             else:
-                result, response = _run_with_response(apparatus, procedure)
+                result, response = _simulate_response(apparatus, procedure)
                 responses[procedure.interval - 1] = response
             procedure.finish_interval(result)
         elif procedure.phase == GAP_PHASE:
@@ -101,7 +101,7 @@ def answer_by_larger_response(
     return 1 if noisy[0] > noisy[1] else 2
 
 
-def _run_with_response(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
+def _simulate_response(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
@@ -126,7 +126,7 @@ def _run_with_response(apparatus: Apparatus, procedure: Procedure) -> tuple[Inte
     return result, rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _insert_peg(apparatus: Apparatus, procedure: Procedure) -> IntervalResult:
+def _simulate_peg_insertion(apparatus: Apparatus, procedure: Procedure) -> IntervalResult:
     task, condition, base = apparatus.task, apparatus.condition, apparatus.base
     assert isinstance(task, PegInSlot) and isinstance(base.operator.task, Insert)
     scenario = replace(

@@ -53,7 +53,7 @@ def table_schema(row: type) -> dict[str, type[pl.DataType]]:
     return {name: types[kind] for name, kind in get_type_hints(row).items()}
 
 
-_TRIAL_SCHEMA = table_schema(TrialRow)
+_TRIAL_COLUMN_TYPES = table_schema(TrialRow)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class TrialStore:
             return []
         remedy = "remove this file; the participant then starts again"
         with wrap_read_errors(path, remedy):
-            table = pl.read_csv(path, schema=_TRIAL_SCHEMA)
+            table = pl.read_csv(path, schema=_TRIAL_COLUMN_TYPES)
         rows = [TrialRow(**row) for row in table.iter_rows(named=True)]
         gaps = [index for index, row in enumerate(rows) if row.trial != index]
         if gaps or table.null_count().sum_horizontal()[0]:
@@ -85,7 +85,7 @@ class TrialStore:
 
     def write_rows(self, participant: int, rows: list[TrialRow]) -> None:
         make_folder(self.participant_file(participant).parent)
-        table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_TRIAL_SCHEMA)
+        table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_TRIAL_COLUMN_TYPES)
         write_table(self.participant_file(participant), table)
 
     def trials_table(self) -> pl.DataFrame:
@@ -94,7 +94,7 @@ class TrialStore:
             for n in self.participant_numbers()
             for row in self.read_rows(n)
         ]
-        return pl.DataFrame(rows, schema={"participant": pl.Int64, **_TRIAL_SCHEMA})
+        return pl.DataFrame(rows, schema={"participant": pl.Int64, **_TRIAL_COLUMN_TYPES})
 
 
 @contextmanager

@@ -14,9 +14,9 @@ from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
 from drake_teleop.load.normal_equations import unidentifiable_mass_error
 
 _PSEUDO_INERTIA_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
-_CONSTRAINT_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
+_PSEUDO_INERTIA_LMI_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
 _PHI_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
-_MIN_LENGTH_UNIT_M = 1e-3  # lower bound of the length unit L [m]
+_MIN_SCALING_LENGTH_M = 1e-3  # lower bound of the length unit L [m]
 # Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
 _MIN_KEPT_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 
@@ -29,7 +29,7 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     """
     if is_physically_consistent(theta[6:]):
         return theta
-    unit = _scales_of_phi(theta[6:])
+    unit = _natural_scales_of_phi(theta[6:])
     cross = gram[:6, 6:]
     offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
@@ -41,12 +41,12 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])
 
 
-def _scales_of_phi(phi: Array) -> Array:
+def _natural_scales_of_phi(phi: Array) -> Array:
     m = abs(phi[0])
     if m == 0.0:
         raise unidentifiable_mass_error("the fitted mass is 0")
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
-    L = max(_MIN_LENGTH_UNIT_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
+    L = max(_MIN_SCALING_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
 
 
@@ -71,7 +71,7 @@ def _cone_program_of_thread(thread: int) -> tuple[Any, Any, Any, Any]:
 
     program = MathematicalProgram()
     x, t = program.NewContinuousVariables(10), program.NewContinuousVariables(1)
-    program.AddLinearMatrixInequalityConstraint(_CONSTRAINT_MATRICES, x)
+    program.AddLinearMatrixInequalityConstraint(_PSEUDO_INERTIA_LMI_MATRICES, x)
     program.AddLinearCost([1.0], t)
     A, b = np.eye(11, 11, 10), np.zeros(11)
     cone = program.AddLorentzConeConstraint(A, b, np.append(x, t)).evaluator()

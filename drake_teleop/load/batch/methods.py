@@ -39,7 +39,7 @@ _MIN_WRENCH_NOISE_VARIANCE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
-_STD_PER_NORMAL_MAD = 1.4826
+_NORMAL_STD_OVER_MEDIAN_DEVIATION = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
 _MIN_SAMPLES_TO_REJECT, _MAX_HUBER_SAMPLES, _MAX_FIT_STD_GROWTH = 12, 50_000, 2.0
@@ -68,12 +68,12 @@ class BatchResult:
     equations: SecondMoments
 
 
-def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+def _fit_ordinary_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
     form = total_least_squares(record.moments, NoiseStd(), np.ones(6), offsets=options.offsets)
     return EstimatorFit(form, np.ones(6), record.moments, np.zeros(len(record.s), bool))
 
 
-def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+def _fit_whitened_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
     return _fit_total_least_squares(record, replace(options, noise=NoiseStd(options.noise.wrench)))
 
 
@@ -102,8 +102,8 @@ def _fit_total_least_squares(
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 
 
-def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    fit = _fit_robust(record, options)
+def _fit_consistent_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+    fit = _fit_robust_least_squares(record, options)
     gram, right, theta = fit.form[:3]
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
@@ -111,13 +111,13 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
     return replace(fit, form=fit.form._replace(theta=consistent_least_squares(gram, right, theta)))
 
 
-def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+def _fit_robust_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
     whole = _fit_total_least_squares(record, options)
     n = len(record.s)
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
     # A subset of the samples is sufficient as a starting point.
-    form = _fit_huber(record.with_row_step(max(1, n // _MAX_HUBER_SAMPLES)), options)
+    form = _fit_huber_regression(record.with_row_step(max(1, n // _MAX_HUBER_SAMPLES)), options)
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
@@ -134,7 +134,7 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
     return replace(fit, rejected=rejected)
 
 
-def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> SolvedNormalEquations:
+def _fit_huber_regression(record: SampleRecord, options: EstimatorOptions) -> SolvedNormalEquations:
     moments, weights = record.moments, np.ones(len(record.s))
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
@@ -169,11 +169,11 @@ class Method(NamedTuple):
 METHODS = Registry(
     "estimator",
     {
-        "ordinary": Method("batch least squares", _fit_ordinary),
-        "whitened": Method("whitened least squares", _fit_whitened),
-        "robust": Method("robust least squares", _fit_robust),
+        "ordinary": Method("batch least squares", _fit_ordinary_least_squares),
+        "whitened": Method("whitened least squares", _fit_whitened_least_squares),
+        "robust": Method("robust least squares", _fit_robust_least_squares),
         "total": Method("total least squares", _fit_total_least_squares),
-        "consistent": Method("physically consistent least squares", _fit_consistent),
+        "consistent": Method("physically consistent least squares", _fit_consistent_least_squares),
     },
     Method,
 )
@@ -248,7 +248,7 @@ def _largest_residuals_over_robust_std(record: SampleRecord, theta: Array, share
     if shared:
         median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_STD_PER_NORMAL_MAD * median, _MIN_NOISE_OVER_RMS * rms)
+    scale = np.maximum(_NORMAL_STD_OVER_MEDIAN_DEVIATION * median, _MIN_NOISE_OVER_RMS * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
     for start in range(0, n, SAMPLES_PER_CHUNK):

@@ -63,7 +63,7 @@ def total_least_squares(
     excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
     previous, min_remaining = np.zeros(16), excess / (1.0 + excess)
     for _ in range(_MAX_REWEIGHTINGS):
-        form = _solve_compensated_equations(Z, Q, W, offsets, min_remaining)
+        form = _solve_noise_compensated_equations(Z, Q, W, offsets, min_remaining)
         change = np.linalg.norm(form.theta - previous)
         if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
             break
@@ -72,7 +72,7 @@ def total_least_squares(
     return form
 
 
-def _solve_compensated_equations(
+def _solve_noise_compensated_equations(
     Z: Array, Q: Array, W: Array, offsets: bool, min_remaining: float
 ) -> SolvedNormalEquations:
     gram, right = normal_equations(Z, W)

@@ -126,7 +126,7 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
         c = coefficients / coefficients[leading_index]
         std = float(np.sqrt(max(0.0, c @ covariance @ c)))
         relative_std = std / float(np.linalg.norm(c * natural))
-        words = _combination_text(c, leading_index, np.abs(c) * natural)
+        words = _parameter_combination_text(c, leading_index, np.abs(c) * natural)
         return ParameterCombination(c, leading_index, float(c @ theta), std, relative_std, words)
 
     # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
@@ -159,7 +159,7 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
-def _combination_text(coefficients: Array, leading_index: int, weights: Array) -> str:
+def _parameter_combination_text(coefficients: Array, leading_index: int, weights: Array) -> str:
     weights = weights / weights.max()
     text = identification.PARAMETER_NAMES[leading_index]
     for i in np.flatnonzero(weights >= _MIN_TERM_SHARE_WITH_NUMBER):

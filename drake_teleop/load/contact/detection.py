@@ -168,10 +168,10 @@ def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUS
     # Without contact, which would reset the sums.
     flag_settings = float(positive_array("slack", slack)), 0.0, 0, np.inf, CONTACT_END_LEVEL, 0
     settings = floor.compiled_parameters, flag_settings
-    return _statistics_and_flags(np.zeros(MEMORY_SIZE), samples, settings)[0]
+    return _statistics_and_contact_flags(np.zeros(MEMORY_SIZE), samples, settings)[0]
 
 
-def _statistics_and_flags(
+def _statistics_and_contact_flags(
     memory: Array, samples: tuple[ArrayLike, ...], settings: tuple[Any, Any]
 ) -> tuple[Array, NDArray[np.bool_]]:
     rows = validate_detector_samples(*samples)
@@ -222,7 +222,7 @@ class ContactDetector:
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
         """Process the arrays of a `DetectorSamples`; return (N,) True in contact."""
-        return _statistics_and_flags(self._memory, samples, self.settings)[1]
+        return _statistics_and_contact_flags(self._memory, samples, self.settings)[1]
 
 
 def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:

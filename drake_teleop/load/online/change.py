@@ -67,7 +67,7 @@ NEW_LOAD_SLICE = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
 _NEW_LOAD_COVARIANCE_SLICE = slice(NEW_LOAD_SLICE.stop, MEMORY_SIZE)
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
-_MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
+_MIN_NOISE_TO_PRIOR_VARIANCE = 1e-10
 
 
 @njit(cache=True)
@@ -130,7 +130,7 @@ def update_estimate_by_block_mean(estimate, V, wrench, root):
             gain[i] = value
             predicted += row[i] * value
             uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, _MIN_ROW_VARIANCE_OVER_TERMS * uncorrelated) + predicted
+        total = max(1.0, _MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated) + predicted
         chi += innovation * innovation / total
         for i in range(16):
             theta[i] += gain[i] * innovation / total
@@ -140,7 +140,7 @@ def update_estimate_by_block_mean(estimate, V, wrench, root):
 
 
 @njit(cache=True)
-def _update_filter(memory, filter_start, block, noise):
+def _update_load_filter_by_block(memory, filter_start, block, noise):
     phi = memory[filter_start + 6 : filter_start + 16].copy()
     wrench = memory[_WRENCH_SUM_START:_MOTION_SUM_START]
     motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
@@ -200,20 +200,20 @@ def update_change_detector(memory, sample, block, noise, window, hold, mass_std_
     memory[_BLOCK_SAMPLES_INDEX] += 1.0
     if memory[_BLOCK_SAMPLES_INDEX] >= block:
         memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] /= block
-        _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio)
+        _update_change_state_by_block(memory, block, noise, window, hold, mass_std_ratio)
         memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] = 0.0
         memory[_BLOCK_SAMPLES_INDEX] = 0.0
 
 
 @njit(cache=True)
-def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
+def _update_change_state_by_block(memory, block, noise, window, hold, mass_std_ratio):
     if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]:
         if memory[_ESTIMATE_AGE_INDEX] >= window:
             excess = memory[_CUSUM_INDEX]
             _restart_filter_from_known_load(memory, _MONITOR_FILTER_START)
             memory[_CUSUM_INDEX] = excess
         memory[_ESTIMATE_AGE_INDEX] += 1.0
-        chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
+        chi = _update_load_filter_by_block(memory, _MONITOR_FILTER_START, block, noise)
         memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
         if memory[_CUSUM_INDEX] > _ALARM_CUSUM:
             memory[_STATE_INDEX], memory[_RETURN_CUSUM_INDEX] = STATE_DISTURBED, 0.0
@@ -221,14 +221,14 @@ def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
         return
     # Return to the known load if it explains the blocks without an update.
     copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
-    chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
+    chi = _update_load_filter_by_block(memory, _MONITOR_FILTER_START, block, noise)
     memory[_RETURN_CUSUM_INDEX] = min(0.0, memory[_RETURN_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
     if memory[_RETURN_CUSUM_INDEX] < _RETURN_TO_KNOWN_CUSUM:
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX]
         _restart_filter_from_known_load(memory, _MONITOR_FILTER_START)
         return
     # Test whether one new load explains all blocks since its start.
-    chi = _update_filter(memory, _NEW_FILTER_START, block, noise)
+    chi = _update_load_filter_by_block(memory, _NEW_FILTER_START, block, noise)
     memory[_ESTIMATE_AGE_INDEX] += 1.0
     for k in range(3):
         memory[_ALPHA_SQUARES_INDEX] += memory[_MOTION_SUM_START + 6 + k] ** 2
@@ -260,7 +260,7 @@ def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
 
 
 @njit(cache=True)
-def _process_samples_of_log(memory, samples, states, block, noise, window, hold, mass_std_ratio):
+def _detect_changes_in_samples(memory, samples, states, block, noise, window, hold, mass_std_ratio):
     for k in range(samples.shape[0]):
         update_change_detector(memory, samples[k], block, noise, window, hold, mass_std_ratio)
         states[k] = int(memory[_STATE_INDEX])
@@ -352,7 +352,7 @@ def detector_states_of_log(
     """Process a log of N samples; return the states (N,) as indices into `STATE_NAMES`."""
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
-    _process_samples_of_log(memory, np.concatenate(rows, axis=1), states, *parameters)
+    _detect_changes_in_samples(memory, np.concatenate(rows, axis=1), states, *parameters)
     return states
 
 

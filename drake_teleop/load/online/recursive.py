@@ -30,7 +30,7 @@ MAX_SETTLED_RELATIVE_STD = 0.05
 _MIN_RELATIVE_INFORMATION_EIGENVALUE = 1e-16
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
-_MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
+_MIN_NOISE_TO_PRIOR_VARIANCE = 1e-10
 
 
 @njit(cache=True)
@@ -69,7 +69,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual
                 innovation -= v * theta[6 + j]
                 predicted += v * gain[6 + j]
                 uncorrelated += v * v * P[6 + j, 6 + j]
-            variance = max(noise_std[c] * noise_std[c], _MIN_ROW_VARIANCE_OVER_TERMS * uncorrelated)
+            variance = max(noise_std[c] * noise_std[c], _MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated)
             inverse = 1.0 / (variance + predicted)
             share = innovation * inverse
             residual_square_sums[c] += variance * innovation * share

@@ -27,11 +27,11 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `normal_equations`.
 _WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
-_INDICES_IN_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
+_Z_INDICES_IN_BATCH_ORDER = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_MIN_INFORMATION_EXCESS = 4.0
+_MIN_COMPENSATED_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
-_MIN_RELATIVE_PIVOT = 1e-13
+_MIN_PIVOT_OVER_DIAGONAL = 1e-13
 # Fewest samples for the noise scale from residuals.
 _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 
@@ -39,7 +39,7 @@ _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 @cache
 def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
     """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
-    T = regressor_coefficients()[:, :, _INDICES_IN_BATCH_MOMENTS].swapaxes(1, 2)
+    T = regressor_coefficients()[:, :, _Z_INDICES_IN_BATCH_ORDER].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
     return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
@@ -212,7 +212,7 @@ def select_compensated_parameters(G, N, strength, K, taper):
     eliminate_rows(K)
     definite = True
     for i in range(16):
-        definite &= K[i, i] > _MIN_RELATIVE_PIVOT * G[i, i]
+        definite &= K[i, i] > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]
     if definite:
         return
     for i in range(16):
@@ -226,9 +226,9 @@ def select_compensated_parameters(G, N, strength, K, taper):
             total = G[i, i] - strength * taper[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
-            if total > _MIN_RELATIVE_PIVOT * G[i, i]:
+            if total > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]:
                 break
-        if not total > _MIN_RELATIVE_PIVOT * G[i, i]:
+        if not total > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]:
             taper[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
@@ -275,7 +275,7 @@ def rtls_update(
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        gain = 1.0 - _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
+        gain = 1.0 - _MIN_COMPENSATED_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
             select_compensated_parameters(G, N, scale / gain, K, taper)
             for i in range(6, 16):
@@ -313,8 +313,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        min_excess = _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
-        excited = (shares < _MIN_RELATIVE_PIVOT) | (excess > min_excess)
+        min_excess = _MIN_COMPENSATED_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
+        excited = (shares < _MIN_PIVOT_OVER_DIAGONAL) | (excess > min_excess)
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
         factor = inverse @ _regularized_cholesky(scale * G + information)
         unknown = directions[:, ~excited]
@@ -336,7 +336,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
 
 
 def _regularized_cholesky(A: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(A + _MIN_RELATIVE_PIVOT * np.diag(np.diag(A))))
+    return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT_OVER_DIAGONAL * np.diag(np.diag(A))))
 
 
 METHODS: Registry[type[RecursiveEstimator]] = Registry(

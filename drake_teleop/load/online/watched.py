@@ -53,7 +53,7 @@ def initial_monitor_memory(theta: Array, covariance: Array) -> Array:
 
 
 @njit(cache=True)
-def _update_and_test_rest(memory, sample, period):
+def _update_rest_detector(memory, sample, period):
     share = period / (_LOW_PASS_TIME_CONSTANT_S + period)
     s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
     shift, rate = 0.0, 0.0
@@ -70,7 +70,7 @@ def _update_and_test_rest(memory, sample, period):
 
 
 @njit(cache=True)
-def _update_and_test_force_change(memory, residual, age, period):
+def _update_force_change_detector(memory, residual, age, period):
     low_passed = memory[_RESIDUAL_START : _RESIDUAL_START + 3]
     lowest = memory[_LOWEST_FORCE_START:_HIGHEST_FORCE_START]
     highest = memory[_HIGHEST_FORCE_START:_CHANGED_SAMPLES_INDEX]
@@ -88,7 +88,7 @@ def _update_and_test_force_change(memory, residual, age, period):
 
 
 @njit(cache=True)
-def _is_com_of_change_within_reach(known, new):
+def _is_com_of_load_change_near_sensor(known, new):
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
     return moment < (MAX_COM_DISTANCE_FROM_SENSOR_M * (new[6] - known[6])) ** 2
 
@@ -106,9 +106,9 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
-    at_rest = _update_and_test_rest(memory, sample, period)
+    at_rest = _update_rest_detector(memory, sample, period)
     verdict, age = change.current_change_state(watch), change.new_load_age_in_samples(watch)
-    force_changed = _update_and_test_force_change(memory, residual, age, period)
+    force_changed = _update_force_change_detector(memory, residual, age, period)
     if verdict == change.STATE_KNOWN:
         memory[STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
@@ -116,7 +116,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
             for i in range(6):
                 known[i] += period / OFFSET_TIME_CONSTANT_S * residual[i]
     elif memory[STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_of_change_within_reach(known, watch[change.NEW_LOAD_SLICE])
+        near = _is_com_of_load_change_near_sensor(known, watch[change.NEW_LOAD_SLICE])
         other = verdict == change.STATE_CHANGED and force_changed and near
         memory[STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)

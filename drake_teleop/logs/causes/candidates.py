@@ -46,7 +46,7 @@ _NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
 _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERROR = 0.02, 0.06, 0.2
 _MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
 _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD = 0.2
-_MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
+_MAX_LOG_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
 _MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
 
 
@@ -111,11 +111,11 @@ def _fit_extension(state: FittedModel, name: str) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
     starts = [start_parameters_of_tilt_fit(state), None] if name == "gravity" else [None]
     best = max((state.refit(model, start) for start in starts), key=lambda x: x.likelihood)
-    if _is_effect_large(best, name):
+    if _is_extension_effect_large(best, name):
         yield _scored_candidate(name, state, best)
 
 
-def _is_effect_large(state: FittedModel, name: str) -> bool:
+def _is_extension_effect_large(state: FittedModel, name: str) -> bool:
     x, _ = state.parameters_of_extension(name)
     match name:
         case "gravity":
@@ -257,7 +257,7 @@ def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
             fitted = state.refit(replace(state.model, torque_factor=other), state.x)
-            if fitted.likelihood > state.likelihood - _MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT:
+            if fitted.likelihood > state.likelihood - _MAX_LOG_LIKELIHOOD_LOSS_OF_OTHER_UNIT:
                 found.append(fitted)
     return found
 

@@ -73,7 +73,7 @@ class _StepTimeScan:
         self._residual = state.residual / scale[:, None]
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
         sums = state.data.lagged_block_sums(self._y, rows=self._rows, lags=1)[:, 0]
-        gram, right = _weighted_normal_equations(self._J, self._residual, sums)
+        gram, right = _wrench_normal_equations(self._J, self._residual, sums)
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
@@ -81,7 +81,7 @@ class _StepTimeScan:
     def likelihood_gain_of_step_at(self, n: int) -> float:
         j = -(-n // self._rows)
         y = self._y[n : j * self._rows]
-        gram, right = _weighted_normal_equations(self._J, self._residual, y.T @ y)
+        gram, right = _wrench_normal_equations(self._J, self._residual, y.T @ y)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
         which = self._which
@@ -91,9 +91,9 @@ class _StepTimeScan:
         return score_statistic(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
-def _weighted_normal_equations(J: Array, residual: Array, sums: Array) -> tuple[Array, Array]:
-    gram = [J[:, c] @ sums @ J[:, c].T for c in range(6)]
-    right = [sums @ residual[c] @ J[:, c].T for c in range(6)]
+def _wrench_normal_equations(J: Array, residual: Array, products: Array) -> tuple[Array, Array]:
+    gram = [J[:, c] @ products @ J[:, c].T for c in range(6)]
+    right = [products @ residual[c] @ J[:, c].T for c in range(6)]
     return np.sum(gram, axis=0), np.sum(right, axis=0)
 
 
@@ -120,7 +120,7 @@ def fit_steps_at_middle_of_ramps(
     steps = []
     for both, span in zip(kinds, around, strict=True):
         added = range(first + len(steps), first + len(steps) + len(both))
-        middle = _estimate_ramp_middle(found, added, span)
+        middle = _ramp_middle_time_s(found, added, span)
         steps += [StepChange(kind, middle) for kind in both]
     model = replace(model, steps=(*state.model.steps, *steps))
     return FittedModel.fit_record(state.data, model, found.x, found.contact_spans)
@@ -136,12 +136,12 @@ def remove_small_steps(state: FittedModel) -> FittedModel:
 
 
 def _refit_without_steps(
-    state: FittedModel, removed: Sequence[int], spans: TimeSpans
+    state: FittedModel, removed: Sequence[int], contact_spans: TimeSpans
 ) -> FittedModel:
     kept = tuple(x for i, x in enumerate(state.model.steps) if i not in removed)
     model = replace(state.model, steps=kept)
     x = model.start_parameters(state.x, LoadModel())
-    return FittedModel.fit_record(state.data, model, x, spans)
+    return FittedModel.fit_record(state.data, model, x, contact_spans)
 
 
 def _squared_step_over_variance(state: FittedModel, i: int) -> float:
@@ -149,14 +149,14 @@ def _squared_step_over_variance(state: FittedModel, i: int) -> float:
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _estimate_ramp_middle(state: FittedModel, added: range, span: tuple[float, float]) -> float:
+def _ramp_middle_time_s(state: FittedModel, step_ids: range, span: tuple[float, float]) -> float:
     data = state.data
     rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
     def residual_with_steps_at(time: float) -> Array:
-        times = tuple(time if i in added else x.time for i, x in enumerate(state.model.steps))
+        times = tuple(time if i in step_ids else x.time for i, x in enumerate(state.model.steps))
         y = data.append_step_signals(times)[rows][:, state.model.columns]
         return np.asarray(y @ state.residual.T)
 
@@ -199,9 +199,9 @@ def _is_step_significant(state: FittedModel, i: int) -> bool:
     return bool(heavier or moved)
 
 
-_TRIMMED_FIT_BLOCK_SHARES = (0.12, 0.3, 0.55)
+_TRIED_SHARES_OF_KEPT_BLOCKS = (0.12, 0.3, 0.55)
 _MAX_TRIMMED_FIT_ITERATIONS, _MIN_TRIMMED_FIT_BLOCKS = 15, 8
-_BLOCK_COUNT_GROWTH = 1.3
+_KEPT_BLOCKS_GROWTH = 1.3
 _TRIED_START_RUN_LENGTHS_BLOCKS, _TRIED_END_RUN_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
 _CONTACT_RMS_OVER_NOISE, _CONTACT_RMS_OVER_CALM, _CALM_RMS_MARGIN = 8.0, 5.0, 1.3
 _MAX_NUM_LOADS, _MAX_LOAD_STEPS, _MIN_CALM_RUN_BLOCKS, _MAX_UNFITTED_BLOCK_SHARE = 4, 4, 4, 0.12
@@ -231,7 +231,7 @@ def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
         contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _long_runs_without_gaps(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
+        calm = _fill_gaps_and_keep_long_runs(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
     if not len(inner) or left.sum() > _MAX_UNFITTED_BLOCK_SHARE * blocks.usable.sum():
@@ -249,12 +249,12 @@ def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
     return found if found.residual_ratio < limit else None
 
 
-def _long_runs_without_gaps(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
+def _fill_gaps_and_keep_long_runs(flags: NDArray[np.bool_], min_length: int) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
     for a, b in find_runs_of_true(closed):
-        out[a:b] = b - a >= shortest
+        out[a:b] = b - a >= min_length
     return out
 
 
@@ -270,25 +270,23 @@ class _NormalEquationsOfBlocks:
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
         scale = np.maximum(data.wrench_noise, least)
         J, left = state.model.wrench_derivative(state.x), state.residual / scale[:, None]
-        self._gram, self._right = _weighted_normal_equations(J / scale[:, None], left, sums)
+        self._gram, self._right = _wrench_normal_equations(J / scale[:, None], left, sums)
         self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return flags of blocks `among` with a residual as in contact; None for too few blocks."""
-        found = self._residual_levels_by_calm_fit(np.flatnonzero(among))
+        found = self._fit_calmest_blocks(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_CALM_RMS_MARGIN * calm) ** 2, 0.0))
         quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_RMS_OVER_CALM * calm)))
         x = self._state.x + move
-        by_motion = _residuals_by_motion_errors(self._state, x, excess, among, quantile)
+        by_motion = _block_residuals_due_to_motion_errors(self._state, x, excess, among, quantile)
         usual = _CONTACT_RMS_OVER_CALM * np.hypot(calm, by_motion)
         return np.asarray((level > np.maximum(_CONTACT_RMS_OVER_NOISE, usual)) & among)
 
-    def _residual_levels_by_calm_fit(
-        self, blocks: NDArray[np.intp]
-    ) -> tuple[Array, float, Array] | None:
+    def _fit_calmest_blocks(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
         if len(blocks) < 2 * _MIN_TRIMMED_FIT_BLOCKS:
             return None
         starts = [blocks]
@@ -296,16 +294,16 @@ class _NormalEquationsOfBlocks:
             begins = range(0, len(blocks) - length // 2, length // 2)
             starts += [blocks[k : k + length] for k in begins]
         found, usual = [], np.inf
-        for kept, share in product(starts, _TRIMMED_FIT_BLOCK_SHARES):
+        for kept, share in product(starts, _TRIED_SHARES_OF_KEPT_BLOCKS):
             level, move, last = self._trimmed_fit_of_blocks(blocks, kept, share)
             found.append((level, move))
-            if share == _TRIMMED_FIT_BLOCK_SHARES[1]:
+            if share == _TRIED_SHARES_OF_KEPT_BLOCKS[1]:
                 usual = min(usual, float(np.median(level[last])))
         for length in _TRIED_END_RUN_LENGTHS_BLOCKS:
             ends = np.r_[blocks[:length], blocks[-length:]]
             level, move, last = self._trimmed_fit_of_blocks(blocks, ends, 0.0)
             calm = float(np.median(level[last]))
-            if self._do_other_blocks_differ(level, last, np.setdiff1d(blocks, last), calm):
+            if self._do_other_blocks_fit_badly(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
         limit = max(_CONTACT_RMS_OVER_NOISE**2, (_CONTACT_RMS_OVER_CALM**2) * usual)
@@ -313,7 +311,7 @@ class _NormalEquationsOfBlocks:
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
 
-    def _do_other_blocks_differ(
+    def _do_other_blocks_fit_badly(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))
@@ -323,14 +321,14 @@ class _NormalEquationsOfBlocks:
         return bool(differ > 1.0 - _MAX_UNFITTED_BLOCK_SHARE)
 
     def _trimmed_fit_of_blocks(
-        self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
+        self, blocks: NDArray[np.intp], kept: NDArray[np.intp], kept_share: float
     ) -> tuple[Array, Array, NDArray[np.intp]]:
-        keep = max(_MIN_TRIMMED_FIT_BLOCKS, int(share * len(blocks)))
+        keep = max(_MIN_TRIMMED_FIT_BLOCKS, int(kept_share * len(blocks)))
         for _ in range(_MAX_TRIMMED_FIT_ITERATIONS):
             move = regularized_inverse(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
             left = self._square - 2.0 * self._right @ move + (self._gram @ move) @ move
             level = left / (6.0 * np.maximum(self._counts, 1.0))
-            size = min(keep, 1 + int(_BLOCK_COUNT_GROWTH * len(kept))) if len(kept) < keep else keep
+            size = min(keep, 1 + int(_KEPT_BLOCKS_GROWTH * len(kept))) if len(kept) < keep else keep
             chosen = np.sort(blocks[np.argsort(level[blocks])[:size]])
             if np.array_equal(chosen, kept):
                 break
@@ -338,7 +336,7 @@ class _NormalEquationsOfBlocks:
         return level, move, kept
 
 
-def _residuals_by_motion_errors(
+def _block_residuals_due_to_motion_errors(
     state: FittedModel, x: Array, level: Array, usable: NDArray[np.bool_], quantile: float
 ) -> Array:
     data, rows = state.data, state.data.rows_per_search_block
@@ -367,7 +365,7 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
             continue
         span = start - state.data.dt, stop + state.data.dt
         spans = (*state.contact_spans, span)
-        if len(ends) == 2 and _is_offset_step_undone(state, i, j):
+        if len(ends) == 2 and _do_offset_steps_cancel(state, i, j):
             return _refit_without_steps(state, ends, spans)
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
             calm = _refit_without_steps(state, ends, spans)
@@ -401,7 +399,7 @@ def _median_residual_over_noise(state: FittedModel, span: tuple[float, float]) -
     return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.wrench_noise, 1e-12)).max())
 
 
-def _is_offset_step_undone(state: FittedModel, i: int, j: int) -> bool:
+def _do_offset_steps_cancel(state: FittedModel, i: int, j: int) -> bool:
     steps = state.model.steps
     if (steps[i].kind, steps[j].kind) != ("offsets", "offsets"):
         return False

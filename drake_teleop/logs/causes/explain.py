@@ -35,7 +35,7 @@ _MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S, _MAX_DELAY_ITERATIONS = 0.004, 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
-_MAX_RESIDUAL_RATIO_OF_SIMPLE_AXES = 2.0
+_MAX_UNPERMUTED_AXES_RESIDUAL_RATIO = 2.0
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL, _MAX_CONTACT_RESIDUAL_SHARE = 0.2, 1.1, 0.5
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO, _MAX_EFFECTIVE_MISFIT_SHARE = 15.0, 0.9
@@ -69,10 +69,10 @@ def search_causes(
 ) -> SearchResult:
     """Return the fit with the found causes, added motion delay [s], and rejected candidates."""
     plain = LoadModel(extensions=always_fitted)
-    found = _search_causes_from(_initial_state(data, plain), 0.0, means_at)
+    found = _search_causes_from(_fit_initial_model(data, plain), 0.0, means_at)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
-        mirrored = _initial_state(data, replace(plain, axes=-np.eye(3)))
+        mirrored = _fit_initial_model(data, replace(plain, axes=-np.eye(3)))
         opposite = _search_causes_from(mirrored, 0.0, means_at)
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
         is_wrench = opposite[0].model.torque_factor > 0.0
@@ -85,7 +85,7 @@ def search_causes(
     delay_s = delay_of_linear_fit(data)
     if abs(delay_s - found[1]) < _EQUAL_DELAY_TOLERANCE_S:
         return found
-    repeated = _search_causes_from(_initial_state(means_at(delay_s), plain), delay_s, means_at)
+    repeated = _search_causes_from(_fit_initial_model(means_at(delay_s), plain), delay_s, means_at)
     likelier = repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
     better = likelier or _is_residual_much_smaller(repeated[0], found[0])
     return repeated if better or residual_is_noise(repeated[0]) else found
@@ -101,7 +101,7 @@ def may_be_coloured_noise(state: FittedModel) -> bool:
     return small and state.smooth_misfit < GOOD_SMOOTH_MISFIT
 
 
-def _initial_state(data: BlockMeans, model: LoadModel) -> FittedModel:
+def _fit_initial_model(data: BlockMeans, model: LoadModel) -> FittedModel:
     state = FittedModel.fit_record(data, model)
     start = start_parameters_of_tilt_fit(state) if "gravity" in model.extensions else None
     return state if start is None else FittedModel.fit_record(data, state.model, start)
@@ -110,7 +110,7 @@ def _initial_state(data: BlockMeans, model: LoadModel) -> FittedModel:
 def _search_causes_from(
     state: FittedModel, delay_s: float, means_at: MeansAtDelay | None
 ) -> SearchResult:
-    state, delay_s = _apply_fitted_delay(state, delay_s, means_at)
+    state, delay_s = _refit_with_delay_removed(state, delay_s, means_at)
     rejected: list[Candidate] = []
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
@@ -134,7 +134,7 @@ def _search_causes_from(
             explained = None if calm is None else changes.replace_contacts_by_steps(calm)
             if explained is None:
                 break
-            state, delay_s = _apply_fitted_delay(explained, delay_s, means_at)
+            state, delay_s = _refit_with_delay_removed(explained, delay_s, means_at)
             continue
         larger = changes.replace_steps_by_contact(winner.state)
         if winner.name == "contact":
@@ -142,7 +142,7 @@ def _search_causes_from(
         elif larger.contact_spans != winner.state.contact_spans:
             larger = changes.replace_contacts_by_steps(larger) or larger
         # A contact can take all the samples before or after an earlier step.
-        state, delay_s = _apply_fitted_delay(remove_small_steps(larger), delay_s, means_at)
+        state, delay_s = _refit_with_delay_removed(remove_small_steps(larger), delay_s, means_at)
         rejected = [x for x in rejected if x is not winner]
         if winner.name == "cable":
             return state, delay_s, []
@@ -155,7 +155,7 @@ def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Can
     return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
-def _apply_fitted_delay(
+def _refit_with_delay_removed(
     state: FittedModel, delay_s: float, means_at: MeansAtDelay | None
 ) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
@@ -272,7 +272,7 @@ def explain_misfit(
         causes = cause.name_misfit_causes(state, always_fitted)
         only_noise = residual_is_noise(state)
         if not causes and (only_noise or may_be_coloured_noise(state)):
-            causes = _no_load_cause(state, covariance)
+            causes = _findings_if_load_is_absent(state, covariance)
         return MisfitExplanation(
             causes=tuple(causes),
             explained=only_noise,
@@ -302,7 +302,7 @@ def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
             state = fit_model(model, state.rows, state.x, iterations=2)
         fits.append(state)
     # A rotation that is not right-angled resembles several permutations of axes.
-    limit = _MAX_RESIDUAL_RATIO_OF_SIMPLE_AXES * fits[0].residual_ratio
+    limit = _MAX_UNPERMUTED_AXES_RESIDUAL_RATIO * fits[0].residual_ratio
     simple = (x for x in fits[1:] if x.x[6] > 0.0 and x.residual_ratio < limit)
     state = next(simple, fits[0])
     covariance = float(data.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]
@@ -312,7 +312,7 @@ def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
     return replace(found, state=state, delay_s=0.0, loads=())
 
 
-def _no_load_cause(state: FittedModel, covariance: Array) -> list[Finding]:
+def _findings_if_load_is_absent(state: FittedModel, covariance: Array) -> list[Finding]:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     largest = min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation)
     if not (mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1):

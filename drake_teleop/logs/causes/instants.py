@@ -32,9 +32,9 @@ _BLOCK_LENGTH_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
 _MAX_EXACTLY_AVERAGED_SAMPLES, _MIN_ACCELERATION_OVER_NOISE = 5, 4.0
 _MAX_ALPHA_NOISE_SHARE = 1.0 / 64.0
 _ALPHA_SMOOTHING_WIDTHS_ROWS = (5, 9, 15, 25)  # windows for a noisy angular acceleration [rows]
-_MIN_WRENCH_NOISE_OVER_SPREAD = 1e-4  # smallest noise of a sensor, as a share of the wrench
+_MIN_WRENCH_NOISE_OVER_SIGNAL_STD = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _MAX_TRIED_DELAY_S, _DELAY_STEP_S = 0.25, 0.01
-_LOAD_SIGNAL_COLUMNS = slice(0, 16)
+_CONSTANT_AND_MOTION_COLUMNS = slice(0, 16)
 SYMMETRIC_MATRIX_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 MotionAtTime = Callable[[Array], tuple[Array, ...]]
@@ -138,7 +138,7 @@ def block_means_of_record(
     y[:, WRENCH_SIGNALS] = wrench.reshape(rows, size, 6).mean(axis=1)
     change = y[2:, WRENCH_SIGNALS] - y[:-2, WRENCH_SIGNALS]
     y[1:-1, WRENCH_RATE_SIGNALS] = change / (2.0 * size * dt)
-    positions = _write_motion_signals_and_find_positions(y, t, size, motion, gravity_W)
+    positions = _write_motion_and_get_has_positions(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
     # Legendre polynomials.
     y[:, TIME_POLYNOMIALS] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
@@ -149,7 +149,7 @@ def block_means_of_record(
     white = white_noise_deviations(wrench)
     variance = np.array([column.var() for column in wrench.T])
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
-    white = np.maximum(white, _MIN_WRENCH_NOISE_OVER_SPREAD * spread)
+    white = np.maximum(white, _MIN_WRENCH_NOISE_OVER_SIGNAL_STD * spread)
     share = _smooth_noisy_alpha_and_get_noise_share(y, used) if gravity_W is None else 0.0
     noise = white / np.sqrt(size)
     out = BlockMeans(middle, y, used, noise, gravity_W, positions, acceleration_noise, share)
@@ -160,9 +160,9 @@ def _smooth_noisy_alpha_and_get_noise_share(y: Array, used: NDArray[np.bool_]) -
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
     alpha = y[used][:, ALPHA_SIGNALS]
-    share = _smallest_noise_variance_share(alpha)
+    share = _min_noise_variance_share(alpha)
     for width in _ALPHA_SMOOTHING_WIDTHS_ROWS:
-        if _smallest_noise_variance_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
+        if _min_noise_variance_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
             break
         alpha = savgol_filter(y[used][:, ALPHA_SIGNALS], width, 2, axis=0)
     y[np.flatnonzero(used)[:, None], np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop)] = alpha
@@ -176,11 +176,11 @@ def white_noise_deviations(x: Array) -> Array:
     return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
-def _smallest_noise_variance_share(x: Array) -> float:
+def _min_noise_variance_share(x: Array) -> float:
     return float((white_noise_deviations(x) ** 2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
-def _write_motion_signals_and_find_positions(
+def _write_motion_and_get_has_positions(
     y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows, total = len(y), np.zeros(())
@@ -219,7 +219,7 @@ def delay_of_linear_fit(data: BlockMeans) -> float:
     """
     reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
-    spline = CubicSpline(data.t, data.y[:, _LOAD_SIGNAL_COLUMNS])
+    spline = CubicSpline(data.t, data.y[:, _CONSTANT_AND_MOTION_COLUMNS])
     forces = data.y[rows][:, WRENCH_SIGNALS]
     total = (forces * forces).sum(axis=0)
 

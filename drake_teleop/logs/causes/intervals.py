@@ -22,10 +22,10 @@ GOOD_SMOOTH_MISFIT, _WIDENING_BY_MISFIT = 1.35, 3.0
 _MIN_WIDENING_SCORE, _FULLY_WIDENING_SCORE, _FULLY_WIDENING_RESIDUAL_SHARE = 6.0, 15.0, 0.5
 _CABLE_WIDENING_FACTOR, _LARGE_RESIDUAL_RATIO = 1.5, 20.0
 _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL, _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL = 2.2, 6.0
-_CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
-_TRIED_SENSOR_GAIN_STDS = np.geomspace(1e-4, 0.1, 31)
+_CAUSES_COVERED_BY_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
+_TRIED_GAIN_ERROR_STDS = np.geomspace(1e-4, 0.1, 31)
 _MIN_LIKELIHOOD_RISE_BY_GAINS, _MIN_SHARE_EXPLAINED_BY_GAINS = 20.0, 0.5
-_MAX_PLAUSIBLE_GAIN_STD = 0.025
+_MAX_PLAUSIBLE_GAIN_ERROR_STD = 0.025
 
 
 def covariance_of_load(
@@ -36,7 +36,7 @@ def covariance_of_load(
     deviations = np.sqrt(np.diag(out))
     factor = widening_factor_by_misfit(state, jackknife_std)
     squares = np.maximum(factor * deviations, jackknife_std) ** 2
-    squares = squares + _phi_variances_by_rejected_causes(state, rejected)
+    squares = squares + _load_variances_by_rejected_causes(state, rejected)
     ratio = np.sqrt(squares) / deviations
     return np.asarray(out * np.outer(ratio, ratio) + gain_covariance)
 
@@ -50,12 +50,12 @@ def deviations_of_load_if_unexplained(
     if state.smooth_misfit > limits[large]:
         growth = 1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
         jackknife_std = jackknife_std * growth
-    lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
-    variance = jackknife_std**2 + _phi_variances_by_rejected_causes(state, lasting)
+    lasting = [x for x in rejected if x.name not in _CAUSES_COVERED_BY_JACKKNIFE]
+    variance = jackknife_std**2 + _load_variances_by_rejected_causes(state, lasting)
     return np.asarray(np.sqrt(variance + np.diag(gain_covariance)))
 
 
-def _phi_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
+def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
     squares = np.zeros(16)
     for candidate in rejected:
         other, score = candidate.state, candidate.score
@@ -93,12 +93,12 @@ def covariance_of_load_by_gain_errors(state: FittedModel) -> Array:
         more = std * std * seen
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
-    likely = np.array([likelihood_with_gain_std(std) for std in _TRIED_SENSOR_GAIN_STDS])
+    likely = np.array([likelihood_with_gain_std(std) for std in _TRIED_GAIN_ERROR_STDS])
     explaining = squares.sum() > _MIN_SHARE_EXPLAINED_BY_GAINS * state.gain_by_smooth_signals[0]
-    plausible = _TRIED_SENSOR_GAIN_STDS[int(likely.argmax())] < _MAX_PLAUSIBLE_GAIN_STD
+    plausible = _TRIED_GAIN_ERROR_STDS[int(likely.argmax())] < _MAX_PLAUSIBLE_GAIN_ERROR_STD
     if likely.max() < _MIN_LIKELIHOOD_RISE_BY_GAINS or not explaining or not plausible:
         return np.zeros((16, 16))
-    largest = _TRIED_SENSOR_GAIN_STDS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
+    largest = _TRIED_GAIN_ERROR_STDS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
     effects = largest * (inverse @ mixed)[OFFSETS_AND_LOAD]
     return np.asarray(effects @ effects.T)
 

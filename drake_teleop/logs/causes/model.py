@@ -27,9 +27,9 @@ _NUM_EXTENSION_PARAMETERS = {
 }  # fmt: skip
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
-_ROTATION_COLUMNS_OF_STEP = slice(16, 25)
+_ROTATION_COLUMNS_OF_STEP_CHANGE = slice(16, 25)
 _MAX_DELAY_CHANGE_PER_ITERATION_S = 0.03
-_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # of the numerical derivative
+_FINITE_DIFFERENCE_ROTATION_RAD = 1e-4  # of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
 SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -86,11 +86,11 @@ class LoadModel:
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the used signals among the columns of `append_step_signals`."""
-        kept = np.ones(_columns_of_step(len(self.steps)).start, bool)
+        kept = np.ones(_step_change_columns(len(self.steps)).start, bool)
         if not {"gravity", "cable"} & set(self.extensions):
             kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
             for i in range(len(self.steps)):
-                kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
+                kept[_step_change_columns(i)][_ROTATION_COLUMNS_OF_STEP_CHANGE] = False
         return np.flatnonzero(kept)
 
     @cached_property
@@ -119,17 +119,17 @@ class LoadModel:
     def wrench_coefficients(self, x: Array) -> Array:
         """Return the model's wrench for x (B, size), as coefficients (B, 6, W) of W signals."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
-        out = np.zeros((len(x), 6, _columns_of_step(len(self.steps)).start))
+        out = np.zeros((len(x), 6, _step_change_columns(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _wrench_coefficients_of_load(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
                 load = _wrench_coefficients_of_load(x[:, parts[f"step {i}"]])
-                out[..., _columns_of_step(i)] = load @ motion[..., COLUMNS_REPEATED_BY_STEP]
+                out[..., _step_change_columns(i)] = load @ motion[..., COLUMNS_REPEATED_BY_STEP]
         if "weight" in parts:
             removed = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
             out[..., instants.GRAVITY_SIGNALS] += removed  # - V(-g) w
         if "cable" in parts:
-            out[..., : instants.NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
+            out[..., : instants.NUM_SIGNALS] += _wrench_coefficients_of_cable(x[:, parts["cable"]])
         turned = self.axes[None]
         if "rotation" in parts:
             turned = Rotation.from_rotvec(x[:, parts["rotation"]]).as_matrix() @ self.axes
@@ -145,7 +145,7 @@ class LoadModel:
         out[:, channels, instants.WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _columns_of_step(i).start] += x[:, parts[f"step {i}"]]
+                out[:, :, _step_change_columns(i).start] += x[:, parts[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
             if name in parts:
                 rows = x[:, parts[name]].reshape(-1, 6, degree)
@@ -172,7 +172,7 @@ class LoadModel:
         """Return derivatives (size, 6, k) by x of the wrench's coefficients of k used signals."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
-            steps[self.parameter_slices["rotation"]] = _ROTATION_DIFFERENCE_STEP_RAD
+            steps[self.parameter_slices["rotation"]] = _FINITE_DIFFERENCE_ROTATION_RAD
         moves = np.diag(steps)
         both = self.wrench_coefficients(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
@@ -185,7 +185,7 @@ class LoadModel:
         return np.asarray(out[:, self.columns])
 
 
-def _columns_of_step(i: int) -> slice:
+def _step_change_columns(i: int) -> slice:
     start = instants.NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i
     return slice(start, start + len(COLUMNS_REPEATED_BY_STEP))
 
@@ -194,7 +194,7 @@ def _wrench_coefficients_of_load(phi: Array) -> Array:
     return np.einsum("bj,cjk->bck", phi, _REGRESSOR_TENSOR)
 
 
-def _cable_coefficients(x: Array) -> Array:
+def _wrench_coefficients_of_cable(x: Array) -> Array:
     out = np.zeros((len(x), 6, instants.NUM_SIGNALS))
     K = x[:, 3:9][:, SYMMETRIC_MATRIX_INDICES].reshape(-1, 9)
     for i in range(3):

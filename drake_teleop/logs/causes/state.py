@@ -44,7 +44,7 @@ class UsedRows:
         return np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).all(axis=1))
 
     @cached_property
-    def _lagged_signals_of_edge_rows(self) -> Array:
+    def _lagged_signals_near_gaps(self) -> Array:
         padded = np.pad(self.used, instants.MAX_NOISE_LAG)
         near = np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).any(axis=1))
         edge = np.setdiff1d(near, self.rows_with_four_predecessors)
@@ -58,7 +58,7 @@ class UsedRows:
         taps = [(filters[:, : 5 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(5, -1)
         out = full.reshape(6, width, width)
-        edge = np.tensordot(filters, self._lagged_signals_of_edge_rows, axes=(1, 1))
+        edge = np.tensordot(filters, self._lagged_signals_near_gaps, axes=(1, 1))
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
     def noise_filters_and_power(
@@ -94,7 +94,7 @@ _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 _NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
 # (18, 27) from rotation-position products to the signals of a symmetric stiffness.
 _STIFFNESS_ENTRY_MASKS = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
-_STIFFNESS_SIGNAL_ROWS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRY_MASKS])
+_PRODUCTS_TO_STIFFNESS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRY_MASKS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ class FittedModel:
         if self.data.gravity_W is not None:
             parts.append(y[:, instants.ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _STIFFNESS_SIGNAL_ROWS.T)
+            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _PRODUCTS_TO_STIFFNESS.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_four_predecessors, self.noise_filters

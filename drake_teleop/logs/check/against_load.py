@@ -44,9 +44,9 @@ VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_MISFIT_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
-_FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
+_FINDING_NAMES_THAT_CHANGE_SIGN = ("sign", "swapped axes")
 """Findings with the sign; mirrored axes are a cause that `identify` names."""
-_CONTACT_FREE_SHARE = 0.75  # of a record with contact
+_KEPT_SHARE_WITHOUT_CONTACT = 0.75  # of a record with contact
 _LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
 
 
@@ -156,7 +156,7 @@ MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_MAX_UNEXPLAINED_RATIO_BY_CLOCK_DRIFT = 0.5
+_MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION = 0.5
 
 
 def check_wrench_and_estimate_delay(
@@ -166,14 +166,18 @@ def check_wrench_and_estimate_delay(
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
+    too_still = too_little_motion(thin)
     samples_of_edits: dict[int, list[_LowPassedSamples]] = {}  # by identity of the description
 
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFitQuality:
         if id(edited) not in samples_of_edits:
             # A wrong description may cause a wrong delay.
             log = _log_with_edited_wrench(thin, description, edited)
-            log = log or data.read_thinned_log(edited)
-            if edited is not description and (why := too_little_motion(log)) is not None:
+            why = too_still
+            if log is None:
+                log = data.read_thinned_log(edited)
+                why = too_little_motion(log)
+            if edited is not description and why is not None:
                 raise DrakeTeleopError(why)
             aligned = [remove_delay(log, shift) for shift in {0.0, delay or 0.0}]
             samples_of_edits[id(edited)] = [_low_passed_samples(each) for each in aligned]
@@ -184,18 +188,18 @@ def check_wrench_and_estimate_delay(
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * MAX_SEARCHED_DELAY_S
     tried: list[tuple[Finding | None, Description]] = []
-    if not (given.is_good and inside):
+    if too_still is None and not (given.is_good and inside):
         tried += _clock_offset_edits(description, thin)
     if not given.is_good:
         tried = [*edits.wrench_and_motion_edits(description), *tried]
     found = _edits_with_far_better_fit(fit_edited_description, given, tried)
     if not found and not given.is_good and not log.static:  # contact may hide what fits
-        without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
+        without_contact = partial(fit_edited_description, kept_share=_KEPT_SHARE_WITHOUT_CONTACT)
         found = _edits_with_far_better_fit(without_contact, without_contact(description), tried)
     if not found and given.is_good:
         return lag_findings(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
-        return _findings_without_remedy(description, log, given, delay)
+        return _payload_or_lag_findings_and_delay(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
     equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
     finding, edited = equals[0]
@@ -224,7 +228,7 @@ def _edits_with_far_better_fit(
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN:
+        elif finding is not None and finding.name not in _FINDING_NAMES_THAT_CHANGE_SIGN:
             negative.append((fit, *edits.edit_with_opposite_wrench_sign(finding, edited)))
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
@@ -266,7 +270,7 @@ def _log_with_edited_wrench(log: Log, old: Description, new: Description) -> Log
     return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
-def _findings_without_remedy(
+def _payload_or_lag_findings_and_delay(
     description: Description, log: Log, given: LoadFitQuality, delay: float | None
 ) -> tuple[list[Finding], float | None]:
     smooth = low_pass_log(log, 30.0)
@@ -355,8 +359,8 @@ def clock_drift_finding_and_correction(
         return [], description
     late, slope = line
     _, lines, edited = data.start_lag_and_clock_drift_correction(name, description, late, slope)
-    limit = _MAX_UNEXPLAINED_RATIO_BY_CLOCK_DRIFT * _unexplained_after_delay_removal(log)
-    if _unexplained_after_delay_removal(data.read_thinned_log(edited)) > limit:
+    limit = _MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION * _unexplained_share_after_delay_removal(log)
+    if _unexplained_share_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
     text = f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against the wrench's"
     return [Finding("clock", f"{text}; set {lines}")], edited
@@ -382,7 +386,7 @@ def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     return float(late + slope * log.t[0]), float(slope)
 
 
-def _unexplained_after_delay_removal(log: Log) -> float:
+def _unexplained_share_after_delay_removal(log: Log) -> float:
     try:
         return fit_load(remove_delay(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:

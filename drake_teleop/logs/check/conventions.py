@@ -33,9 +33,9 @@ from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table
 
-_MIN_CHECKED_POSES = 6
-_MIN_GRAVITY_DIRECTION_SPREAD = 0.15  # that separates offsets from a load
-_MIN_WRENCH_CHANGE_OVER_LARGEST = 1e-6  # of a live wrench, over the largest reading
+_MIN_STATIC_POSES_FOR_CHECK = 6
+_MIN_GRAVITY_DIRECTION_STD = 0.15  # that separates offsets from a load
+_MIN_WRENCH_RANGE_OVER_MAGNITUDE = 1e-6  # of a live wrench, over the largest reading
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def findings_if_load_is_suspicious(
     clocks = log.static or (delay is not None and abs(delay) < edits.MIN_LAG_OF_WRONG_CLOCK_S)
     if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
-        return tuple(_findings_except_lag(check)) if _are_signals_suspicious(log) else ()
+        return tuple(_findings_except_lag(check)) if _has_dead_channel_or_imu_finding(log) else ()
     found = _findings_except_lag(check)
     negative = load.mass < 0 and bool(load.identifiable[6])
     if any(finding.name == "payload" for finding in found):
@@ -112,7 +112,7 @@ def _findings_except_lag(check: Callable[[], ConventionCheckResult]) -> list[Fin
     return []
 
 
-def _are_signals_suspicious(log: Log) -> bool:
+def _has_dead_channel_or_imu_finding(log: Log) -> bool:
     if log.static or log.described is None or Path(log.source).suffix.lower() in TABLE_READERS:
         return False
     few = log.select_rows(slice(None, None, max(1, int(0.01 / log.dt))))
@@ -134,7 +134,7 @@ def check_conventions(
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    limit = _MIN_WRENCH_CHANGE_OVER_LARGEST * np.abs(log.wrench).max()
+    limit = _MIN_WRENCH_RANGE_OVER_MAGNITUDE * np.abs(log.wrench).max()
     return bool((np.ptp(log.wrench, axis=0) <= limit).all())
 
 
@@ -194,13 +194,13 @@ def _merge_clock_findings(
 def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
     if not log.static:
         return []
-    if len(log) < _MIN_CHECKED_POSES:
+    if len(log) < _MIN_STATIC_POSES_FOR_CHECK:
         remedy = "record 12 poses, rotated about two horizontal axes"
         text = f"{len(log)} poses at rest are too few to check the fit; {remedy}"
         return [Finding("static poses", text)]
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
-    if least >= _MIN_GRAVITY_DIRECTION_SPREAD:
+    if least >= _MIN_GRAVITY_DIRECTION_STD:
         return []
     text = (
         "the poses are too alike: along one direction gravity in S varies by only"

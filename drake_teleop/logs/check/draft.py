@@ -6,7 +6,8 @@ import copy
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +16,8 @@ import numpy as np
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
-from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.tables import Table
+from drake_teleop.logs.read.description_fields import known_unit
+from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 _TIME_NAME_PATTERN = (
     r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?|zeit|temps|tiempo|tempo)(_?(s|ms|us|ns))?$"
@@ -30,7 +31,7 @@ _VECTOR_NAME_PATTERNS = {
     "orientation": "q|quat|quaternion|orientation",
     "position": "p|pos|position|translation|tcp|ee|eef",
 }
-_VECTORS_OF_ONE_INSTRUMENT = (
+_VECTOR_PAIRS_OF_EACH_INSTRUMENT = (
     ("force", "torque"),
     ("specific_force", "angular_velocity"),
     ("orientation", "position"),
@@ -56,16 +57,11 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 _HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-_BASE_AXES_COLUMN_PATTERN = r"tcp_force$|^o_f_ext"
+_FORCE_IN_BASE_AXES_PATTERN = r"tcp_force$|^o_f_ext"
 _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
-_UNIT_OF_SPELLING = {
-    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
-    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
-    "n*m": "N m", "n.m": "N m",
-}  # fmt: skip
 _ALLOWED_UNITS = {
     "force": description_fields.FORCE_UNITS, "torque": description_fields.TORQUE_UNITS,
     "specific_force": ("m/s^2", "mm/s^2", "g", "mg"),
@@ -76,9 +72,9 @@ _ALLOWED_UNITS = {
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
-_MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
-_MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
-_MAX_DEG_S = 4000.0  # faster than any gyroscope measures
+_MAX_ROWS_OF_STATIC_LOG = 200  # a table without time and with more rows has a constant rate
+_MIN_MEDIAN_OF_RAW_COUNTS = 2000.0  # median of integers that are raw counts
+_MAX_GYRO_RATE_DEG_S = 4000.0  # faster than any gyroscope measures
 _FILL_IN_TEXT, _MIN_CLOCK_ROWS = "FILL IN", 20
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -95,10 +91,11 @@ _NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate:
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, and its comment lines."""
+    """Draft of a log description: its streams as in YAML, comment lines, and findings."""
 
     streams: dict[str, Any]
     comment_lines: list[str]
+    findings: tuple[Finding, ...] = ()
 
     def text(self) -> str:
         return to_yaml_text(self.streams, head=self.comment_lines)
@@ -111,7 +108,8 @@ class Draft(NamedTuple):
             for name in outer:
                 place = place.setdefault(name, {})
             place[last] = value
-        return Draft(streams, [*self.comment_lines, f"Corrected by the data: {finding.message}."])
+        lines = [*self.comment_lines, f"Corrected by the data: {finding.message}."]
+        return Draft(streams, lines, self.findings)
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
@@ -123,7 +121,8 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
     streams = streams or drafts[0].streams
     order = ["wrench", "imu", "pose", "static"]
     ordered = {name: streams[name] for name in order if name in streams}
-    return Draft(ordered, [*dict.fromkeys(x for draft in drafts for x in draft.comment_lines)])
+    lines = dict.fromkeys(x for draft in drafts for x in draft.comment_lines)
+    return Draft(ordered, [*lines], tuple(x for draft in drafts for x in draft.findings))
 
 
 def _is_template(stream: dict[str, Any]) -> bool:
@@ -140,8 +139,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     """Return a log description guessed from names and magnitudes of columns."""
     plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
-    found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
-    found |= _find_vectors_in_array_columns(table, plain)
+    found |= _find_wrench_in_arrays(table, plain) | _find_quaternion(table, plain)
     ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
@@ -155,7 +153,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
-    if any(re.search(_BASE_AXES_COLUMN_PATTERN, name) for name in forces):
+    if any(re.search(_FORCE_IN_BASE_AXES_PATTERN, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
@@ -163,7 +161,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     imu = {
         kind: _draft_quantity(table, plain, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if _width_of_columns(table, found.get(kind, [])) == 3
+        if _count_scalars_per_row(table, found.get(kind, [])) == 3
     }
     if imu:
         draft["imu"] = stream_with_time(**imu)
@@ -175,7 +173,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
     without_time = _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time"))
-    if without_time and table.rows <= _MAX_STATIC_ROWS and pose and not _is_template(wrench):
+    if without_time and table.rows <= _MAX_ROWS_OF_STATIC_LOG and pose and not _is_template(wrench):
         kept = {name: value for name, value in wrench.items() if name != "time"}
         draft = {"static": {**kept, "orientation": pose["orientation"]}}
     times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
@@ -195,20 +193,51 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *([_RAW_ACCELERATION_NOTE] if raw in str(draft.get("imu")) else []),
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
-    return Draft(draft, head)
+    return Draft(draft, head, tuple(_other_wrench_findings(table, plain, found)))
+
+
+def _find_wrench_in_arrays(table: Table, plain: _NamesAndUnits) -> _Columns:
+    numbered = _find_vectors_in_numbered_columns(plain)
+    return numbered | _find_vectors_in_array_columns(table, plain)
+
+
+def _other_wrench_findings(
+    table: Table, plain: _NamesAndUnits, found: _Columns
+) -> Iterator[Finding]:
+    """Yield a finding for each complete wrench of a table beside the one in `found`."""
+    pair = "force", "torque"
+    used = {x for names in found.values() for x in names}
+    taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
+    while taken:
+        arrays = {name.partition("[")[0] for name in used}
+        plain = {x: y for x, y in plain.items() if not {x, x.partition("[")[0]} & (used | arrays)}
+        rest = replace(table, columns=ColumnsOnAccess(plain, table.columns.__getitem__))
+        other = _find_vectors(plain) | _find_wrench_in_arrays(rest, plain)
+        if any(_count_scalars_per_row(table, other.get(kind, [])) != 3 for kind in pair):
+            return
+        used = {x for kind in pair for x in other[kind]}
+        lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
+        text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
+        yield Finding("other wrench", f"{text}; to use it, set {lines}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
-    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
+    if unit is None and suffix is not None and known_unit(suffix[1]):
         unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[\W_]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
 
-def _remove_trailing_number(plain: str) -> str:
-    return re.sub(r"_?\d+$", "", plain)
+def _remove_trailing_number(name: str) -> str:
+    return re.sub(r"_?\d+$", "", name)
+
+
+def _is_not_measured(name: str) -> bool:
+    return (
+        re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name) is not None
+    )
 
 
 def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
@@ -222,8 +251,9 @@ def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, li
 def _find_vectors(plain: _NamesAndUnits) -> _Columns:
     groups = {kind: _group_axes(plain, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
     found: _Columns = {}
-    for pair in _VECTORS_OF_ONE_INSTRUMENT:
+    for pair in _VECTOR_PAIRS_OF_EACH_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
+        shared.sort(key=_is_not_measured)
         for kind in pair:
             for name in (shared or list(groups[kind]))[:1]:
                 found[kind] = groups[kind][name]
@@ -242,14 +272,10 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
             groups.setdefault("", {}).setdefault(words, name)
     for name, (words, unit) in plain.items() if not groups else ():  # in another language
         match = re.match(r"^(.*?)_?([xyz])$", words)
-        if match and _known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
+        if match and known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
     whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
     return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
-
-
-def _known_unit(text: str) -> str:
-    return _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", text).lower(), "")
 
 
 def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
@@ -293,7 +319,7 @@ def _find_vectors_in_numbered_columns(plain: _NamesAndUnits) -> _Columns:
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
-        for base in sorted(fit, key=lambda name: "target" in name)[:1]:
+        for base in sorted(fit, key=_is_not_measured)[:1]:
             for kind, places in kinds.items():
                 found[kind] = [groups[base][k] for k in places]
     by_words = {words: name for name, (words, _) in plain.items()}
@@ -309,7 +335,7 @@ def _find_vectors_in_array_columns(table: Table, plain: _NamesAndUnits) -> _Colu
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, form = plain[name][0], kind
-            fits = _width_of_columns(table, [name]) == width
+            fits = _count_scalars_per_row(table, [name]) == width
             if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
                 words = words[:-5]
                 form = "quaternion_xyzw" if plain[name][0].endswith("xyzw") else kind
@@ -325,7 +351,7 @@ def _names_of_array_columns(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width_of_columns(table: Table, columns: list[str]) -> int:
+def _count_scalars_per_row(table: Table, columns: list[str]) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in columns)
 
 
@@ -338,10 +364,10 @@ def _draft_quantity(
     if kind in ("force", "torque"):
         x = table.numbers_with_nan(columns[0], columns[0])
         is_integer = (np.nan_to_num(x) % 1.0 == 0.0).all()
-        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_RAW_COUNT:
+        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_OF_RAW_COUNTS:
             group["scale"] = _FILL_IN_TEXT
     if spelling := plain[columns[0]][1]:
-        unit = _known_unit(spelling)
+        unit = known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
     if kind in ("force", "torque"):
@@ -352,7 +378,7 @@ def _draft_quantity(
         limits = {"g": (0, 3), "m/s^2": (3, 30), "mg": (700, 1400), "mm/s^2": (7e3, 14e3)}
         fitting = [unit for unit, (low, high) in limits.items() if low <= median < high]
         return group | ({"unit": fitting[0]} if fitting else {"scale": _FILL_IN_TEXT})
-    if kind == "angular_velocity" and np.nanmax(size) > _MAX_DEG_S:
+    if kind == "angular_velocity" and np.nanmax(size) > _MAX_GYRO_RATE_DEG_S:
         return group | {"unit": "mdeg/s"}
     usual, other, limit = {
         "angular_velocity": ("rad/s", "deg/s", 15),
@@ -362,7 +388,7 @@ def _draft_quantity(
 
 
 def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
-    if _width_of_columns(table, found.get("orientation", [])) == 4:
+    if _count_scalars_per_row(table, found.get("orientation", [])) == 4:
         orientation = {"columns": found["orientation"], "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
         orientation = {"columns": found[form], "form": form}
@@ -374,7 +400,7 @@ def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[st
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if _width_of_columns(table, found.get("position", [])) == 3:
+    if _count_scalars_per_row(table, found.get("position", [])) == 3:
         pose["position"] = _draft_quantity(table, plain, "position", found["position"])
     return pose
 
@@ -383,14 +409,14 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
     named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
-    named = named or _clock_columns(table, plain)
+    named = named or _find_clock_columns(table, plain)
     if not named:
         return {"column": _FILL_IN_TEXT}
     if vector_column in table.columns:
         structure, rows = vector_column.rpartition(".")[0], len(table.columns[vector_column])
         named.sort(key=lambda name: len(table.columns[name]) != rows)
         named.sort(key=lambda name: name.rpartition(".")[0] != structure)
-    unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
+    unit = known_unit(plain[named[0]][1])
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
     for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
@@ -403,7 +429,7 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
     return {"column": named[0], "unit": unit}
 
 
-def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
+def _find_clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
     def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:

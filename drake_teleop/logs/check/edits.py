@@ -227,12 +227,12 @@ class LogTables:
         return lag, lines, edit_field(edited, f"{name}.time.scale", factor)
 
     def _start_time_of_stream(self, stream: Any) -> float:
-        return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
+        return float(self._finite_times_and_row_indices(stream)[0][0]) + float(stream.time.offset)
 
     def _thinning_stride(self, stream: Any) -> int:
         if getattr(stream, "time", None) is None:
             return 1
-        t, _ = self._times_and_rows(stream)
+        t, _ = self._finite_times_and_row_indices(stream)
         if len(t) < 2:  # read_log raises the error
             return 1
         rate = 1 / max(1e-12, float(np.median(np.diff(t))))
@@ -243,7 +243,7 @@ class LogTables:
     def _table_of_stream(self, stream: Any) -> Table:
         return self.tables[stream.source].rows_with_any_number(stream.columns)
 
-    def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
+    def _finite_times_and_row_indices(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
         t, _ = time_stamps_and_num_episodes(stream.time, self._table_of_stream(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
@@ -254,7 +254,7 @@ class LogTables:
     def _add_thinned_columns(self, name: str, stream: Any, thinned: Table, block_rows: int) -> None:
         table, rows = self._table_of_stream(stream), None
         if getattr(stream, "time", None) is not None:
-            t, rows = self._times_and_rows(stream)
+            t, rows = self._finite_times_and_row_indices(stream)
             means = _means_of_consecutive_rows(t[:, None], block_rows)
             thinned.columns[f"{_THINNED_TIME_COLUMN_PREFIX} {name}"] = means
         for field in type(stream).model_fields:

@@ -94,10 +94,10 @@ def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
 def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float) -> Edit | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
-    given = _gravity_misfit(few, np.eye(3), gravity)
+    given = _relative_gravity_misfit(few, np.eye(3), gravity)
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
-    misfits = ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
+    misfits = ((_relative_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
     best, P = min(misfits, key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
@@ -153,7 +153,7 @@ def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
     return means
 
 
-def _gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> float:
+def _relative_gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> float:
     means = _mean_specific_forces_in_start_axes(log, gyro_axes) / gravity
     if means.shape[1] == 0:
         return np.nan
@@ -265,17 +265,17 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogTable
 
 _ACCELERATION_CUTOFF_HZ, _MAX_SHIFT_FIT_CONDITION_NUMBER = 3.0, 1e8
 _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
-_MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
+_MIN_SCALE_OR_SHIFT_OVER_STD = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
-_TORQUE_UNIT_VALUES = [SI_VALUE_OF_UNIT[unit] for unit in ("N m", "N mm", "lbf in")]
+_SI_VALUES_OF_TORQUE_UNITS = [SI_VALUE_OF_UNIT[unit] for unit in ("N m", "N mm", "lbf in")]
 _WRONG_TORQUE_UNIT_RATIOS = (
-    *(a / b for a, b in permutations(_TORQUE_UNIT_VALUES, 2)),
+    *(a / b for a, b in permutations(_SI_VALUES_OF_TORQUE_UNITS, 2)),
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
-_COM_TOLERANCE_OF_WRONG_TORQUE_UNIT = 0.03
+_MAX_COM_ERROR_OVER_COM_DISTANCE = 0.03
 
 
 def position_unit_or_origin_findings(
@@ -305,7 +305,7 @@ def position_unit_or_origin_findings(
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     num_samples = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
     fit = _fit_centred_signals(columns[inner], by_pose[inner], num_samples)
-    if fit is None or abs(fit[0][0]) <= _MIN_ERROR_OVER_DEVIATION * fit[1][0]:
+    if fit is None or abs(fit[0][0]) <= _MIN_SCALE_OR_SHIFT_OVER_STD * fit[1][0]:
         return []
     x, deviations = fit
     k = float(x[0])
@@ -316,7 +316,7 @@ def position_unit_or_origin_findings(
     size = float(np.linalg.norm(shift))
     if abs(k - 1.0) > _MAX_SCALE_ERROR_FOR_SHIFT or deviation > _MAX_POSE_SHIFT_DEVIATION_M:
         return []
-    if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_ERROR_OVER_DEVIATION * deviation):
+    if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_SCALE_OR_SHIFT_OVER_STD * deviation):
         return []
     place, other = shift + np.array(pose.position_in_sensor), np.array(imu.position) - shift
     text = (
@@ -329,7 +329,7 @@ def position_unit_or_origin_findings(
 
 
 def _position_unit_finding(described: str, scale: float, deviation: float) -> Finding | None:
-    if not abs(scale) > _MIN_ERROR_OVER_DEVIATION * deviation:
+    if not abs(scale) > _MIN_SCALE_OR_SHIFT_OVER_STD * deviation:
         return None
     text = f"the acceleration by the positions is {1.0 / scale:.3g} times the measured one:"
     for unit in POSITION_UNITS:
@@ -406,4 +406,4 @@ def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = min(np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS)
     is_usual = _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M
-    return not is_usual or bool(off < _COM_TOLERANCE_OF_WRONG_TORQUE_UNIT * size)
+    return not is_usual or bool(off < _MAX_COM_ERROR_OVER_COM_DISTANCE * size)

@@ -45,7 +45,7 @@ _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_ROWS = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_LN_SPREAD_OVER_USUAL = 1.5  # of the residual of the best hypothesis
+_MAX_LN_RESIDUAL_WIDTH_OVER_USUAL = 1.5  # of the residual of the best hypothesis
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
@@ -177,7 +177,7 @@ def _choose_quaternion_order_and_wrench_sign(
 def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
     table = dataset.read_episode(episode)
     draft = draft_description(table, episode.file.parent)
-    streams = _streams_of_draft_for_all_episodes(draft, dataset.fps)
+    streams = _streams_without_file_names(draft, dataset.fps)
     if "FILL IN" in str(streams) or "wrench" not in streams or not {"pose", "imu"} & set(streams):
         raise DrakeTeleopError(
             "wrench, time and motion are not all recognized by the names of the columns"
@@ -195,11 +195,11 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
         if fields is None:
             break
         draft = draft.with_finding_corrected(fields)
-        streams = _streams_of_draft_for_all_episodes(draft, dataset.fps)
+        streams = _streams_without_file_names(draft, dataset.fps)
     return streams
 
 
-def _streams_of_draft_for_all_episodes(draft: Draft, fps: float) -> dict[str, Any]:
+def _streams_without_file_names(draft: Draft, fps: float) -> dict[str, Any]:
     streams = {name: dict(x) for name, x in draft.streams.items()}
     for stream in streams.values():
         stream.pop("file", None)
@@ -267,14 +267,14 @@ def _judge_all_episodes(
     count = len(task.dataset.episodes)
     left = [k for k in range(count) if not (work / f"{k}.json").is_file()]
     progress(1.0 - len(left) / count)
-    judge = delayed(partial(_judge_episode, task, work))
+    judge = delayed(partial(_write_verdict_of_episode, task, work))
     done = Parallel(n_jobs=jobs, return_as="generator_unordered")(map(judge, left))
     for number, _ in enumerate(done, start=count - len(left) + 1):
         progress(number / count, f"{number} of {count}")
     return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
 
 
-def _judge_episode(task: DatasetAndLoad, work: Path, number: int) -> None:
+def _write_verdict_of_episode(task: DatasetAndLoad, work: Path, number: int) -> None:
     episode = task.dataset.episodes[number]
     try:
         with one_blas_thread():
@@ -312,7 +312,7 @@ def _verdict_on_episode(
     spread, _ = episode_verdict.ln_half_width_and_centre_of_calm_half(calm, 0.1 * usual)
     spread -= np.log(usual)
     spread -= np.log(found.gains).repeat(3)
-    if not faults and spread.mean() > _MAX_LN_SPREAD_OVER_USUAL:
+    if not faults and spread.mean() > _MAX_LN_RESIDUAL_WIDTH_OVER_USUAL:
         text = (
             "no single fault explains the wrench (possible causes: contact most of the time, or a"
             " change of the load)"

@@ -28,7 +28,7 @@ from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN = "observation.contact_wrench", "observation.in_contact"
 _TABLE_SUFFIXES = (".csv", ".tsv", ".parquet")
-_ZARR_METADATA_NAMES = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+_ZARR_METADATA_FILE_NAMES = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
 _LEROBOT_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
@@ -147,32 +147,32 @@ def _open_zarr(path: Path) -> Dataset:
 def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
     """Write a copy of the dataset with the new columns of each episode to `out`."""
     if dataset.kind == "hdf5":
-        _write_hdf5(dataset, out, columns)
+        _write_hdf5_copy(dataset, out, columns)
         return
     written = {e.file for e in dataset.episodes} if dataset.kind != "zarr" else set()
     if dataset.kind == "lerobot":
         written |= {dataset.path / "meta" / name for name in ("info.json", "stats.json")}
     for file in sorted(p for p in dataset.path.glob("**/*") if p.is_file()):
         if file not in written:
-            must_copy = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
+            must_copy = dataset.kind == "zarr" and file.name in _ZARR_METADATA_FILE_NAMES
             _hard_link_or_copy(file, out / file.relative_to(dataset.path), must_copy=must_copy)
     if dataset.kind == "zarr":
-        _write_zarr(out, columns)
+        _add_columns_to_zarr(out, columns)
         return
     for path in dict.fromkeys(episode.file for episode in dataset.episodes):
         pairs = zip(dataset.episodes, columns, strict=True)
-        part = _join_columns([new for episode, new in pairs if episode.file == path])
+        part = _concatenate_contact_columns([new for episode, new in pairs if episode.file == path])
         target = out / path.relative_to(dataset.path)
         make_folder(target.parent)
         if path.suffix.lower() == ".parquet":
-            _write_parquet(path, target, part)
+            _write_parquet_copy(path, target, part)
         else:
-            _write_csv(path, target, part)
+            _write_csv_copy(path, target, part)
     if dataset.kind == "lerobot":
         _write_lerobot_metadata(dataset.path / "meta", out / "meta", columns)
 
 
-def _join_columns(columns: Sequence[ContactColumns]) -> ContactColumns:
+def _concatenate_contact_columns(columns: Sequence[ContactColumns]) -> ContactColumns:
     return ContactColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
@@ -187,7 +187,7 @@ def _hard_link_or_copy(file: Path, target: Path, *, must_copy: bool) -> None:
         shutil.copyfile(file, temporary)
 
 
-def _write_parquet(path: Path, target: Path, new: ContactColumns) -> None:
+def _write_parquet_copy(path: Path, target: Path, new: ContactColumns) -> None:
     import polars as pl
 
     frame = pl.read_parquet(path)
@@ -195,11 +195,11 @@ def _write_parquet(path: Path, target: Path, new: ContactColumns) -> None:
     frame = frame.with_columns(wrench.arr.to_list(), pl.Series(IN_CONTACT_COLUMN, new.in_contact))
     kept = {k: v for k, v in pl.read_parquet_metadata(path).items() if k != "ARROW:schema"}
     if "huggingface" in kept:
-        kept["huggingface"] = _add_features_to_metadata(kept["huggingface"])
+        kept["huggingface"] = _add_features_to_huggingface_metadata(kept["huggingface"])
     write_table(target, frame, metadata=kept)
 
 
-def _add_features_to_metadata(text: str) -> str:
+def _add_features_to_huggingface_metadata(text: str) -> str:
     data = json.loads(text)
     features = data.get("info", {}).get("features", {})
     lists = [x for x in features.values() if isinstance(x, dict) and "feature" in x]
@@ -210,12 +210,13 @@ def _add_features_to_metadata(text: str) -> str:
     return json.dumps(data)
 
 
-def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
+def _write_csv_copy(path: Path, target: Path, new: ContactColumns) -> None:
     frame, first = table_files.read_csv(path, True)
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
     head = first - 2
-    if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
+    is_header = head >= 0 and frame.columns[0].strip().encode() in lines[head]
+    if len(rows) != len(frame) or len(frame) != len(new.in_contact) or not is_header:
         what = "columns can only be added to a file with a header and one line for each row"
         raise DrakeTeleopError(what, where=str(path), remedy="convert it to Parquet")
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
@@ -236,7 +237,7 @@ def _arrays_of_columns(new: ContactColumns) -> list[tuple[str, NDArray]]:
     return [("contact_wrench", wrench), ("in_contact", flags)]
 
 
-def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
+def _write_hdf5_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
     h5py = import_optional_module("h5py", dataset.path)
     make_folder(out.parent)
     with replace_file_on_success(out) as temporary:
@@ -251,9 +252,9 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) 
                     group[name] = values
 
 
-def _write_zarr(out: Path, columns: Sequence[ContactColumns]) -> None:
+def _add_columns_to_zarr(out: Path, columns: Sequence[ContactColumns]) -> None:
     zarr = import_optional_module("zarr", out)
-    group, new = zarr.open_group(out / "data", mode="r+"), _join_columns(columns)
+    group, new = zarr.open_group(out / "data", mode="r+"), _concatenate_contact_columns(columns)
     for name, values in _arrays_of_columns(new):
         group.create_array(name, data=values, overwrite=True)
     if (out / ".zmetadata").is_file():
@@ -270,7 +271,7 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[Contac
     if not (source / "stats.json").is_file():
         return
     stats = json.loads((source / "stats.json").read_text(encoding="utf-8"))
-    new = _join_columns(columns)
+    new = _concatenate_contact_columns(columns)
     with_quantiles = any("q50" in x for x in stats.values())
     for name, values in zip((CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN), new, strict=True):
         x = values.astype(float).reshape(len(values), -1)

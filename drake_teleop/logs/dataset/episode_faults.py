@@ -76,9 +76,9 @@ def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
     return found
 
 
-def _unit_faults(gain: Array) -> list[EpisodeFault]:
+def _unit_faults(gains: Array) -> list[EpisodeFault]:
     found = []
-    for factor, (what, si, names) in zip(gain, _SI_AND_OTHER_UNITS_OF_QUANTITIES, strict=True):
+    for factor, (what, si, names) in zip(gains, _SI_AND_OTHER_UNITS_OF_QUANTITIES, strict=True):
         if abs(factor - 1.0) < _MIN_UNIT_FACTOR_ERROR:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))

@@ -38,7 +38,7 @@ _SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
 _NUM_START_FIT_PARTS, _MIN_HALF_WIDTH_OVER_TYPICAL = 4, 0.3
 _MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
-_MAX_STEP_DEVIATION_OVER_FRAME_NOISE = 1.5
+_MAX_RESIDUAL_STD_OVER_FRAME_NOISE = 1.5
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class HypothesisSearch:
         cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
-    def _best_rows_of(self, x: WrenchHypothesis) -> NDArray[np.bool_]:
+    def _best_explained_rows(self, x: WrenchHypothesis) -> NDArray[np.bool_]:
         residual = (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
         return _rows_of_smallest_residual(residual)
 
@@ -194,7 +194,7 @@ class HypothesisSearch:
                 if scale:
                     found = replace(found, gains=_fit_gains(w, q, found))
                 found = self.with_spread_and_cost(found)
-                rows = self._best_rows_of(found)
+                rows = self._best_explained_rows(found)
             return found
 
         return self._best_fit(fit_from_rows)
@@ -211,7 +211,7 @@ class HypothesisSearch:
                 size = np.linalg.norm(A, axis=0) + 1e-12
                 phi = np.linalg.lstsq(A / size, w, rcond=1e-3)[0] / size
                 x = self.with_spread_and_cost(replace(x, phi=phi))
-                rows, weights = self._best_rows_of(x), np.exp(-x.spread)
+                rows, weights = self._best_explained_rows(x), np.exp(-x.spread)
             return x
 
         return self._best_fit(fit_from_rows)
@@ -271,11 +271,11 @@ def _weighted_number_of_faults(x: WrenchHypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _rotation_cost(x.axes[0]) + float(not np.allclose(*x.axes))
+    count += _fault_weight_of_rotation(x.axes[0]) + float(not np.allclose(*x.axes))
     return count + float((x.gains != 1.0).sum())
 
 
-def _rotation_cost(M: Array) -> float:
+def _fault_weight_of_rotation(M: Array) -> float:
     if np.allclose(np.abs(M), np.eye(3)):
         return 0.0 if M.trace() > 2.9 else 1.0
     return 1.5 if np.allclose(np.abs(M).max(axis=0), 1.0) else 2.5
@@ -291,7 +291,7 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * STANDARD_NORMAL_QUARTILE)
     by_spread = np.exp(spread) / STANDARD_NORMAL_QUARTILE
-    deviation = np.minimum(by_spread, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise)
+    deviation = np.minimum(by_spread, _MAX_RESIDUAL_STD_OVER_FRAME_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -31,7 +31,7 @@ _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 _EXCESS_SPREAD_LIMIT, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
 _LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0
 _MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
-_THRESHOLD_OVER_LARGEST_FREE_LEVEL = 1.1
+_THRESHOLD_OVER_MAX_CONTACT_FREE_LEVEL = 1.1
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     floor = detection.fit_noise_floor(*pooled, covariance, fade=0.0)
     threshold = max(
         detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
-        _THRESHOLD_OVER_LARGEST_FREE_LEVEL * float(floor.free_maxima[0]),
+        _THRESHOLD_OVER_MAX_CONTACT_FREE_LEVEL * float(floor.free_maxima[0]),
     )
     return SharedLoad(load, phi, lag, typical, floor, threshold)
 

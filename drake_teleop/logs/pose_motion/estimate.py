@@ -19,7 +19,7 @@ from drake_teleop.logs.pose_motion.rigid import RigidFit, RigidParameters, Units
 from drake_teleop.logs.pose_motion.spectra import FitWindow, Spectra, WrenchGrid
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-_MAX_SEARCHED_DURATION_S = 120.0
+_MAX_DELAY_SEARCH_RECORD_SPAN_S = 120.0
 MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
 MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG = 5.0, 1.0
@@ -29,7 +29,7 @@ _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_MAX_ORIGIN_DERIVATIVE_BY_UNDETERMINED = 1e-3
+_MAX_ORIGIN_CHANGE_PER_UNKNOWN_PARAMETER = 1e-3
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -134,9 +134,9 @@ def estimate_from_poses(
     """
     with one_blas_thread():
         grid = WrenchGrid.from_samples(t, wrench)
-        found, _, window = _find_splines_and_delay(grid, poses, gravity_W, delay, lost, imu)
+        found, _, window = _fit_pose_splines_and_delay(grid, poses, gravity_W, delay, lost, imu)
         splines, late = found.splines, found.delay_s
-        window = replace(window, taper=_taper_zero_in_gaps(grid, splines.poses, lost, late))
+        window = replace(window, taper=_taper_excluding_gaps(grid, splines.poses, lost, late))
         rejected, note = find_disturbances(window.spectra_at_delay(splines, late), splines.spacing)
         window = replace(window, taper=spectra.exclude_from_taper(window.taper, rejected, grid.dt))
         final = window.spectra_at_delay(splines, late)
@@ -170,7 +170,7 @@ def estimate_from_poses(
         return PoseEstimate(
             **vars(found),
             fit=fit,
-            frame=_pose_frame_of_fit(free, start),
+            frame=_pose_frame_from_free_fit(free, start),
             free_frame_fit=free,
             units_and_axes=seen,
             t=grid.t,
@@ -196,11 +196,11 @@ def fit_motion_to_load(
     """
     with one_blas_thread():
         grid = WrenchGrid.from_samples(t, wrench, coefficients)
-        motion, last, _ = _find_splines_and_delay(grid, poses, gravity_W, delay, lost, imu)
+        motion, last, _ = _fit_pose_splines_and_delay(grid, poses, gravity_W, delay, lost, imu)
         return replace(motion, delay_std_s=linear_model.delay_std(last) if delay is None else 0.0)
 
 
-def _find_splines_and_delay(
+def _fit_pose_splines_and_delay(
     grid: WrenchGrid,
     poses: Poses,
     gravity_W: ArrayLike,
@@ -210,7 +210,7 @@ def _find_splines_and_delay(
 ) -> tuple[PoseMotion, Spectra, FitWindow]:
     gravity, poses = finite_array("gravity_W", gravity_W, 3), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
-    taper = _taper_zero_in_gaps(grid, poses, lost, guess)
+    taper = _taper_excluding_gaps(grid, poses, lost, guess)
     usable = int((taper > 0.5).sum())
     free_load = grid.known_load is None
     fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
@@ -222,7 +222,7 @@ def _find_splines_and_delay(
     slower = min(poses.rate, grid.stride / grid.dt)
     top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)
-    part = whole.select_rows(_part_with_most_varied_force(grid))
+    part = whole.select_rows(_slice_of_largest_force_variance(grid))
     margin = 2 * spectra.DELAY_SEARCH_HALF_RANGE_S
     near = (poses.t >= part.grid.t[0] - margin) & (poses.t <= part.grid.t[-1] + margin)
     near_poses = Poses(poses.t[near], poses.position[near], poses.quaternion[near])
@@ -252,8 +252,8 @@ def _find_splines_and_delay(
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
-def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
-    rows, length = len(grid.t), round(_MAX_SEARCHED_DURATION_S / grid.dt)
+def _slice_of_largest_force_variance(grid: WrenchGrid) -> slice:
+    rows, length = len(grid.t), round(_MAX_DELAY_SEARCH_RECORD_SPAN_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     coarse, parts = grid.wrench[:: grid.stride], range(0, rows - length, length // 2)
@@ -261,7 +261,7 @@ def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
     return slice(first, first + length)
 
 
-def _taper_zero_in_gaps(
+def _taper_excluding_gaps(
     grid: WrenchGrid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float
 ) -> Array:
     stamps = poses.t - delay
@@ -278,7 +278,7 @@ def _taper_zero_in_gaps(
     return spectra.exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
 
-def _pose_frame_of_fit(free: RigidFit, described: RigidParameters) -> PoseFrame:
+def _pose_frame_from_free_fit(free: RigidFit, described: RigidParameters) -> PoseFrame:
     R_SP, r = free.parameters.R_PS.T, free.parameters.p_PoSo_P
     origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
@@ -288,7 +288,7 @@ def _pose_frame_of_fit(free: RigidFit, described: RigidParameters) -> PoseFrame:
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_DERIVATIVE_BY_UNDETERMINED
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_CHANGE_PER_UNKNOWN_PARAMETER
         deviations = np.where(lost, np.inf, deviations)
     moved = free.parameters.p_PoSo_P - described.p_PoSo_P
     turned = Rotation.from_matrix(described.R_PS.T @ free.parameters.R_PS).as_rotvec()

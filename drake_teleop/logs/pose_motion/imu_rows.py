@@ -99,9 +99,9 @@ def _fit_sensor_model(
         if step == 0:
             power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
         weight = 1.0 / np.sqrt(energy * (noise + power))
-        D, b, shift = _fit_sensor_parameters(Y - X, X, one, change, weight)
+        D, b, shift = _fit_imu_gain_bias_and_shift(Y - X, X, one, change, weight)
         residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
-        power = _estimate_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
+        power = _estimate_imu_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
         tau += shift
         if abs(tau) > _MAX_IMU_SHIFT_S:
             return None
@@ -111,15 +111,15 @@ def _fit_sensor_model(
     return _ImuSensorModel(D, b, tau, power)
 
 
-def _fit_sensor_parameters(
-    y: ComplexArray, X: ComplexArray, one: ComplexArray, change: ComplexArray, weight: Array
+def _fit_imu_gain_bias_and_shift(
+    y: ComplexArray, X: ComplexArray, one: ComplexArray, X_rate: ComplexArray, weight: Array
 ) -> tuple[Array, Array, float]:
     K = len(y)
     columns = np.zeros((K, 3, 13), complex)
     for i in range(3):
         columns[:, i, 3 * i : 3 * i + 3] = X
         columns[:, i, 9 + i] = one[:, 0]
-    columns[:, :, 12] = change
+    columns[:, :, 12] = X_rate
     A = (columns * weight[:, None, None]).reshape(3 * K, 13)
     right = (y * weight[:, None]).ravel()
     gram = (A.conj().T @ A).real
@@ -128,12 +128,12 @@ def _fit_sensor_parameters(
     return found[:9].reshape(3, 3), found[9:12], float(found[12])
 
 
-def _estimate_noise_power(
-    residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
+def _estimate_imu_noise_power(
+    residual_power: NDArray[np.floating], pose_noise_power: NDArray[np.floating], min_power: float
 ) -> float:
-    power = max(float(np.median(residual)), white)
+    power = max(float(np.median(residual_power)), min_power)
     for _ in range(_NOISE_POWER_STEPS):
-        weight = 1.0 / (power + pose_noise) ** 2
-        power = max(float(weight @ (residual - pose_noise) / weight.sum()), white)
-    effective = float(np.sum((white / (white + pose_noise)) ** 2))
-    return power if effective > _MIN_NOISE_FREQUENCIES else white
+        weight = 1.0 / (power + pose_noise_power) ** 2
+        power = max(float(weight @ (residual_power - pose_noise_power) / weight.sum()), min_power)
+    effective = float(np.sum((min_power / (min_power + pose_noise_power)) ** 2))
+    return power if effective > _MIN_NOISE_FREQUENCIES else min_power

@@ -39,7 +39,7 @@ _REWEIGHTING_ITERATIONS, _MIN_AVERAGED_POSE_RATE_HZ = 4, 125.0
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_RELATIVE_PIVOT_FOR_INVERSE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
 _TRIED_OFFSET_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
-_MIN_COST_REDUCTION_BY_DRIFT = 3.0
+_MIN_LOG_LIKELIHOOD_GAIN_BY_DRIFT = 3.0
 _SPACING_OVER_BEST, _SPACING_OVER_BEST_KNOWN_LOAD, _MIN_COST_RISE_OFF_DELAY = 0.84, 0.92, 25.0
 
 
@@ -71,7 +71,7 @@ def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -
     With the coefficients `load` (6, 16) only the offsets are fitted.
     """
     zz, zf = (Z[..., :NUM_MOTION_SIGNALS, x] for x in (slice(NUM_MOTION_SIGNALS), WRENCH_COLUMNS))
-    ff, floor = _wrench_powers(Z), min_noise_power(Z, levels)
+    ff, floor = _wrench_power_sums(Z), min_noise_power(Z, levels)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -100,7 +100,7 @@ def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -
     return LinearFit(C, covariance, power, levels.negative_log_likelihoods(power))
 
 
-def _wrench_powers(Z: Array) -> Array:
+def _wrench_power_sums(Z: Array) -> Array:
     return np.diagonal(Z[..., WRENCH_COLUMNS, WRENCH_COLUMNS], axis1=-2, axis2=-1)
 
 
@@ -120,7 +120,7 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
     """Return a lower limit (..., 1, 6) of noise power: rounding of the wrench's numbers."""
-    power = _wrench_powers(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
+    power = _wrench_power_sums(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
     both = power.reshape(*power.shape[:-1], 2, 3).sum(axis=-1).repeat(3, axis=-1)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
@@ -128,7 +128,7 @@ def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
     """Return noise levels; each channel has white noise, or the likelier random walk (T74)."""
     levels = NoiseLevels.white_within_groups(bands)
-    least = fit_linear_model(Z, levels).channel_costs - _MIN_COST_REDUCTION_BY_DRIFT
+    least = fit_linear_model(Z, levels).channel_costs - _MIN_LOG_LIKELIHOOD_GAIN_BY_DRIFT
     shape = levels.relative_power.copy()
     for corner in _TRIED_OFFSET_DRIFT_CORNERS_HZ:
         rising = np.repeat(spectral.random_walk_relative_power(bands, corner)[:, None], 6, axis=1)
@@ -186,7 +186,7 @@ def guess_knot_spacing_and_delay(
 ) -> tuple[float, float]:
     """Return likeliest knot distance and delay [s] on a coarse grid; a `known` delay is kept."""
     found, reach = [], window.delay_search_half_range_s
-    for h in _knot_spacings_for_pose_rate(cache)[::2]:
+    for h in _knot_spacings_allowed_by_pose_rate(cache)[::2]:
         spectra, late = window.spectra_at_delay(cache.splines_with_spacing(h), delay), delay
         if known:
             cost = fit_coefficients(spectra).cost
@@ -210,7 +210,7 @@ def choose_knot_spacing_and_delay(
 
     found = []
     for cache in choices:
-        spacings = _knot_spacings_for_pose_rate(cache)
+        spacings = _knot_spacings_allowed_by_pose_rate(cache)
         costs = [(fit_coefficients(spectra_of(cache, h)).cost, h) for h in spacings]
         k = spacings.index(min(costs)[1])
         for h in spacings[max(0, k - 1) : k] + spacings[k + 1 : k + 2]:
@@ -232,14 +232,14 @@ def spline_cache_of_averaged_poses(poses: Poses) -> SplineCache:
     return SplineCache(poses.average_consecutive(count))
 
 
-def _knot_spacings_for_pose_rate(cache: SplineCache) -> list[float]:
+def _knot_spacings_allowed_by_pose_rate(cache: SplineCache) -> list[float]:
     usable = [h for h in TRIED_KNOT_SPACINGS_S if h * cache.rate >= MIN_POSES_PER_KNOT]
     return usable or [TRIED_KNOT_SPACINGS_S[0]]
 
 
 _MAX_CLOCK_RATE_ITERATIONS, _MIN_CLOCK_RATE_LIKELIHOOD_GAIN = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
-_MAX_DELAY_CHANGE_BY_CLOCK_S = 0.2
+_MAX_DELAY_CHANGE_BY_CLOCK_DRIFT_S = 0.2
 
 
 def estimate_clock_rate_error(
@@ -250,11 +250,11 @@ def estimate_clock_rate_error(
     grid, least = window.grid, fit_coefficients(now).cost
     start = least
     for _ in range(_MAX_CLOCK_RATE_ITERATIONS):
-        step, gain = _clock_rate_step_and_likelihood_gain(now)
+        step, gain = _clock_rate_change_and_likelihood_gain(now)
         trial = best + step
         if gain < _MIN_CLOCK_RATE_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
-        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_DELAY_CHANGE_BY_CLOCK_S:
+        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_DELAY_CHANGE_BY_CLOCK_DRIFT_S:
             break
         splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = window.spectra_at_delay(splines, delay)
@@ -271,7 +271,7 @@ def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay:
     return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 
 
-def _clock_rate_step_and_likelihood_gain(spectra: Spectra) -> tuple[float, float]:
+def _clock_rate_change_and_likelihood_gain(spectra: Spectra) -> tuple[float, float]:
     window, fit = spectra.window, fit_coefficients(spectra)
     grid, bands = window.grid, window.bands
     change = np.gradient(spectra.motion_signals, grid.dt, axis=0)
@@ -301,8 +301,8 @@ NOTHING_REJECTED_NOTE = (
     " scale and mounting"
 )
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
-_STD_PER_NORMAL_MAD, _MAX_FIT_STD_GROWTH = 1.4826, 2.5
-_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE = 0.3
+_NORMAL_STD_OVER_MEDIAN_DEVIATION, _MAX_FIT_STD_GROWTH = 1.4826, 2.5
+_RESIDUAL_FILTER_CUTOFF_OVER_KNOT_RATE = 0.3
 _MIN_REJECTION_MARGIN_S = 0.1  # least margin on both sides of a rejected time span [s]
 
 
@@ -311,9 +311,9 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
 
     `spacing`: of the knots [s]. If too little motion would remain, none is flagged, with a note.
     """
-    # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
+    # A Gaussian gain, one half at `_RESIDUAL_FILTER_CUTOFF_OVER_KNOT_RATE` / h, does not ring.
     window, grid = spectra.window, spectra.window.grid
-    gain = 0.5 ** ((window.bands.frequency * spacing / _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE) ** 2)
+    gain = 0.5 ** ((window.bands.frequency * spacing / _RESIDUAL_FILTER_CUTOFF_OVER_KNOT_RATE) ** 2)
     filtered = (x * gain[:, None] for x in (spectra.signals, window.wrench_spectrum))
     x, y = (_spectrum_to_time_signal(spectrum, grid) for spectrum in filtered)
     inside = window.taper > 0.5
@@ -357,7 +357,7 @@ def _max_residuals_over_std(x: Array, y: Array, weights: Array, inside: NDArray[
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
-    scale = _STD_PER_NORMAL_MAD * np.median(residual[inside], axis=0)
+    scale = _NORMAL_STD_OVER_MEDIAN_DEVIATION * np.median(residual[inside], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     scale = np.maximum(scale, MIN_NOISE_STD_OVER_WRENCH_RMS * rms + 1e-30)
     return np.asarray((residual / scale).max(axis=1))

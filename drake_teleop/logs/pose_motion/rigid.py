@@ -24,10 +24,10 @@ OFFSET_AND_LOAD_PARAMETERS, DELAY_PARAMETER = slice(0, 16), slice(16, 17)
 LEVER_PARAMETERS, ROTATION_PARAMETERS = slice(17, 20), slice(20, 23)
 _MAX_RIGID_FIT_STEPS, _MAX_CONVERGED_STEP_OVER_STD = 40, 1e-4
 _MAX_RIGID_MISFIT_OVER_DOF, _MAX_GAIN_MISFIT_OVER_EXPECTED, _NOISE_MISFIT_OVER_DOF = 4.0, 1.5, 1.5
-_MAX_PARAMETER_FIT_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_MAX_GAUSS_NEWTON_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
 _MIN_WRENCH_NOISE_OVER_RESIDUAL, _ROTATION_DIFFERENCE_STEP_RAD = 0.1, 1e-4
 _MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
-_OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_OMEGA_PRODUCT_AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +84,8 @@ def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
     M[7:10, 1:4] = M[7:10, 4:7] = M[10:13, 7:10] = R_PS.T
     M[7:10, 7:10] = -R_PS.T @ cross_matrix(p_PoSo_P)
     M[7:10, 10:16] = R_PS.T @ centripetal_matrix(p_PoSo_P)
-    i, j = np.transpose(_OMEGA_PRODUCT_PAIRS)[:, :, None]
-    k, m = np.transpose(_OMEGA_PRODUCT_PAIRS)[:, None]
+    i, j = np.transpose(_OMEGA_PRODUCT_AXIS_PAIRS)[:, :, None]
+    k, m = np.transpose(_OMEGA_PRODUCT_AXIS_PAIRS)[:, None]
     M[13:19, 10:16] = R_PS[k, i] * R_PS[m, j] + (k != m) * R_PS[m, i] * R_PS[k, j]
     return M
 
@@ -131,7 +131,7 @@ def fit_rigid(
         covariance=np.zeros((0, 0)),
         misfit=2.0 * (float(levels.negative_log_likelihoods(power).sum()) - linear.cost),
         degrees_of_freedom=6.0 * NUM_MOTION_SIGNALS - float(free.sum()),
-        expected_misfit_by_gains=_expected_misfit_by_gains(record, plain, gain_std),
+        expected_misfit_by_gains=_expected_misfit_by_gain_errors(record, plain, gain_std),
     )
     if not fit.is_rigid:
         solution = _solve_rigid_fit(record, solution.parameters, one_weight=True)
@@ -170,11 +170,11 @@ def _solve_rigid_fit(
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
         B, Le = _residual_and_derivative(state)
         gram, right = _normal_equations(B, Le, clean, W)
-        inverse, undetermined = _inverse_of_free_parameters(gram, record.is_free)
+        inverse, undetermined = _invert_gram_of_free_parameters(gram, record.is_free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
-        step *= min(1.0, float(np.min(_MAX_PARAMETER_FIT_STEP / np.maximum(np.abs(step), 1e-300))))
-        state = _add_rigid_step(state, step)
+        step *= min(1.0, float(np.min(_MAX_GAUSS_NEWTON_STEP / np.maximum(np.abs(step), 1e-300))))
+        state = _add_increments(state, step)
         half = np.einsum("cjk,ji->cik", B, inverse)
         used = np.einsum("cik,bkm,cim->bc", half, record.moments, B, optimize=True)
         used = np.clip(used * np.diagonal(W, axis1=1, axis2=2), 0.0, None)
@@ -192,11 +192,11 @@ def _parameter_covariance(
     W = W @ solution.residual_covariances @ W
     middle = _normal_equations(solution.residual_derivative, none, record.moments, W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
-    covariance *= np.outer(*2 * [_std_factors_of_estimated_weights(record, solution)])
+    covariance *= np.outer(*2 * [_std_inflation_by_estimated_weights(record, solution)])
     larger = covariance * inflation**2
     if gain_std:
         clean = record.moments - record.noise_moments
-        effects = gain_std * _parameter_errors_of_unit_gains(solution, clean)
+        effects = gain_std * _parameter_errors_by_unit_gain_errors(solution, clean)
         covariance = covariance + effects @ effects.T
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
@@ -204,7 +204,7 @@ def _parameter_covariance(
     return mark_undetermined(larger, undetermined)
 
 
-def _std_factors_of_estimated_weights(record: _RigidFitData, solution: _RigidSolution) -> Array:
+def _std_inflation_by_estimated_weights(record: _RigidFitData, solution: _RigidSolution) -> Array:
     levels, B = record.noise_levels, solution.residual_derivative
     half = np.einsum("cjk,ji->cik", B, solution.inverse_gram)
     weight = np.diagonal(solution.residual_weights, axis1=1, axis2=2)
@@ -215,12 +215,12 @@ def _std_factors_of_estimated_weights(record: _RigidFitData, solution: _RigidSol
     return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
 
 
-def _motion_map_with_delay(state: RigidParameters) -> Array:
+def _delayed_motion_transformation(state: RigidParameters) -> Array:
     M = motion_transformation_matrix(state.R_PS, state.p_PoSo_P)
     return np.hstack([M, state.delay_s * M[:, :NUM_MOTION_SIGNALS]])
 
 
-def _residual_coefficients(state: RigidParameters) -> Array:
+def _residual_wrench_coefficients(state: RigidParameters) -> Array:
     L = -np.einsum("cjk,j->ck", regressor_coefficients(), state.theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     return L
@@ -228,15 +228,15 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and e (6, 38), coefficients of the residual wrench."""
-    L, M = _residual_coefficients(state), _motion_map_with_delay(state)
+    L, M = _residual_wrench_coefficients(state), _delayed_motion_transformation(state)
     step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, spectra.SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
-        lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
+        lever = _delayed_motion_transformation(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
         turned = (_rotate_about_own_axes(state.R_PS, x * unit) for x in (step, -step))
-        ahead, behind = (_motion_map_with_delay(replace(state, R_PS=R)) for R in turned)
+        ahead, behind = (_delayed_motion_transformation(replace(state, R_PS=R)) for R in turned)
         B[:, 17 + i] = -L @ lever
         B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * step)
     return B, L @ M
@@ -250,7 +250,7 @@ def _normal_equations(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, A
     return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
 
 
-def _inverse_of_free_parameters(
+def _invert_gram_of_free_parameters(
     gram: Array, free: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_]]:
     diagonal = np.diag(gram)
@@ -264,7 +264,7 @@ def _inverse_of_free_parameters(
 
 
 def _residual_cross_powers(Z: Array, state: RigidParameters) -> Array:
-    Le = _residual_coefficients(state) @ _motion_map_with_delay(state)
+    Le = _residual_wrench_coefficients(state) @ _delayed_motion_transformation(state)
     return np.asarray(Le @ Z @ Le.T)
 
 
@@ -273,32 +273,32 @@ def _residual_channel_powers(record: _RigidFitData, state: RigidParameters) -> A
 
 
 def _residual_covariances(
-    record: _RigidFitData, state: RigidParameters, sums: Array, used: Array | None = None
+    record: _RigidFitData, state: RigidParameters, power_sums: Array, used_dof: Array | None = None
 ) -> Array:
     levels, sizes = record.noise_levels, record.noise_levels.half_dof_of_bands[:, None]
     P = _residual_cross_powers(record.noise_moments, state) / sizes[..., None]
-    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
+    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used_dof is None else sizes - 0.5 * used_dof)
     least = np.maximum(
-        _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(sums, used),
+        _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(power_sums, used_dof),
         min_noise_power(record.moments, levels),
     )
-    rest = np.maximum(levels.noise_power(sums - own, used), least)
+    rest = np.maximum(levels.noise_power(power_sums - own, used_dof), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
 
 
-def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array:
+def _parameter_errors_by_unit_gain_errors(solution: _RigidSolution, Z: Array) -> Array:
     BF = (solution.residual_derivative.reshape(-1, NUM_MOMENT_SIGNALS) @ Z)[:, :, WRENCH_COLUMNS]
     BF = BF.reshape(len(Z), 6, NUM_RIGID_PARAMETERS, 6)
     return parameter_errors_by_gains(BF, solution.residual_weights, solution.inverse_gram)
 
 
-def _expected_misfit_by_gains(
+def _expected_misfit_by_gain_errors(
     record: _RigidFitData, solution: _RigidSolution, gain_std: float
 ) -> float:
     if gain_std == 0.0:
         return 0.0
     B, levels = solution.residual_derivative, record.noise_levels
-    effects = _parameter_errors_of_unit_gains(solution, record.moments)
+    effects = _parameter_errors_by_unit_gain_errors(solution, record.moments)
     left = -np.einsum("cjk,ji->cik", B, effects)
     length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     left = left.reshape(6, 6, 6, NUM_MOMENT_SIGNALS)  # of channel c by gain d, k
@@ -310,10 +310,10 @@ def _expected_misfit_by_gains(
     return 2.0 * float(levels.negative_log_likelihoods(1.0 + more).sum())
 
 
-def _add_rigid_step(state: RigidParameters, step: Array) -> RigidParameters:
-    theta = state.theta + step[OFFSET_AND_LOAD_PARAMETERS]
-    delay_s, p = state.delay_s + float(step[16]), state.p_PoSo_P + step[LEVER_PARAMETERS]
-    R = _rotate_about_own_axes(state.R_PS, step[ROTATION_PARAMETERS])
+def _add_increments(state: RigidParameters, increment: Array) -> RigidParameters:
+    theta = state.theta + increment[OFFSET_AND_LOAD_PARAMETERS]
+    delay_s, p = state.delay_s + float(increment[16]), state.p_PoSo_P + increment[LEVER_PARAMETERS]
+    R = _rotate_about_own_axes(state.R_PS, increment[ROTATION_PARAMETERS])
     return RigidParameters(theta, delay_s, p, Rotation.from_matrix(R).as_matrix())
 
 
@@ -321,7 +321,7 @@ def _rotate_about_own_axes(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())
 
 
-_UNIT_RATIO_ITERATIONS = 5
+_NUM_POSITION_UNIT_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,15 +359,15 @@ def estimate_position_unit_axes_and_masses(fit: LinearFit) -> UnitsAndAxes:
     )
     U, masses, Vt = np.linalg.svd(M_g)
     largest = float(np.sqrt(v_g.max())) if (v_g > 0.0).all() else np.inf
-    kappa, deviation = _position_unit_ratio(M_a, M_g, v_a, v_g)
+    kappa, deviation = _position_unit_and_std(M_a, M_g, v_a, v_g)
     return UnitsAndAxes(kappa, deviation, largest, U @ Vt, masses)
 
 
-def _position_unit_ratio(M_a: Array, M_g: Array, v_a: Array, v_g: Array) -> tuple[float, float]:
+def _position_unit_and_std(M_a: Array, M_g: Array, v_a: Array, v_g: Array) -> tuple[float, float]:
     known = (v_a > 0.0) & (v_g > 0.0)
     a, g, v_a, v_g = (x[known] for x in (M_a, M_g, v_a, v_g))
     kappa = 0.0
-    for _ in range(_UNIT_RATIO_ITERATIONS):
+    for _ in range(_NUM_POSITION_UNIT_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
         information = float(weight @ np.maximum(g * g - v_g, 0.0))
         if not information > 0.0:  # gravity is not observable, or nothing is known

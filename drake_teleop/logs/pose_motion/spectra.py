@@ -29,7 +29,7 @@ _WRENCH_GRID_RATE_HZ = 100.0
 DELAY_SEARCH_HALF_RANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
-_MIN_NOISE_GROUP_SIZE = 8.0
+_MIN_FREQUENCIES_PER_NOISE_GROUP = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
 _MAX_NARROW_BAND_FREQUENCY_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
 NUM_MOMENT_SIGNALS = 2 * NUM_MOTION_SIGNALS + 6
@@ -143,10 +143,10 @@ class FitWindow:
         weight[0] *= 0.5
         group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
         for k in range(len(_GROUP_EDGES_HZ)):
-            if 0.0 < weight[group == k].sum() < _MIN_NOISE_GROUP_SIZE:
+            if 0.0 < weight[group == k].sum() < _MIN_FREQUENCIES_PER_NOISE_GROUP:
                 group[group == k] = k + 1
         last = group == group[-1]
-        if weight[last].sum() < _MIN_NOISE_GROUP_SIZE and not last.all():
+        if weight[last].sum() < _MIN_FREQUENCIES_PER_NOISE_GROUP and not last.all():
             group[last] = group[~last][-1]
         low = np.clip(frequency, frequency[1], _MAX_NARROW_BAND_FREQUENCY_HZ) / frequency[1]
         narrow = np.log(low) // np.log(_MAX_NARROW_BAND_EDGE_RATIO)
@@ -302,14 +302,14 @@ class NoiseLevels:
             left = remaining - 0.5 * self.sums_over_groups(used)
             remaining = np.maximum(left, _MIN_REMAINING_DOF_SHARE * remaining)
         white = sums / self.relative_power
-        level = np.add.reduceat(white, self._first_bands_of_groups, axis=-2) / remaining
+        level = np.add.reduceat(white, self._first_bands_of_noise_groups, axis=-2) / remaining
         return np.asarray(level[..., self.group_of_band, :] * self.relative_power)
 
     def sums_over_groups(self, x: Array) -> Array:
-        return np.asarray(np.add.reduceat(x, self._first_bands_of_groups, axis=0))
+        return np.asarray(np.add.reduceat(x, self._first_bands_of_noise_groups, axis=0))
 
     @cached_property
-    def _first_bands_of_groups(self) -> NDArray[np.intp]:
+    def _first_bands_of_noise_groups(self) -> NDArray[np.intp]:
         return np.flatnonzero(np.diff(self.group_of_band, prepend=-1))
 
     def negative_log_likelihoods(self, power: Array) -> Array:

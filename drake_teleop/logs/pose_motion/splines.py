@@ -24,7 +24,7 @@ GRAVITY_COLUMNS, SIGNALS_ZERO_AT_REST = slice(4, 7), [1, 2, 3, *range(7, 16)]
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _POSE_NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _MAX_ROWS_PER_BLOCK = 2**17
-_DERIVATIVES_LIMITED_AT_ENDS = range(1, 5)
+_DERIVATIVE_ORDERS_LIMITED_AT_ENDS = range(1, 5)
 # Largest weight of the penalty or of a limit over that of the poses; rounding allows no more.
 _MAX_PENALTY_OVER_POSE_WEIGHT = 1e12
 
@@ -150,28 +150,28 @@ class PoseSplines:
             )
             band, noise, _ = penalized(best.x)
             spline = BSpline(knots, solveh_banded(band, right[:, part]), SPLINE_DEGREE)
-            self._limit_derivatives_at_ends(band, spline, t, noise, largest)
+            self._add_end_derivative_penalties(band, spline, t, noise, largest)
             coefficients[:, part] = solveh_banded(band, right[:, part])
         return BSpline(knots, coefficients, SPLINE_DEGREE)
 
-    def _limit_derivatives_at_ends(
-        self, band: Array, spline: BSpline, t: Array, noise: float, largest: float
+    def _add_end_derivative_penalties(
+        self, band: Array, spline: BSpline, t: Array, noise_variance: float, max_penalty: float
     ) -> None:
         count, margin = SPLINE_DEGREE + 1, SPLINE_DEGREE * self.spacing
         inside = t[(t > t[0] + margin) & (t < t[-1] - margin)]
         if not len(inside):
             return
-        x = np.stack([spline(inside, order) for order in _DERIVATIVES_LIMITED_AT_ENDS])
+        x = np.stack([spline(inside, order) for order in _DERIVATIVE_ORDERS_LIMITED_AT_ENDS])
         covariance = np.einsum("inc,jnc->ij", x, x) / (x.shape[1] * x.shape[2])
         std = np.sqrt(np.diag(covariance)) + 1e-150
         correlation = covariance / np.outer(std, std) + 1e-6 * np.eye(len(std))
-        weight = noise * np.linalg.inv(correlation) / np.outer(std, std)
+        weight = noise_variance * np.linalg.inv(correlation) / np.outer(std, std)
         for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
             basis = BSpline(spline.t, np.eye(band.shape[1])[:, columns], SPLINE_DEGREE)
-            values = np.stack([basis(at, order) for order in _DERIVATIVES_LIMITED_AT_ENDS])
+            values = np.stack([basis(at, order) for order in _DERIVATIVE_ORDERS_LIMITED_AT_ENDS])
             limit = values.T @ weight @ values
             # Constant poses have no derivatives inside; their limit would exceed all poses.
-            limit *= min(1.0, largest / np.trace(limit))
+            limit *= min(1.0, max_penalty / np.trace(limit))
             for k in range(count):
                 band[SPLINE_DEGREE - k, columns][k:] += np.diag(limit, k)
 
@@ -189,16 +189,16 @@ class PoseSplines:
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """Return [1, a, -g, alpha, products of omega] (N, 16) at times t [s], in P, Eq. (T73)."""
-        a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
+        a, minus_g, omega, alpha = self._evaluate_motion_in_P(t, gravity_W)
         products = np.hstack([omega, omega[:, [0, 0, 1]]]) * np.hstack([omega, omega[:, [1, 2, 2]]])
         return np.hstack([np.ones((len(t), 1)), a, minus_g, alpha, products])
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         """Return specific force of Po, omega, alpha and gravity (N, 3) at times t, in P [SI]."""
-        a, minus_g, omega, alpha = self._acceleration_minus_gravity_omega_alpha(t, gravity_W)
+        a, minus_g, omega, alpha = self._evaluate_motion_in_P(t, gravity_W)
         return a + minus_g, omega, alpha, -minus_g
 
-    def _acceleration_minus_gravity_omega_alpha(self, t: Array, gravity_W: Array) -> Array:
+    def _evaluate_motion_in_P(self, t: Array, gravity_W: Array) -> Array:
         out = np.empty((4, len(t), 3))
         for part in _split_rows_into_blocks(len(t)):
             x, first, second = (self._evaluate_derivative(t[part], order) for order in range(3))
@@ -279,8 +279,8 @@ def _remove_knots_without_poses(knots: Array, t: Array) -> Array:
     return np.concatenate([knots[: SPLINE_DEGREE + 1], kept, knots[-SPLINE_DEGREE - 1 :]])
 
 
-def _split_rows_into_blocks(count: int) -> list[slice]:
-    return [slice(k, k + _MAX_ROWS_PER_BLOCK) for k in range(0, count, _MAX_ROWS_PER_BLOCK)]
+def _split_rows_into_blocks(num_rows: int) -> list[slice]:
+    return [slice(k, k + _MAX_ROWS_PER_BLOCK) for k in range(0, num_rows, _MAX_ROWS_PER_BLOCK)]
 
 
 def _spline_normal_equations(
@@ -339,10 +339,10 @@ def _vector_part_of_relative_quaternion(q: Array, p: Array) -> Array:
     return out
 
 
-def _rotate_W_to_P(q: Array, n: Array, x: Array) -> Array:
+def _rotate_W_to_P(q: Array, squared_norm: Array, x: Array) -> Array:
     v = -q[:, 1:]
     once = _cross_products(v, x)
-    out: Array = x + 2.0 * (q[:, :1] * once + _cross_products(v, once)) / n
+    out: Array = x + 2.0 * (q[:, :1] * once + _cross_products(v, once)) / squared_norm
     return out
 
 

@@ -17,9 +17,9 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
 
-_MIN_SAMPLES_AFTER_DELAY = 8
+_MIN_SAMPLES_LEFT_AFTER_DELAY_SHIFT = 8
 _INTERPOLATED_CHUNK_ROWS = 2**18
-_MAX_VALUES_PER_TRANSFORM = 2**18  # limits the memory of the low-pass
+_MAX_VALUES_PER_FOURIER_TRANSFORM = 2**18  # limits the memory of the low-pass
 _MIN_SMOOTHER_WINDOW_SAMPLES, _SMOOTHER_DEGREE = 9, 5
 SMOOTHER_WINDOW_OVER_PERIOD = 1.8  # window [s] of the smoother times its bandwidth [Hz]
 
@@ -67,7 +67,7 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
     gain = 1 / (1 + (np.fft.rfftfreq(length, dt) / cutoff_hz) ** 4)
     out = np.empty((n, x.size // n))
     columns = x.reshape(n, -1).T
-    count = max(1, _MAX_VALUES_PER_TRANSFORM // length)
+    count = max(1, _MAX_VALUES_PER_FOURIER_TRANSFORM // length)
     for first in range(0, len(columns), count):  # one transform of several columns is faster
         part = slice(first, first + count)
         padded = _pad_by_continuation(columns[part], pad, length)
@@ -179,10 +179,10 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
-    if known.sum() < _MIN_SAMPLES_AFTER_DELAY:
+    if known.sum() < _MIN_SAMPLES_LEFT_AFTER_DELAY_SHIFT:
         what = (
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples"
-            f" ({_MIN_SAMPLES_AFTER_DELAY} are required)"
+            f" ({_MIN_SAMPLES_LEFT_AFTER_DELAY_SHIFT} are required)"
         )
         raise DrakeTeleopError(what, where=log.source, remedy="give a shorter delay, or `auto`")
     names = ("specific_force", "angular_velocity", "angular_acceleration", "gravity", "R_WS")
@@ -236,7 +236,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     if len(inside) < _MIN_SAMPLES_FOR_DELAY:
         return None
     stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES_FOR_DELAY)
-    cost = _cost_of_shift(smooth, inside[::stride], phi)
+    cost = _cost_of_delay(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])
     best = int(np.argmin(costs))
@@ -269,7 +269,7 @@ def choose_delay(
     return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
-def _cost_of_shift(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:
+def _cost_of_delay(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]
     # Common scales of forces and torques prevent large weights of channels without a signal; the
     # floor excludes rounding of a constant wrench.

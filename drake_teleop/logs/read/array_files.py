@@ -107,54 +107,54 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     return found
 
 
-def _iterate_mat_elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+def _iterate_mat_elements(data: memoryview, byte_order: str) -> Iterator[tuple[int, memoryview]]:
     start = 0
     while start < len(data):
         if len(data) - start < 8:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        kind, size = struct.unpack_from(f"{order}II", data, start)
+        kind, size = struct.unpack_from(f"{byte_order}II", data, start)
         small = kind >> 16
         kind, size, begin = (kind & 0xFFFF, small, 4) if small else (kind, size, 8)
         content = data[start + begin : start + begin + size]
         if len(content) < size or (small and size > 4):
             raise ValueError(_DAMAGED_FILE_MESSAGE)
         if kind == _MAT_COMPRESSED_TYPE:
-            yield from _iterate_mat_elements(memoryview(zlib.decompress(content)), order)
+            yield from _iterate_mat_elements(memoryview(zlib.decompress(content)), byte_order)
         else:
             yield kind, content
         start += 8 if small else 8 + (size if kind == _MAT_COMPRESSED_TYPE else -(-size // 8) * 8)
 
 
 def _add_mat_variable(
-    kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
+    kind: int, content: memoryview, byte_order: str, name: str | None, depth: int, found: dict
 ) -> None:
-    parts = list(_iterate_mat_elements(content, order)) if kind == _MAT_MATRIX_TYPE else []
+    parts = list(_iterate_mat_elements(content, byte_order)) if kind == _MAT_MATRIX_TYPE else []
     # Objects have no size.
     if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _MAT_FLAGS_AND_SIZE_TYPES:
         return
     if depth > _MAX_MAT_STRUCTURE_DEPTH:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
-    (flags, *_), size = (_parse_mat_numbers(part, order).tolist() for part in parts[:2])
+    (flags, *_), size = (_parse_mat_numbers(part, byte_order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
     if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _MAT_COMPLEX_FLAG:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        array = _parse_mat_numbers(parts[3], order).reshape(size, order="F")
+        array = _parse_mat_numbers(parts[3], byte_order).reshape(size, order="F")
         _add_mat_array_unless_scalar(name, array, found)
     elif flags & 0xFF == _MAT_STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
-        (length, *_), names = _parse_mat_numbers(parts[3], order).tolist(), bytes(parts[4][1])
+        (length, *_), names = _parse_mat_numbers(parts[3], byte_order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
         for field, part in zip(fields, parts[5:], strict=True):
             label = field.partition(b"\0")[0].decode("latin-1")
-            _add_mat_variable(*part, order, f"{name}.{label}", depth + 1, found)
+            _add_mat_variable(*part, byte_order, f"{name}.{label}", depth + 1, found)
 
 
-def _parse_mat_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
+def _parse_mat_numbers(part: tuple[int, memoryview], byte_order: str) -> NDArray:
     kind, content = part
     if kind not in _DTYPE_OF_MAT_TYPE:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
     dtype = _DTYPE_OF_MAT_TYPE[kind]
-    return np.frombuffer(content, f"{order}{dtype}").astype(dtype)
+    return np.frombuffer(content, f"{byte_order}{dtype}").astype(dtype)
 
 
 def _add_mat_array_unless_scalar(name: str, array: NDArray, found: dict[str, NDArray]) -> None:

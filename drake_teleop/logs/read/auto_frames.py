@@ -50,7 +50,7 @@ def estimate_auto_imu_mounting(description: Description, source: str, read: Read
         lever = _lever_arm_from_pose_or_wrench(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         found = f": {_format_arm_mm(lever)} mm, from the {lever.source}"
-        notes.append(_estimate_note("imu.position", found, lever.p_SoIo_S))
+        notes.append(_note_on_estimate("imu.position", found, lever.p_SoIo_S))
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
 
@@ -62,7 +62,7 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
         problem = "the axes of the IMU are mirrored relative to those of the pose"
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits_pose:
-        problem = f"no rotation makes IMU and pose agree ({_unexplained_shares_text(mounting)})"
+        problem = f"no rotation makes IMU and pose agree ({_format_unexplained_shares(mounting)})"
         remedy = "find wrong units, signs or clocks by `drake-teleop inspect` with `frame: sensor`"
     elif not mounting.is_determined:
         worst = float(mounting.deviations_deg.max())
@@ -74,7 +74,7 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
     raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or give a rotation matrix")
 
 
-def _unexplained_shares_text(found: Mounting) -> str:
+def _format_unexplained_shares(found: Mounting) -> str:
     shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_omega}
     return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
 
@@ -83,7 +83,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     nearest = found.nearest_right_angled_rotation.astype(int).tolist()
     oblique = f"{found.angle_to_right_angled_deg:.1f} deg from the right-angled mounting {nearest}"
     std = f"{float(found.deviations_deg.max()):.2g} deg"
-    notes = [_estimate_note("imu.frame", f": {oblique}, standard deviation {std}", found.R_SI)]
+    notes = [_note_on_estimate("imu.frame", f": {oblique}, standard deviation {std}", found.R_SI)]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
     if abs(found.lag_s) > MIN_WARNED_IMU_LAG_S:
@@ -116,7 +116,7 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
     return lever
 
 
-def _estimate_note(field: str, found: str, value: Array) -> str:
+def _note_on_estimate(field: str, found: str, value: Array) -> str:
     written = f"{field}: {round_for_yaml(value)}"
     return f"{field} found{found}; write it into the description as {written}"
 
@@ -162,7 +162,7 @@ def estimate_auto_pose_frame(description: Description, source: str, read: ReadLo
             remedy = "turn the sensor faster, about more axes, without contact; or give the values"
             raise DrakeTeleopError(what, where=f"{source}:pose.{field}", remedy=remedy)
         changes[field] = tuple(map(tuple, value.tolist()) if value.ndim == 2 else value.tolist())
-        notes.append(_estimate_note(f"pose.{field}", f", standard deviation {deviation}", value))
+        notes.append(_note_on_estimate(f"pose.{field}", f", standard deviation {deviation}", value))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 
 
@@ -216,5 +216,5 @@ def estimate_auto_gravity(description: Description, source: str, read: ReadLog) 
         what = "the data do not determine the direction of gravity"
         remedy = "record the load in more orientations, without contact; or give the vector"
         raise DrakeTeleopError(what, where=f"{source}:gravity", remedy=remedy)
-    note = _estimate_note("gravity", f", standard deviation {deviation:.2g} deg", estimated)
+    note = _note_on_estimate("gravity", f", standard deviation {deviation:.2g} deg", estimated)
     return description.model_copy(update={"gravity": tuple(round_for_yaml(estimated))}), (note,)

@@ -37,8 +37,8 @@ _TOO_LARGE_MESSAGE = "its uncompressed size is too large (more than 1.5 GB, or 2
 _SPLIT_REMEDY = "cut the bag, or write each topic to its own bag"
 _SHORT_NAME_OF_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
 _SHORT_NAME_OF_FIELD |= dict.fromkeys(("position", "translation"), "position")
-_FIELDS_WITH_OWN_SHORT_NAME = ("force", "torque", "linear_acceleration", "angular_velocity")
-_SHORT_NAME_OF_FIELD |= {field: field for field in _FIELDS_WITH_OWN_SHORT_NAME}
+_FIELDS_THAT_ARE_SHORT_NAMES = ("force", "torque", "linear_acceleration", "angular_velocity")
+_SHORT_NAME_OF_FIELD |= {field: field for field in _FIELDS_THAT_ARE_SHORT_NAMES}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -213,13 +213,13 @@ def _limit_process_memory() -> Iterator[None]:
 
 
 def _read_column_blocks(
-    pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
+    timed_messages: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
     children: set[str] = set()
     blocks: list[dict[str, NDArray]] = []
 
     def messages_of_child_frame() -> Iterator[tuple[int, Any]]:
-        for received, part in pairs:
+        for received, part in timed_messages:
             children.add(getattr(part, "child_frame_id", ""))
             if child_frame in (None, getattr(part, "child_frame_id", "")):
                 yield received, part

@@ -26,7 +26,7 @@ ANGULAR_VELOCITY_COLUMNS = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION_COLUMNS = ("alpha_x", "alpha_y", "alpha_z")
 QUATERNION_COLUMNS = ("q_w", "q_x", "q_y", "q_z")
 POSITION_COLUMNS = ("p_x", "p_y", "p_z")
-_KINEMATIC_COLUMNS = {
+_COLUMNS_OF_KINEMATIC_FIELD = {
     "specific_force": SPECIFIC_FORCE_COLUMNS,
     "angular_velocity": ANGULAR_VELOCITY_COLUMNS,
     "angular_acceleration": ANGULAR_ACCELERATION_COLUMNS,
@@ -171,7 +171,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     table.finite_numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {}
-    for name, names in _KINEMATIC_COLUMNS.items():
+    for name, names in _COLUMNS_OF_KINEMATIC_FIELD.items():
         present = [column for column in names if column in table.columns]
         if present and len(present) < len(names):
             table.finite_numbers(names, len(names), str(path))
@@ -181,7 +181,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
         fields["orientation"]["form"] = "quaternion_wxyz"
     force, torque = {"columns": WRENCH_COLUMNS[:3]}, {"columns": WRENCH_COLUMNS[3:]}
     wrench = {"file": path, "force": force, "torque": torque}
-    if _are_rows_at_rest(table, fields):
+    if _are_rows_poses_at_rest(table, fields):
         kinematics = "orientation" if "orientation" in fields else "specific_force"
         return Description.model_validate({"static": wrench | {kinematics: fields[kinematics]}})
     if "orientation" not in fields and not {"specific_force", "angular_velocity"} <= fields.keys():
@@ -200,7 +200,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     return Description.model_validate(streams)
 
 
-def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
+def _are_rows_poses_at_rest(table: Table, fields: Container[str]) -> bool:
     where, oriented = str(table.path), "orientation" in fields
     if not oriented and "specific_force" not in fields:
         return False

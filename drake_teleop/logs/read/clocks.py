@@ -18,7 +18,7 @@ from drake_teleop.logs.read.tables import Table
 EPISODE_SPACING_S = 1.0  # least time between two episodes of a file
 MIN_GAP_STEPS = 4.0  # median steps
 MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5  # other rates indicate a wrong unit
-_MAX_MEAN_OVER_MEDIAN_STEP = 4.0
+_MAX_MEAN_OVER_MEDIAN_TIME_STEP = 4.0
 # Limits of an episode, in median steps: distance of its start from that of the first episode, and
 # each of its first steps. Least number of its rows.
 _MAX_EPISODE_START_OFFSET_STEPS, _MAX_STEP_AT_EPISODE_START_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
@@ -76,7 +76,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
             f" {np.abs(even - t).max():.2g} s"
         )
         t = even
-    _check_steps(t, rows, time, table, where)
+    _check_sampling(t, rows, time, table, where)
     return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
 
 
@@ -216,18 +216,18 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
         raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
 
 
-def _check_steps(t: Array, rows: NDArray[np.intp], time: Time, table: Table, where: str) -> None:
+def _check_sampling(t: Array, rows: NDArray[np.intp], time: Time, table: Table, where: str) -> None:
     if len(t) < 2:
         return
     steps = np.diff(t)
     step = float(np.median(steps))
     if 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
-        if len(t) > 2 and t[-1] - t[0] > _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * step:
+        if len(t) > 2 and t[-1] - t[0] > _MAX_MEAN_OVER_MEDIAN_TIME_STEP * len(t) * step:
             longest = int(np.argmax(steps))
             row = table.line_in_file(rows[longest + 1])
             raise DrakeTeleopError(
                 f"the time stamps are too uneven: median step {step:.3g} s, mean"
-                f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that),"
+                f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_TIME_STEP:g} times that),"
                 f" longest {steps[longest]:.3g} s to row {row} of {table.path.name}",
                 where=where,
                 remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",

@@ -48,7 +48,7 @@ class Time(StrictModel):
     )
 
     @model_validator(mode="after")
-    def _check_alternatives(self) -> Time:
+    def _check_column_or_rate(self) -> Time:
         if (self.column is None) == (self.rate is None):
             raise ValueError("time needs either column or rate: give exactly one of them")
         if self.nanoseconds is not None and (self.column is None or self.unit != "s"):
@@ -70,7 +70,7 @@ class Orientation(StrictModel):
     inverse: bool = Field(default=False, description="true if the columns hold R_SW")
 
     @model_validator(mode="after")
-    def _check_axes(self) -> Orientation:
+    def _check_euler_axes(self) -> Orientation:
         if (self.axes is not None) != (self.form == "euler"):
             raise ValueError(
                 "form: euler needs axes, such as xyz (fixed) or ZYX (moving); other forms have none"
@@ -83,21 +83,21 @@ class Orientation(StrictModel):
         return self
 
 
-def _axis_columns(group: str, axes: str = "xyz") -> list[str]:
+def _columns_of_axes(group: str, axes: str = "xyz") -> list[str]:
     return [f"{group}.{axis}" for axis in axes]
 
 
-_TOPIC_DEFAULTS: dict[str, dict[str, Any]] = {
-    "force": {"columns": _axis_columns("force")},
-    "torque": {"columns": _axis_columns("torque")},
-    "specific_force": {"columns": _axis_columns("linear_acceleration")},
-    "angular_velocity": {"columns": _axis_columns("angular_velocity")},
-    "orientation": {"columns": _axis_columns("orientation", "wxyz"), "form": "quaternion_wxyz"},
-    "position": {"columns": _axis_columns("position")},
+_DEFAULTS_OF_TOPIC_QUANTITY: dict[str, dict[str, Any]] = {
+    "force": {"columns": _columns_of_axes("force")},
+    "torque": {"columns": _columns_of_axes("torque")},
+    "specific_force": {"columns": _columns_of_axes("linear_acceleration")},
+    "angular_velocity": {"columns": _columns_of_axes("angular_velocity")},
+    "orientation": {"columns": _columns_of_axes("orientation", "wxyz"), "form": "quaternion_wxyz"},
+    "position": {"columns": _columns_of_axes("position")},
 }
 
 
-class _Stream(StrictModel):
+class _StreamDescription(StrictModel):
     file: Path
     header: bool = True
 
@@ -113,7 +113,7 @@ class _Stream(StrictModel):
         return tuple(c for quantity in quantities for c in getattr(quantity, "columns", ()))
 
 
-class _RecordedStream(_Stream):
+class _RecordedStreamDescription(_StreamDescription):
     topic: str | None = Field(default=None, description="topic of a ROS bag or MCAP file")
     child_frame: str | None = Field(
         default=None, description="child frame of the transform in the topic"
@@ -134,7 +134,7 @@ class _RecordedStream(_Stream):
         for name in cls._quantities_of_topic:
             given = data[name]
             if isinstance(given, dict) and not {"columns", "form"} & set(given):
-                data[name] = {**_TOPIC_DEFAULTS[name], **given}
+                data[name] = {**_DEFAULTS_OF_TOPIC_QUANTITY[name], **given}
         return data
 
     @property
@@ -144,7 +144,7 @@ class _RecordedStream(_Stream):
         return self.file.joinpath(*f"{self.topic}/{self.child_frame or ''}".split("/"))
 
 
-class Wrench(_RecordedStream):
+class Wrench(_RecordedStreamDescription):
     """File and columns of the force-torque sensor."""
 
     _quantities_of_topic = ("force", "torque")
@@ -157,7 +157,7 @@ class Wrench(_RecordedStream):
     gain_std: fields.GainStd = 0.0
 
 
-class Imu(_RecordedStream):
+class Imu(_RecordedStreamDescription):
     """File and columns of an IMU."""
 
     _quantities_of_topic = ("specific_force", "angular_velocity")
@@ -174,7 +174,7 @@ class Imu(_RecordedStream):
     )
 
     @model_validator(mode="after")
-    def _check_signals(self) -> Imu:
+    def _check_imu_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         if self.is_mounting_auto and not self.specific_force:
@@ -188,7 +188,7 @@ class Imu(_RecordedStream):
         return self.frame == "auto" or self.position == "auto"
 
 
-class Pose(_RecordedStream):
+class Pose(_RecordedStreamDescription):
     """File and columns of a pose of sensor, flange or TCP."""
 
     _quantities_of_topic = ("orientation", "position")
@@ -206,7 +206,7 @@ class Pose(_RecordedStream):
     )
 
     @model_validator(mode="after")
-    def _check_frame(self) -> Pose:
+    def _check_pose_frame(self) -> Pose:
         if self.frame == "base":
             raise ValueError("frame must be sensor, or a rotation matrix from the posed frame to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
@@ -231,7 +231,7 @@ class Pose(_RecordedStream):
         return None
 
 
-class Static(_Stream):
+class Static(_StreamDescription):
     """Wrenches averaged over separate poses at rest, one pose per row."""
 
     force: fields.Force
@@ -247,7 +247,7 @@ class Static(_Stream):
     gain_std: fields.GainStd = 0.0
 
     @model_validator(mode="after")
-    def _check_alternatives(self) -> Static:
+    def _check_orientation_source(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
             raise ValueError("static needs exactly one of gravity, specific_force and orientation")
         if self.weight == "removed":

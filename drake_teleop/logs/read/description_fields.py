@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from typing import Annotated, Any, Literal, get_args
 
@@ -27,6 +28,17 @@ SI_VALUE_OF_UNIT = {
     "mdeg/s": 1e-3 * np.pi / 180,
 }  # fmt: skip
 """SI value of each unit, except "g", the magnitude of the described gravity, and "mg"."""
+_UNIT_OF_SPELLING = {
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g", "mg")},
+    "µs": "us", "°": "deg", "dps": "deg/s", "mdps": "mdeg/s", "°/s": "deg/s", "m/s²": "m/s^2",
+    "rad/s²": "rad/s^2", "sec": "s",
+}  # fmt: skip
+
+
+def known_unit(text: str) -> str:
+    """Return the name of a unit in any spelling, such as "N m" for "[Nm]"; "" if it is unknown."""
+    plain = re.sub(r"[] ^[*.·]", "", text).lower().replace("\u03bc", "µ")
+    return _UNIT_OF_SPELLING.get(plain, "")
 
 
 def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:
@@ -64,14 +76,14 @@ def _parse_gravity(value: Any) -> Any:
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
-def _parse_scale(value: Any) -> Any:
+def _parse_scale_factors(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE_FACTOR for x in factors):
         raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE_FACTOR:g}")
     return [float(value)] * 3 if _is_number(value) else value
 
 
-def _parse_weight(value: Any) -> Any:
+def _parse_removed_weight(value: Any) -> Any:
     if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
         raise ValueError("weight must be the word removed, or [m, m c_x, m c_y, m c_z] in kg, kg m")
     return value
@@ -107,11 +119,11 @@ _SCALE_SCHEMA = {
     "anyOf": _NUMBER_OR_VECTOR_SCHEMA,
     "description": "factor on the numbers of the file, or one for each column; -1 for another sign",
 }
-Scale = Annotated[Vector, BeforeValidator(_parse_scale), WithJsonSchema(_SCALE_SCHEMA)]
+Scale = Annotated[Vector, BeforeValidator(_parse_scale_factors), WithJsonSchema(_SCALE_SCHEMA)]
 MassAndMoment = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
 Weight = Annotated[
     MassAndMoment | Literal["removed"] | None,
-    BeforeValidator(_parse_weight),
+    BeforeValidator(_parse_removed_weight),
     Field(
         description="weight that the robot has subtracted: removed (that of the load), or that of a"
         " payload, [m, m c_x, m c_y, m c_z] in S, kg and kg m"

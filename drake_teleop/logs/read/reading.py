@@ -129,14 +129,14 @@ class _LogReader:
             return log
         without = stream.model_copy(update={"weight": None})
         other = self.description.model_copy(update={"wrench": without})
-        return restore_removed_weight(log, np.array(weight), self._read_log_with(other))
+        return restore_removed_weight(log, np.array(weight), self._read_described_log(other))
 
-    def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
-        read = partial(self._read_log_with, differentiate=differentiate)
-        self.description, notes = describe(self.description, self.source, read)
+    def _replace_auto_fields(self, estimate: _EstimateAuto, *, differentiate: bool = True) -> None:
+        read = partial(self._read_described_log, differentiate=differentiate)
+        self.description, notes = estimate(self.description, self.source, read)
         self.notes += notes
 
-    def _read_log_with(self, description: Description, *, differentiate: bool = True) -> Log:
+    def _read_described_log(self, description: Description, *, differentiate: bool = True) -> Log:
         for stream in self.description.streams.values():
             self._table_of_stream(stream)
         reader = _LogReader(description, self.source, 30.0, dict(self.tables))
@@ -146,6 +146,8 @@ class _LogReader:
         if stream.source not in self.tables:
             self.tables[stream.source] = read_stream_table(stream)
         table = self.tables[stream.source]
+        if table.note and table.note not in self.notes:
+            self.notes.append(table.note)
         return table if isinstance(stream, Static) else table.rows_with_any_number(stream.columns)
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
@@ -373,7 +375,7 @@ class _LogReader:
             gravity=gravity,
             R_WS=R_WS,
             gravity_W=None if R_WS is None else described.gravity_W,
-            bridged=self._flag_bridged_samples(t),
+            bridged=self._flag_samples_in_gaps(t),
             notes=tuple(self.notes),
             source=self.source,
             posed=posed,
@@ -382,7 +384,7 @@ class _LogReader:
             described=described,
         )
 
-    def _flag_bridged_samples(self, t: Array) -> NDArray[np.bool_] | None:
+    def _flag_samples_in_gaps(self, t: Array) -> NDArray[np.bool_] | None:
         if not self.gaps:
             return None
         flags = np.zeros(len(t), bool)

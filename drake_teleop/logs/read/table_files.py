@@ -2,8 +2,9 @@
 
 Nested columns become several: `name.field` for the fields of a structure, and `name[k]` for the
 elements of a list or array of constant length, besides the whole as `name`. Separator, decimal
-sign, header and encoding (UTF-8, UTF-16) of text are detected. Lines with `#` before the header are
-comments, except column names directly before the numbers.
+sign, header and encoding (UTF-8, UTF-16, else Windows-1252) of text are detected. Lines with `#`
+and other text before the header are comments, except column names directly before the numbers.
+A row of units below the header completes the column names.
 """
 
 from __future__ import annotations
@@ -27,24 +28,28 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.parquet_sizes import check_parquet_sizes
 from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
+from drake_teleop.logs.read.description_fields import known_unit
 from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 if TYPE_CHECKING:
     import polars as pl
 
 _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
-_CANONICAL_COLUMNS = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
 _ROWS_FOR_TYPE_INFERENCE = 1000  # rows from which column types are inferred
-_UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF_16_BYTE_ORDER_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
-_THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
+_THOUSANDS_COMMA_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
 _DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_MIN_WRENCH_COLUMNS = 6
+_MIN_SIMILAR_SHEET = 0.5  # rows of a second log in an Excel file, over those of the first
+_TIME_CELL_PATTERN = re.compile(r"\d[\dT:./ +-]*Z?")  # of dates and times of day
 _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
 
 
@@ -91,14 +96,25 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     with path.open("rb") as file:
         head = file.read(_INSPECTED_HEAD_BYTES)
     source: Path | bytes = path
-    if head.startswith(_UTF_16_MARKS):
+    if head.startswith(_UTF_16_BYTE_ORDER_MARKS):
         source = path.read_text("utf-16").encode()
+        head = source[:_INSPECTED_HEAD_BYTES]
+    elif not _is_utf_8(head):
+        source = path.read_bytes().decode("cp1252", "replace").encode()
         head = source[:_INSPECTED_HEAD_BYTES]
     if (text := _normalize_line_ends_and_decimal_commas(path, source, head)) is not None:
         source, head = text, text[:_INSPECTED_HEAD_BYTES]
-    lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
+    lines = re.split("\r?\n", head.decode("utf-8", "replace").lstrip("\ufeff"))
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     before = next(table, 0)
+    names_line, first, units = _find_table_below_text(lines, before) or (before, before + 1, [])
+    cut = first - names_line - 1  # lines between the header and the numbers
+    if cut > 0:
+        text = path.read_bytes() if isinstance(source, Path) else source
+        pieces = text.split(b"\n", first)
+        source = b"\n".join([*pieces[: names_line + 1], pieces[-1]])
+        del lines[names_line + 1 : first]
+    before = names_line
     rest = lines[before:]
     separator = _find_separator(rest[0]) if rest else ","
     if separator == " " and any(line != " ".join(line.split()) for line in rest):
@@ -106,7 +122,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
         source = b"\n".join([b" ".join(line.split()) for line in aligned])
         rest = [" ".join(line.split()) for line in rest]
-    names = _names_in_comment(lines[:before], rest, separator) if header else None
+    names = _header_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
     cells = (cell for line in rest for cell in line.split(separator))
     parse = partial(
@@ -125,7 +141,10 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         frame = parse(infer_schema_length=None)
     if names is not None:
         frame.columns = names
-    return frame, before + (2 if header else 1)
+    elif header and units:
+        pairs = zip(frame.columns, units, strict=True)
+        frame.columns = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
+    return frame, before + cut + (2 if header else 1)
 
 
 def _normalize_line_ends_and_decimal_commas(
@@ -136,7 +155,7 @@ def _normalize_line_ends_and_decimal_commas(
         tail = file.read() if isinstance(source, Path) else source
     returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
     # "1,500" can be 1500.
-    commas = [found for found in commas if not _THOUSANDS_PATTERN.fullmatch(b",".join(found))]
+    commas = [found for found in commas if not _THOUSANDS_COMMA_PATTERN.fullmatch(b",".join(found))]
     if not (returns or commas or _length_without_blank_end(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
@@ -150,6 +169,59 @@ def _length_without_blank_end(text: bytes) -> int:
     return len(text) if line < 0 else line + 1
 
 
+def _is_utf_8(head: bytes) -> bool:
+    with suppress(UnicodeDecodeError):
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+        return True
+    return False
+
+
+def _find_table_below_text(lines: list[str], start: int) -> tuple[int, int, list[str]] | None:
+    """Return the line of the header, the first line of numbers, and the units between them.
+
+    Return None if the table begins at line `start`, or if a line in it is unclear. Without a
+    header the line of the header is the first line of numbers.
+    """
+    rows = [_split_cells(line) for line in lines]
+
+    def is_data(k: int) -> bool:
+        return len(rows[k]) == len(rows[k + 1]) and all(map(_is_data_row, rows[k : k + 2]))
+
+    first = next(filter(is_data, range(start, len(lines) - 1)), start)
+    width, above = len(rows[first]), range(first - 1, start - 1, -1)
+    if first <= start + 1 or any(len(rows[k]) == width and _is_data_row(rows[k]) for k in above):
+        return None
+    names = [k for k in above if len(rows[k]) == width and not _is_row_of_units(rows[k])]
+    whole = [k for k in names if len(set(rows[k])) == width]
+    header = (whole or names or [first])[0]
+    between = [rows[k] for k in above if k > header and rows[k] != [""]]
+    if not all(map(_is_row_of_units, between)):
+        return None
+    units = [cell.strip("[]() ") for cell in between[-1]] if between else []
+    return (header, first, units) if header < first else (first, first + 1, [])
+
+
+def _split_cells(line: str) -> list[str]:
+    separator = _find_separator(line)
+    cells = line.split() if separator == " " else line.rstrip().split(separator)
+    cells = [cell.strip(' "') for cell in cells]
+    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells or [""]
+
+
+def _is_data_row(cells: list[str]) -> bool:
+    numbers = sum(map(_is_decimal_number, cells))
+    others = [cell for cell in cells if cell and not _is_decimal_number(cell)]
+    if len(cells) < 2 or not numbers:
+        return False
+    return all(map(_TIME_CELL_PATTERN.fullmatch, others)) or numbers >= max(3, len(cells) / 2)
+
+
+def _is_row_of_units(cells: list[str]) -> bool:
+    filled = [cell for cell in cells if cell]
+    known = [cell for cell in filled if cell[0] in "[(" or known_unit(cell)]
+    return len(cells) > 1 and 2 * len(known) >= len(filled) > 0
+
+
 def _find_separator(line: str) -> str:
     bare = _QUOTED_TEXT_PATTERN.sub("", line).strip()
     if ";" in bare or "\t" in bare:
@@ -157,7 +229,7 @@ def _find_separator(line: str) -> str:
     return " " if "," not in bare and " " in bare else ","
 
 
-def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+def _header_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
     if not marked or not all(_is_decimal_number(cell) for cell in rest[0].split(separator)):
         return None
@@ -184,8 +256,8 @@ def _strip_column_names(names: list[str]) -> list[str]:
 
 def _add_lower_case_names_if_canonical(columns: dict[str, _ColumnType]) -> dict[str, _ColumnType]:
     small = {name.lower(): column for name, column in columns.items()}
-    canonical = len(small) == len(columns) and _CANONICAL_COLUMNS.issubset(small)
-    return small | columns if canonical and not _CANONICAL_COLUMNS.issubset(columns) else columns
+    canonical = len(small) == len(columns) and _WRENCH_COLUMN_NAMES.issubset(small)
+    return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
 
 
 def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
@@ -195,8 +267,6 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
     if kind == ".parquet":
         check_parquet_sizes(path)
         frame = pl.scan_parquet(path)
-    elif kind == ".xlsx":
-        frame = pl.read_excel(path).lazy()
     else:
         read = pl.read_ipc if kind in (".arrow", ".feather") else pl.read_ndjson
         frame = read(path.read_bytes()).lazy()
@@ -209,6 +279,30 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
 
         return ColumnsOnAccess(columns, read_column)  # to limit memory
     return _collect_columns(frame, columns)
+
+
+def _read_excel(path: Path) -> Table:
+    """Return the sheet with the log; raise an error if another one has a similar table."""
+    import polars as pl
+
+    sheets = pl.read_excel(path, sheet_id=0, raise_if_empty=False)
+    number = pl.all().cast(pl.Float64, strict=False)
+    rows, wide = dict.fromkeys(sheets, 0), []
+    for name, sheet in sheets.items():
+        if sheet.width:
+            cells = sheet.select(number.is_not_null())
+            rows[name] = int(cells.select((pl.sum_horizontal(pl.all()) > 1).sum()).item())
+            full = cells.select(pl.all().sum() > 0.5 * rows[name]).row(0)
+            wide += [name] if rows[name] and sum(full) >= _MIN_WRENCH_COLUMNS else []
+    best = max(wide or rows, key=lambda name: rows[name])
+    if similar := [x for x in wide if x != best and rows[x] >= _MIN_SIMILAR_SHEET * rows[best]]:
+        what = (
+            f"the sheets {best!r} and {', '.join(map(repr, similar))} have tables of similar size"
+        )
+        raise DrakeTeleopError(what, where=str(path), remedy="save each sheet as a CSV file")
+    others = ", ".join(repr(name) for name in sheets if name != best)
+    note = f"{path.name}: the sheet {best!r} was read; other sheets: {others}" if others else ""
+    return Table(path, columns_of_frame(sheets[best].lazy()), note=note)
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
@@ -307,7 +401,7 @@ _ARRAY_READERS: dict[str, _ArrayReader] = {".npz": _read_npz, ".npy": _read_npy,
 _ARRAY_READERS |= {".h5": read_hdf5, ".hdf5": read_hdf5, ".zarr": read_zarr}
 
 
-def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
+def _table_reader_of_arrays(read: _ArrayReader) -> _ArrayReader:
     return lambda path: array_columns(_with_samples_as_rows(read(path)))
 
 
@@ -326,10 +420,9 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
     "log format",
     {
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
-        **dict.fromkeys(
-            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_with_polars
-        ),
-        **{suffix: _reader_of_columns(read) for suffix, read in _ARRAY_READERS.items()},
+        **dict.fromkeys((".parquet", ".arrow", ".feather", ".jsonl", ".ndjson"), _read_with_polars),
+        ".xlsx": _read_excel,
+        **{suffix: _table_reader_of_arrays(read) for suffix, read in _ARRAY_READERS.items()},
     },
 )
 """Readers of files by suffix; a reader returns columns by name."""

@@ -31,6 +31,7 @@ class Table:
         absent_groups: names of column groups that the file marks as not provided.
         whole_table: table of all rows, if this one has only some of them.
         kept_rows: row numbers in `whole_table`, counted from 0; None: all rows.
+        note: which part of the file was read, if it has several.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class Table:
     absent_groups: tuple[str, ...] = ()
     whole_table: Table | None = None
     kept_rows: NDArray[np.intp] | None = None
+    note: str = ""
 
     def line_in_file(self, row: int) -> int:
         """Return the number in the file, for messages, of a row of this table."""
@@ -105,7 +107,7 @@ class Table:
         if name not in self.columns:
             return self._finite_column(name, where)
         column = self.columns[name]
-        numbers = _column_to_numbers(column, partial(self._cell_error, name))
+        numbers = _column_to_numbers(column, partial(self._not_a_number_error, name))
         numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
         self.check_magnitude(numbers, MAX_PLAUSIBLE_NUMBER, "", f"{self.path}:{name}")
         return numbers
@@ -160,7 +162,7 @@ class Table:
             raise DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
         return numbers
 
-    def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
+    def _not_a_number_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         what = f"{cell!r} in row {self.line_in_file(row)} is not a number"
         remedy = "correct the cell or delete the row"
         if row == 0:

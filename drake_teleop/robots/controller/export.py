@@ -35,14 +35,14 @@ from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 """Options of a C compiler for results that are bit-equal to those of Python."""
-_TEST_VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
+_FORCE_SCALES_OF_TEST_VECTOR = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
-_MODEL_NAME = "wrench_compensator"
+_FMU_MODEL_NAME = "wrench_compensator"
 _WRENCH_COMPONENT_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
-_PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
-_FILTER_NAME = "wrench_compensator_filter"
-_FILTER_TEMPLATE_FOLDER = "ros2_filter"
+_FMU_BINARY_FOLDER_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
+_ROS2_FILTER_PACKAGE_NAME = "wrench_compensator_filter"
+_ROS2_FILTER_TEMPLATE_FOLDER = "ros2_filter"
 
 ExportedFiles = Mapping[str, str | bytes]
 
@@ -78,7 +78,7 @@ class ExportedCompensation(NamedTuple):
 def c99_files(target: ExportedCompensation) -> ExportedFiles:
     return {
         **kernel_files(target),
-        "test_vector.h": _test_vector_header(target),
+        "test_vector.h": _render_test_vector_header(target),
         "test_wrench_compensator.c": read_template("test_wrench_compensator.c"),
         "CMakeLists.txt": read_template("CMakeLists.txt"),
         "README.md": render_template(
@@ -117,17 +117,17 @@ def render_template(name: str, **values: Any) -> str:
     return render_page(TEMPLATE_PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
-def _test_vector_header(target: ExportedCompensation) -> str:
+def _render_test_vector_header(target: ExportedCompensation) -> str:
     inputs, sensor_range = _simulated_readings_and_sensor_range(target)
     target = target._replace(sensor_range=sensor_range)
-    python = target.make_compensator(**_TEST_VECTOR_SCALES)
+    python = target.make_compensator(**_FORCE_SCALES_OF_TEST_VECTOR)
     outputs = [
         python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
         "test_vector.h",
-        settings=target.settings_initializer(**_TEST_VECTOR_SCALES),
+        settings=target.settings_initializer(**_FORCE_SCALES_OF_TEST_VECTOR),
         inputs=[_c_literal(row) for row in inputs],
         outputs=[_c_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
         flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
@@ -168,23 +168,23 @@ def fmu_files(target: ExportedCompensation) -> ExportedFiles:
     kernel["token.h"] = f'#define TOKEN "{token}"\n'
     kernel["fmu.h"] = read_template("fmu.h")
     return {
-        f"{_MODEL_NAME}_fmi{version[0]}.fmu": _fmu_archive(target, kernel, version, token, compiler)
+        f"{_FMU_MODEL_NAME}_fmi{version[0]}.fmu": _zip_fmu(target, kernel, version, token, compiler)
         for version in ("2.0", "3.0")
     }
 
 
-def _fmu_archive(
+def _zip_fmu(
     target: ExportedCompensation, kernel: ExportedFiles, version: str, token: str, cc: str | None
 ) -> bytes:
     sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
     c_files = [name for name in sources if name.endswith(".c")]
-    files["modelDescription.xml"] = _model_description(target, version, token)
+    files["modelDescription.xml"] = _render_fmi_model_description(target, version, token)
     if version == "3.0":
         files["sources/buildDescription.xml"] = read_template("buildDescription.xml")
     if cc is not None:
-        binary = f"binaries/{_PLATFORM_OF_FMI_VERSION[version]}/{_MODEL_NAME}.so"
-        files[binary] = _compile_library(cc, sources, c_files)
+        binary = f"binaries/{_FMU_BINARY_FOLDER_OF_FMI_VERSION[version]}/{_FMU_MODEL_NAME}.so"
+        files[binary] = _compile_shared_library(cc, sources, c_files)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
@@ -192,7 +192,7 @@ def _fmu_archive(
     return content.getvalue()
 
 
-def _compile_library(compiler: str, sources: ExportedFiles, c_files: list[str]) -> bytes:
+def _compile_shared_library(compiler: str, sources: ExportedFiles, c_files: list[str]) -> bytes:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in sources.items():
@@ -202,10 +202,10 @@ def _compile_library(compiler: str, sources: ExportedFiles, c_files: list[str]) 
         return (folder / "library.so").read_bytes()
 
 
-def _model_description(target: ExportedCompensation, version: str, token: str) -> str:
+def _render_fmi_model_description(target: ExportedCompensation, version: str, token: str) -> str:
     number, integer = ("Float64", "Int32") if version == "3.0" else ("Real", "Integer")
     variables = []
-    for name, causality, unit, start in _model_variables(target):
+    for name, causality, unit, start in _fmi_variables(target):
         values = "" if start is None else f' start="{start!r}"'
         values += f' unit="{unit}"' if unit else ""
         variability = "tunable" if causality == "parameter" else "discrete"
@@ -216,7 +216,7 @@ def _model_description(target: ExportedCompensation, version: str, token: str) -
     return render_template(f"modelDescription{version[0]}.xml", **names)
 
 
-def _model_variables(target: ExportedCompensation) -> list[tuple[str, str, str, float | None]]:
+def _fmi_variables(target: ExportedCompensation) -> list[tuple[str, str, str, float | None]]:
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_COMPONENT_NAMES]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
@@ -240,16 +240,16 @@ def _model_variables(target: ExportedCompensation) -> list[tuple[str, str, str, 
 
 def ros2_filter_files(target: ExportedCompensation) -> ExportedFiles:
     shipped = {
-        f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
+        f"{_ROS2_FILTER_PACKAGE_NAME}.xml": f"{_ROS2_FILTER_PACKAGE_NAME}.xml",
         "package.xml": "package.xml",
         "CMakeLists.txt": "CMakeLists.txt",
-        f"src/{_FILTER_NAME}.cpp": f"{_FILTER_NAME}.cpp",
+        f"src/{_ROS2_FILTER_PACKAGE_NAME}.cpp": f"{_ROS2_FILTER_PACKAGE_NAME}.cpp",
     }
     kernel = dict(kernel_files(target))
     sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
-    folder = _FILTER_TEMPLATE_FOLDER
+    folder = _ROS2_FILTER_TEMPLATE_FOLDER
     return {
         **{name: read_template(f"{folder}/{file}") for name, file in shipped.items()},
         **{f"src/{name}": text for name, text in kernel.items()},

@@ -17,7 +17,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_LOAD_WRENCH, PACKET_SIZE
 from drake_teleop.station.stepped_block import SteppedBlock
 
-_OPTIONAL_INPUT_PORTS = ("hand_wrench_E", "load_wrench_B", "saturated", "contact")
+_OPTIONAL_INPUT_PORT_NAMES = ("hand_wrench_E", "load_wrench_B", "saturated", "contact")
 
 
 class NetworkChannel(SteppedBlock):
@@ -74,7 +74,7 @@ class NetworkChannel(SteppedBlock):
         self.DeclareStateOutputPort("received", DiscreteStateIndex(self._states[-1]))
         self._declare_output("arriving", 3, slice(0, size + 1))
 
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         receiver, in_transit, count, received = results
         k, line = int(count[0]), (receiver, in_transit)
         network.send_packet(self._parameters, line, k, self._packet.Eval(context))
@@ -109,14 +109,14 @@ class _PassivityEndBlock(SteppedBlock):
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
         self._ports = [
-            (self.DeclareVectorInputPort(name, size), name in _OPTIONAL_INPUT_PORTS)
-            for name, size in self._INPUT_PORTS
+            (self.DeclareVectorInputPort(name, size), name in _OPTIONAL_INPUT_PORT_NAMES)
+            for name, size in self._INPUT_PORT_NAMES_AND_SIZES
         ]
         self._declare_step(results, 3, period)
         self._declare_output("packet", 4, slice(0, PACKET_SIZE))
-        self._declare_end_specific_output()
+        self._declare_master_or_slave_output()
 
-    def _evaluate_inputs_and_packet(self, context: Context) -> tuple[list[Array], Array, bool]:
+    def _evaluate_inputs_and_last_packet(self, context: Context) -> tuple[list[Array], Array, bool]:
         packet = self._received.Eval(context)
         inputs = []
         for port, is_optional in self._ports:
@@ -150,14 +150,14 @@ class PassivityAtMaster(_PassivityEndBlock):
     """
 
     __slots__ = ()
-    _INPUT_PORTS = (("pose_command", 7), ("hand_wrench_E", 6))
+    _INPUT_PORT_NAMES_AND_SIZES = (("pose_command", 7), ("hand_wrench_E", 6))
 
-    def _declare_end_specific_output(self) -> None:
+    def _declare_master_or_slave_output(self) -> None:
         self._declare_output("wrench_to_master", 3, slice(0, 6))
 
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         ends, _, port_energies, wrench, packet = results
-        inputs, *received = self._evaluate_inputs_and_packet(context)
+        inputs, *received = self._evaluate_inputs_and_last_packet(context)
         states = *self._constants, ends, port_energies[:2], packet, wrench
         steps.step_master_end(self._method, *inputs, *received, *states)
 
@@ -183,17 +183,17 @@ class PassivityAtSlave(_PassivityEndBlock):
     """
 
     __slots__ = ()
-    _INPUT_PORTS = (
+    _INPUT_PORT_NAMES_AND_SIZES = (
         *(("wrench_B", 6), ("load_wrench_B", 6), ("pose_slave", 7)),
         *(("saturated", 1), ("contact", 1)),
     )
 
-    def _declare_end_specific_output(self) -> None:
+    def _declare_master_or_slave_output(self) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         ends, pose, port_energies, _, packet = results
-        (*values, saturated, contact), *received = self._evaluate_inputs_and_packet(context)
+        (*values, saturated, contact), *received = self._evaluate_inputs_and_last_packet(context)
         flags = bool(saturated[0] > 0.5), float(contact[0])
         states = *self._constants, ends, pose, port_energies, packet
         steps.step_slave_end(self._method, *values, *flags, *received, *states)

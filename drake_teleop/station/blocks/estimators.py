@@ -72,7 +72,7 @@ class LoadEstimator(DoubleOnlySystem, load_estimator.LoadEstimator):
         start = np.zeros(16) if initial is None else finite_array("initial", initial, 16)
         super().__init__(config, noise, motion, period, regressor.FIRST_JOINT_INDEX, start)
 
-    def _declare_sample_ports(self, size: int) -> Any:
+    def _declare_sample_input_ports(self, size: int) -> Any:
         return _SampleInputPorts(self)
 
 
@@ -114,10 +114,10 @@ class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
         self._gravity_W = finite_array("gravity_W", gravity_W, 3)
         self._orientation = self.DeclareVectorInputPort("R_WS", 9)
 
-    def _declare_sample_ports(self, arm: Any) -> Any:
+    def _declare_sample_input_ports(self, arm: Any) -> Any:
         return _SampleInputPorts(self)
 
-    def _next_contact_flag(
+    def _update_and_get_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
         gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W

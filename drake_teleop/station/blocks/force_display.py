@@ -51,7 +51,7 @@ class ForceDisplay(SteppedBlock):
         fault = DISPLAYED_WRENCH_SLOTS.stop
         self._declare_output("fault_at_hand", 0, slice(fault, fault + 1))
 
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         (drive,), command = results, self._command.Eval(context)
         device = drive.copy()
         device[:6] = self._position.Eval(context)

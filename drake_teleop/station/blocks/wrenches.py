@@ -127,16 +127,16 @@ def WrenchScaling_(T: Any) -> Any:
             self._inputs, self._orientation = inputs[:-1], inputs[-1]
             tickets = {port.ticket() for port in inputs[:-1]}
             for name, calc, more in (
-                ("contact_wrench_S", self._calc_contact, set()),
-                ("scaled_wrench_S", self._calc_scaled, {self._orientation.ticket()}),
-                ("wrench_to_master", self._calc_to_master, {self._orientation.ticket()}),
+                ("contact_wrench_S", self._calc_contact_wrench, set()),
+                ("scaled_wrench_S", self._calc_scaled_wrench, {self._orientation.ticket()}),
+                ("wrench_to_master", self._calc_wrench_to_master, {self._orientation.ticket()}),
             ):
                 self.DeclareVectorOutputPort(name, 6, weak_callback(calc), tickets | more)
 
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
             WrenchScalingT._construct(self, other._config, other._R_WB, other._gravity_W, converter)
 
-        def _scaled_wrench(self, context: Any, scales: Scales) -> Any:
+        def _scale_wrench(self, context: Any, scales: Scales) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
             given, wrench = self._config.gripper_phi, _zero_vector_of_type(T, 6)
             gripper = estimate[6:] if given is None else np.asarray(given)
@@ -149,26 +149,26 @@ def WrenchScaling_(T: Any) -> Any:
                 if not self._orientation.HasValue(context):
                     where = "WrenchScaling: gravity in S"
                     raise compensation.unknown_gravity_error(where, "connect R_WS")
-                gravity = self._R_WS(context).T @ self._gravity_W
+                gravity = self._evaluate_R_WS(context).T @ self._gravity_W
                 _function_for_scalar(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
 
-        def _R_WS(self, context: Any) -> Any:
+        def _evaluate_R_WS(self, context: Any) -> Any:
             return np.ascontiguousarray(self._orientation.Eval(context)).reshape(3, 3)
 
-        def _calc_contact(self, context: Any, output: Any) -> None:
-            output.SetFromVector(self._scaled_wrench(context, Scales(0.0, 0.0, 1.0, 0.0, 0.0)))
+        def _calc_contact_wrench(self, context: Any, output: Any) -> None:
+            output.SetFromVector(self._scale_wrench(context, Scales(0.0, 0.0, 1.0, 0.0, 0.0)))
 
-        def _calc_scaled(self, context: Any, output: Any) -> None:
-            output.SetFromVector(self._scaled_wrench(context, self._scales))
+        def _calc_scaled_wrench(self, context: Any, output: Any) -> None:
+            output.SetFromVector(self._scale_wrench(context, self._scales))
 
-        def _calc_to_master(self, context: Any, output: Any) -> None:
+        def _calc_wrench_to_master(self, context: Any, output: Any) -> None:
             if not self._orientation.HasValue(context):
                 what = "the input port R_WS, the orientation of the sensor, is not connected"
                 remedy = "connect a rotation matrix, by rows"
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
-            scaled, R_WS = self._scaled_wrench(context, self._scales), self._R_WS(context)
+            scaled, R_WS = self._scale_wrench(context, self._scales), self._evaluate_R_WS(context)
             to_master_into = _function_for_scalar(force_scaling.wrench_to_master_into, T)
             to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)

@@ -25,7 +25,7 @@ from drake_teleop.station.stepped_block import SteppedBlock
 _NETWORK_CHOICES = ("custom", *PRESETS)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
-_TIMEOUT_PER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
+_TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
 
 
 @settings
@@ -61,21 +61,21 @@ class Channel(NetworkConfig):
             return self.timeout
         lines = enumerate(self.networks_of_directions())
         longest = max(network.longest_silence(line, k, period) for k, line in lines)
-        return min(max(_TIMEOUT_PER_LONGEST_SILENCE * longest, MIN_TIMEOUT_S), MAX_TIMEOUT_S)
+        return min(max(_TIMEOUT_OVER_LONGEST_SILENCE * longest, MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.
-_MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
-_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_MONITOR_SIZES)
-_layout = slots.SlotAllocator(_ENDS_STATE_SIZE)
+_SILENCE_MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
+_MASTER_AND_SLAVE_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_SILENCE_MONITOR_SIZES)
+_layout = slots.SlotAllocator(_MASTER_AND_SLAVE_STATE_SIZE)
 _STEP_COUNT = _layout.number()
 # Last finite commanded pose (7); 1 if the newest one is not finite.
-_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG = _layout.vector(8)
-_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG = _layout.vector(8)  # the same of the slave's pose
-_RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
-_LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
-_TIME_SINCE_INVALID_SLAVE_WRENCH = _layout.number()  # time since the last invalid wrench [s]
-_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _MONITOR_SIZES)
+_MASTER_POSE_AND_INVALID_FLAG_SLOTS = _layout.vector(8)
+_SLAVE_POSE_AND_INVALID_FLAG_SLOTS = _layout.vector(8)  # the same of the slave's pose
+_RENDERED_HAND_WRENCH_SLOTS = _layout.vector(6)  # wrench rendered since the last step
+_LAST_VALID_SLAVE_WRENCH_SLOTS = _layout.vector(6)  # slave's wrench at the last step
+_TIME_SINCE_INVALID_WRENCH_SLOT = _layout.number()  # time since the last invalid wrench [s]
+_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _SILENCE_MONITOR_SIZES)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = map(_layout.vector, [slots.MEMORY_SIZE] * 2)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
 _R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
@@ -102,10 +102,10 @@ def method_parameters_and_frame(
 
 def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array:
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
-    ends = np.zeros(_ENDS_STATE_SIZE)
-    ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG][:7] = start
-    ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG][:7] = start
-    ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
+    ends = np.zeros(_MASTER_AND_SLAVE_STATE_SIZE)
+    ends[_MASTER_POSE_AND_INVALID_FLAG_SLOTS][:7] = start
+    ends[_SLAVE_POSE_AND_INVALID_FLAG_SLOTS][:7] = start
+    ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = safe_state.STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -162,7 +162,7 @@ def step_master_end(
     `received` is the slave's newest packet, `fresh` is True if it is new, `packet` is written. The
     hand's energy input by translation and rotation is added to `work` (2,) [J].
     """
-    before, held = ends[_LAST_FINITE_MASTER_POSE_AND_INVALID_FLAG], ends[_RENDERED_HAND_WRENCH]
+    before, held = ends[_MASTER_POSE_AND_INVALID_FLAG_SLOTS], ends[_RENDERED_HAND_WRENCH_SLOTS]
     monitor, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
     valid = _update_pose_and_twist(pose_command, before, T, dx, twist)
@@ -170,7 +170,7 @@ def step_master_end(
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
     if are_valid_port_values(hand_B):
-        _convert_wrench_to_world(hand_B, frame, hand)
+        _transform_master_wrench_to_world_into(hand_B, frame, hand)
     else:
         valid = False
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
@@ -184,7 +184,7 @@ def step_master_end(
     )  # fmt: skip
     if not valid:
         packet[fields.SENDER_INPUTS_FINITE] = 0.0
-    _convert_wrench_to_master(held, frame, wrench_received[_RECEIVED_WRENCH])
+    _transform_world_wrench_to_master_into(held, frame, wrench_received[_RECEIVED_WRENCH])
     wrench_received[_RECEIVED_CONTACT_FLAG] = received[fields.CONTACT_FLAG]
 
 
@@ -194,7 +194,7 @@ def step_slave_end(
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
-    before, held = ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG], ends[_LAST_VALID_SLAVE_WRENCH]
+    before, held = ends[_SLAVE_POSE_AND_INVALID_FLAG_SLOTS], ends[_LAST_VALID_SLAVE_WRENCH_SLOTS]
     monitor, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
@@ -205,19 +205,19 @@ def step_slave_end(
     load = memory[slots.LOAD_WRENCH]
     if not (are_valid_port_values(wrench_B) and are_valid_port_values(load_B)):
         valid = False
-        ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] = 0.0
+        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = 0.0
     elif saturated:
-        ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] = 0.0
+        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
-        _convert_wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_INVALID_SLAVE_WRENCH], T)
+        _transform_master_wrench_to_world_into(wrench_B, frame, wrench)
+        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_INVALID_WRENCH_SLOT], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
-        _convert_wrench_to_world(load_B, frame, wrench)
+        _transform_master_wrench_to_world_into(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_TIME_SINCE_INVALID_SLAVE_WRENCH] += T
+        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
@@ -254,7 +254,7 @@ def _update_pose_and_twist(pose, before, T, dx, twist):
 
 
 @njit(cache=True)
-def _convert_wrench_to_world(wrench_B, frame, out):
+def _transform_master_wrench_to_world_into(wrench_B, frame, out):
     R_WB, scales = matrix_at(frame, _R_WB_ROWS.start), frame[_MOTION_SCALES]
     for g in range(2):
         rotated = apply_matrix(R_WB, vector_at(wrench_B, 3 * g))
@@ -263,7 +263,7 @@ def _convert_wrench_to_world(wrench_B, frame, out):
 
 
 @njit(cache=True)
-def _convert_wrench_to_master(wrench, frame, out):
+def _transform_world_wrench_to_master_into(wrench, frame, out):
     R_BW, scales = transposed(matrix_at(frame, _R_WB_ROWS.start)), frame[_MOTION_SCALES]
     for g in range(2):
         rotated = apply_matrix(R_BW, vector_at(wrench, 3 * g))
@@ -337,12 +337,12 @@ class TeleopChannel(SteppedBlock):
         the command for `fill_time_s`, in which packets fill the channel.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_FINITE_SLAVE_POSE_AND_INVALID_FLAG][:7] = slave
+        ends[_SLAVE_POSE_AND_INVALID_FLAG_SLOTS][:7] = slave
         ends[SLAVE_METHOD_MEMORY][slots.CHANNEL_FILL_TIME_LEFT] = fill_time_s
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)
 
-    def _advance(self, context: Context, results: list[Array]) -> None:
+    def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
         forward, backward = zip(results[:2], in_transit, strict=True)

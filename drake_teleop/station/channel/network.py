@@ -28,7 +28,7 @@ MAX_POSE_EXTRAPOLATION_S = 0.1  # [s]; after it the pose is constant
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
 _MAX_DELAY_DEVIATIONS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
-_SILENCE_POLICIES = ("hold", "zero", "extrapolate")
+_SILENCE_POLICY_NAMES = ("hold", "zero", "extrapolate")
 _SILENCE_POLICY_ZERO, _SILENCE_POLICY_EXTRAPOLATE = 1, 2
 _TRACE_STEP_S = 1e-3  # [s], for mean and maximum of a trace
 _SILENCE_SIMULATION_S, _SILENCE_SIMULATION_SEED = 60.0, 20090101  # for `longest_silence`
@@ -58,7 +58,7 @@ class NetworkConfig:
     )
     silence: str = choice(
         "hold",
-        _SILENCE_POLICIES,
+        _SILENCE_POLICY_NAMES,
         "values at steps without a new packet; hold: the newest packet; zero: the same with zero "
         "velocity and wrench; extrapolate: the same with a pose that keeps its velocity for 0.1 s. "
         "Energies and integrals are always held",
@@ -141,7 +141,7 @@ def network_parameters(
     p[_PACKETS_PER_STEP] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
     p[_PLAYOUT_STEPS], p[_IS_REDUNDANT] = playout, config.redundant
     p[_NUM_TRANSIT_SLOTS] = max(longest, playout) + 1
-    p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICIES.index(config.silence), min_steps
+    p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICY_NAMES.index(config.silence), min_steps
     p[_DELAY_TRACE_START:] = trace
     return p
 
@@ -192,7 +192,7 @@ def _read_delay_trace(path: Path, period: float) -> Array:
 
 
 @njit(cache=True)
-def _random_uniform(p, k, draw):
+def _draw_uniform(p, k, draw):
     return (float(random_bits(np.uint64(p[_RANDOM_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
 
 
@@ -205,14 +205,14 @@ def _draw_delay_steps(p, k, draw):
     mean, spread = p[_MEAN_DELAY_STEPS], p[_MEAN_DELAY_STEPS] * p[_DELAY_JITTER]
     if spread == 0.0:
         return int(p[_MAX_DELAY_STEPS])
-    u = _random_uniform(p, k, draw)
+    u = _draw_uniform(p, k, draw)
     if p[_DELAY_DISTRIBUTION] == 0:
         delay = mean + spread * (2.0 * u - 1.0)
     elif p[_DELAY_DISTRIBUTION] == 1:  # Box and Muller
-        angle = 2.0 * math.pi * _random_uniform(p, k, draw + 1)
+        angle = 2.0 * math.pi * _draw_uniform(p, k, draw + 1)
         delay = mean + spread / math.sqrt(3.0) * math.sqrt(-2.0 * math.log(u)) * math.cos(angle)
     else:  # sum of three exponential waits
-        u *= _random_uniform(p, k, draw + 1) * _random_uniform(p, k, draw + 2)
+        u *= _draw_uniform(p, k, draw + 1) * _draw_uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
     return int(min(max(delay + 0.5, p[_MIN_DELAY_STEPS]), p[_MAX_DELAY_STEPS]))
 
@@ -222,15 +222,15 @@ def _draw_loss_and_delays(p, k, bad):
     """Return loss state (1: bad) at step k, delays of packet and duplicate [steps] (-1: none)."""
     if p[_BAD_STATE_SHARE] > 0.0:
         likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
-        bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
+        bad = 1.0 if _draw_uniform(p, k, 0) <= likely else 0.0
     rate = p[_PACKETS_PER_STEP]
     if rate < 1.0 and math.floor(k * rate + 1e-9) == math.floor((k - 1) * rate + 1e-9):
         return bad, -1, -1
-    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BAD_STATE_LOSS_SHARE]:
+    if bad == 1.0 and _draw_uniform(p, k, 1) <= p[_BAD_STATE_LOSS_SHARE]:
         return bad, -1, -1
     first = _draw_delay_steps(p, k, 2)
     second = -1
-    if first >= 0 and p[_DUPLICATE_SHARE] > 0.0 and _random_uniform(p, k, 5) <= p[_DUPLICATE_SHARE]:
+    if first >= 0 and p[_DUPLICATE_SHARE] > 0.0 and _draw_uniform(p, k, 5) <= p[_DUPLICATE_SHARE]:
         second = _draw_delay_steps(p, k, 6)
     return bad, first, second
 

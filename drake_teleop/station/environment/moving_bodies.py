@@ -138,7 +138,7 @@ def _hermite_value_and_rate(h, u, a, a_dot, b, b_dot):
 
 
 @njit(cache=True)
-def _quaternion_rate(omega, q):
+def _quaternion_derivative(omega, q):
     return quaternion_product((0.0, 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]), q)
 
 
@@ -158,8 +158,8 @@ def interpolate_joint_state(joints, h, u, start, end, out):
             for i, j in ((q + 4, v + 3), (q + 5, v + 4), (q + 6, v + 5)):
                 out[i], out[j] = _hermite_value_and_rate(h, u, start[i], start[j], end[i], end[j])
             a, b = quaternion_at(start, q), quaternion_at(end, q)
-            a_dot = _quaternion_rate(vector_at(start, v), a)
-            b_dot = _quaternion_rate(vector_at(end, v), b)
+            a_dot = _quaternion_derivative(vector_at(start, v), a)
+            b_dot = _quaternion_derivative(vector_at(end, v), b)
             w, w_dot = _hermite_value_and_rate(h, u, a[0], a_dot[0], b[0], b_dot[0])
             x, x_dot = _hermite_value_and_rate(h, u, a[1], a_dot[1], b[1], b_dot[1])
             y, y_dot = _hermite_value_and_rate(h, u, a[2], a_dot[2], b[2], b_dot[2])

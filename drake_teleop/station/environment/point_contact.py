@@ -95,7 +95,7 @@ def FindContactPairs(
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
                     sphere, edges = _require_sphere_and_box(inspector, own, other)
-                    law = _combined_contact_law(inspector, own, other)
+                    law = _combined_contact_law_parameters(inspector, own, other)
                     last = [direction, law, [slip_speed, row]]
                     place, half = [X_SShape.translation(), [sphere.radius()]], edges.size() / 2
                     compiled_pairs.append(_shape_pair_row(place, X_Other, half, last))
@@ -151,7 +151,7 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
     return direction
 
 
-def _combined_contact_law(
+def _combined_contact_law_parameters(
     inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
 ) -> list[float]:
     names = "point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"
@@ -247,7 +247,7 @@ def lower_bound_of_box_distance(
 
 
 @njit(cache=True)
-def _friction_coefficient(static: float, dynamic: float, slip_ratio: float) -> float:
+def _stribeck_friction_coefficient(static: float, dynamic: float, slip_ratio: float) -> float:
     if slip_ratio < 1.0:
         return static * slip_ratio**3 * (10.0 + slip_ratio * (6.0 * slip_ratio - 15.0))
     if slip_ratio < 3.0:
@@ -273,6 +273,6 @@ def point_contact_force_into(
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
     speed = np.sqrt(speed + _SLIP_SPEED_REGULARIZATION_M_S * _SLIP_SPEED_REGULARIZATION_M_S)
-    mu = _friction_coefficient(pair[24], pair[25], speed / pair[26])
+    mu = _stribeck_friction_coefficient(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

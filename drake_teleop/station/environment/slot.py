@@ -28,8 +28,8 @@ PEG_RADIUS_M, TIP_BALL_CENTRE_Z_S_M, UPPER_BALL_CENTRE_Z_S_M = 0.012, 0.188, 0.1
 #: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
 SLOT_LENGTH_M, _SIDE_BLOCK_WIDTH_M = 0.10, 0.04
 _SLOT_FLOOR_THICKNESS_M = 0.02
-_SLOT_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
-_PEG_BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
+_SLOT_COLOUR_RGBA = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
+_PEG_BALL_COLOUR_RGBA = np.array([0.86, 0.20, 0.12, 1.0])
 
 
 @settings
@@ -84,22 +84,22 @@ class Slot(Environment):
             return
         tool = plant.GetBodyByName("tool")
         above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])
-        ball, properties = Sphere(PEG_RADIUS_M), _contact_material(self)
+        ball, properties = Sphere(PEG_RADIUS_M), _slot_contact_material(self)
         plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
-        plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _PEG_BALL_COLOUR)
+        plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _PEG_BALL_COLOUR_RGBA)
         for name, (X_MBox, box) in _boxes_of_slot(self).items():
             plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
-            plant.RegisterVisualGeometry(body, X_MBox, box, name, _SLOT_COLOUR)
+            plant.RegisterVisualGeometry(body, X_MBox, box, name, _SLOT_COLOUR_RGBA)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
         source = plant.get_source_id()
         for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
-            scene_graph.AssignRole(source, ball, _contact_material(self), RoleAssign.kReplace)
+            scene_graph.AssignRole(source, ball, _slot_contact_material(self), RoleAssign.kReplace)
 
 
-def _contact_material(slot: Slot) -> ProximityProperties:
+def _slot_contact_material(slot: Slot) -> ProximityProperties:
     return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction)
 
 

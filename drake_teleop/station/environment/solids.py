@@ -22,11 +22,11 @@ from drake_teleop.station.environment.environment import (
     NewInstance,
 )
 
-_BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
+_BOX_COLOUR_RGBA = np.array([0.78, 0.66, 0.50, 1.0])
 _WALL_THICKNESS_M = 0.1  # deep enough that a tool leaves through the face
 _FOOT_RADIUS_M, _TABLE_THICKNESS_M = 0.002, 0.05
 _BLOCK_BODY_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
-_BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
+_BLOCK_COLOUR_RGBA = np.array([0.30, 0.42, 0.58, 1.0])
 
 
 @settings
@@ -79,7 +79,7 @@ def AddFixedBox(
     if plant.geometry_source_is_registered():
         shape, here = BoxShape(*size), RigidTransform()
         plant.RegisterCollisionGeometry(body, here, shape, name, surface.material())
-        plant.RegisterVisualGeometry(body, here, shape, name, _BOX_COLOUR)
+        plant.RegisterVisualGeometry(body, here, shape, name, _BOX_COLOUR_RGBA)
 
 
 @settings
@@ -146,7 +146,7 @@ class Block(Surface):
             return
         here, box = RigidTransform(), BoxShape(*self.size)
         plant.RegisterCollisionGeometry(body, here, box, _BLOCK_BODY_NAME, self.material())
-        plant.RegisterVisualGeometry(body, here, box, _BLOCK_BODY_NAME, _BLOCK_COLOUR)
+        plant.RegisterVisualGeometry(body, here, box, _BLOCK_BODY_NAME, _BLOCK_COLOUR_RGBA)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
             place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS_M))
             ball, name = Sphere(_FOOT_RADIUS_M), f"{_FOOT_NAME_PREFIX}{k}"

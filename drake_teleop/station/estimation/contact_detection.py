@@ -33,7 +33,7 @@ class ContactDetectionConfig:
 
 
 @njit(cache=True)
-def _update_flag_with_arm(memory, sample, estimate, arm, settings):
+def _detect_contact_using_arm(memory, sample, estimate, arm, settings):
     s, acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE], np.empty(3)
     q = sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX]
     acceleration_from_specific_force_into(arm, q, s, acceleration)
@@ -77,7 +77,7 @@ class ContactDetection(LeafSystem):
         self._settings = ContactDetector(
             floor, threshold, statistic=config.statistic, hold=hold, following=following
         ).settings
-        self._sample = self._declare_sample_ports(arm)
+        self._sample = self._declare_sample_input_ports(arm)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
@@ -86,15 +86,15 @@ class ContactDetection(LeafSystem):
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_contact_flag_state)
 
-    def _declare_sample_ports(self, arm: ArmModel | None) -> Any:
+    def _declare_sample_input_ports(self, arm: ArmModel | None) -> Any:
         assert arm is not None
         self._arm = arm.table
         return self.DeclareVectorInputPort("sample", regressor.sample_size(arm.num_joints) + 1)
 
-    def _next_contact_flag(
+    def _update_and_get_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
-        return bool(_update_flag_with_arm(memory, sample, estimate, self._arm, self._settings))
+        return bool(_detect_contact_using_arm(memory, sample, estimate, self._arm, self._settings))
 
     def _update_contact_flag_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
@@ -108,4 +108,4 @@ class ContactDetection(LeafSystem):
         memory = discrete_state.get_mutable_value(self._memory)
         estimate = self._estimate.Eval(context)
         flag = discrete_state.get_mutable_value(self._flag)
-        flag[0] = self._next_contact_flag(context, memory, sample, estimate)
+        flag[0] = self._update_and_get_contact_flag(context, memory, sample, estimate)

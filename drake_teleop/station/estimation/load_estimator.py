@@ -87,7 +87,7 @@ class LoadEstimator(LeafSystem):
         start = np.asarray(initial, dtype=float)
         memory = self._estimator.initial_memory(start)
         self._shape, self._watches, self._period = memory.shape, config.watch, period
-        self._sample = self._declare_sample_ports(sample_size)
+        self._sample = self._declare_sample_input_ports(sample_size)
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
@@ -103,17 +103,17 @@ class LoadEstimator(LeafSystem):
             safe = np.zeros(10) if fallback is None else np.array(fallback, dtype=float)
             self._watch_arguments = safe, period, *change
         if config.enabled or config.watch:
-            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_or_monitor_load)
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._estimate_or_monitor_load)
 
-    def _declare_sample_ports(self, size: int) -> Any:
+    def _declare_sample_input_ports(self, size: int) -> Any:
         return self.DeclareVectorInputPort("sample", size)
 
-    def _update_or_monitor_load(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _estimate_or_monitor_load(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
         if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._index_of_load_state(discrete_state) != STATE_LEARNING:
+        if self._read_load_state_code(discrete_state) != STATE_LEARNING:
             memory = discrete_state.get_mutable_value(2)
             watched.monitor_load(estimate, memory, sample, *self._watch_arguments)
             return
@@ -126,12 +126,12 @@ class LoadEstimator(LeafSystem):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, watched.initial_monitor_memory(estimate, covariance))
 
-    def _index_of_load_state(self, discrete_state: DiscreteValues) -> int:
+    def _read_load_state_code(self, discrete_state: DiscreteValues) -> int:
         return int(discrete_state.value(2)[STATE_INDEX]) if self._watches else STATE_LEARNING
 
     def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
-        output[0] = self._index_of_load_state(state)
+        output[0] = self._read_load_state_code(state)
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.is_state_settled(estimate, memory.reshape(self._shape))

@@ -64,9 +64,9 @@ class DeviceFigures:
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_SIZE_M = [0.11, 0.113, 0.113]  # workspace
+_OMEGA_WORKSPACE_M = [0.11, 0.113, 0.113]  # workspace
 _OMEGA_MAX_TURN_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
-_OMEGA_DEVICE_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; rate [Hz]
+_OMEGA_ENCODER_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; rate [Hz]
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -77,16 +77,16 @@ _OMEGA_DEVICE_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [r
 _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _WRIST_TURN_RAD, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_TURN_RAD, *_OMEGA_DEVICE_STEPS_AND_RATE),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_DEVICE_STEPS_AND_RATE),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_DEVICE_STEPS_AND_RATE),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_WORKSPACE_M, _NO_TURN_RAD, *_OMEGA_ENCODER_AND_RATE),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_ENCODER_AND_RATE),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_ENCODER_AND_RATE),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN_RAD, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_ROW_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
+_SHEET_ROW_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
 _sheets = {
-    name: DeviceFigures(**dict(zip(_ROW_FIELDS.split(), copy.deepcopy(row), strict=True)))
+    name: DeviceFigures(**dict(zip(_SHEET_ROW_FIELDS.split(), copy.deepcopy(row), strict=True)))
     for name, row in _DATA_SHEETS.items()
 }
 #: Data sheets by name, for `Master.figures`.

@@ -17,9 +17,9 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step_d
 from drake_teleop.station.master.force_display import ForceDisplay, initial_display_state
 from drake_teleop.station.master.leader import LeaderDevice, step_leader
 
-_MAX_DEVICE_PERIOD_S = 1e-3  # slower than any haptic device
+_MAX_SIMULATION_PERIOD_S = 1e-3  # slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
-_MAX_STABLE_RATE_TIMES_PERIOD = 2.0
+_MAX_DAMPING_RATE_TIMES_PERIOD = 2.0
 
 
 @njit(cache=True, omits_reference_counting=True)
@@ -37,17 +37,17 @@ def _advance_device(
 
 def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
     """Raise a DrakeTeleopError if q is outside limits, or the step `period` [s] is too long."""
-    if not 0 < period <= _MAX_DEVICE_PERIOD_S:
+    if not 0 < period <= _MAX_SIMULATION_PERIOD_S:
         raise DrakeTeleopError(
             f"gives a period of {period:g} s (a simulated haptic device needs a positive one of at"
-            f" most {_MAX_DEVICE_PERIOD_S:g} s)",
+            f" most {_MAX_SIMULATION_PERIOD_S:g} s)",
             where="rates.hand_hz",
             remedy="choose 1000 Hz or more; the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, include_coulomb_slope=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
-    if rate * period > _MAX_STABLE_RATE_TIMES_PERIOD:
+    if rate * period > _MAX_DAMPING_RATE_TIMES_PERIOD:
         raise DrakeTeleopError(
             f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
             f"simulation with a period of {1e3 * period:g} ms is unstable",
@@ -106,9 +106,9 @@ class MasterDevice(LeafSystem):
             ("for_display", display),
         ):
             self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_device_states)
 
-    def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _advance_device_states(self, context: Context, discrete_state: DiscreteValues) -> None:
         states = map(discrete_state.get_mutable_value, range(4))
         inputs = self._hand_wrench.Eval(context), self._drive.Eval(context)
         self._advance(*self._constants, *states, *inputs, self._period)

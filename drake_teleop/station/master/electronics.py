@@ -45,9 +45,9 @@ class Encoders(LeafSystem):
         self._constants = q_start, steps, device.packed_parameters
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
-        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_rounded_pose), inputs)
+        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_encoder_pose), inputs)
 
-    def _calc_rounded_pose(self, context: Context, output: BasicVector) -> None:
+    def _calc_encoder_pose(self, context: Context, output: BasicVector) -> None:
         q = self._state.Eval(context)[:6]
         encoder_pose_into(q, *self._constants, output.get_mutable_value())
 
@@ -70,7 +70,7 @@ class SampleHold(LeafSystem):
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._take_sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample_and_hold_input)
 
-    def _take_sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _sample_and_hold_input(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._value.Eval(context))

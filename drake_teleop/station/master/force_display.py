@@ -27,7 +27,7 @@ _JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout
 DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
 _IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
 _SAFE_STATE_MONITOR_SLOTS = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
-_DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
+_DISPLAYED_WRENCH_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
 )
@@ -163,9 +163,9 @@ class ForceDisplay(LeafSystem):
         )
         # The log samples with the device, so the drive is calculated once.
         for name, size, calc in (
-            ("force_to_master", 6, self._calc_force),
-            ("fault_at_hand", 1, self._calc_fault),
-            ("displayed_and_fault", 7, self._calc_force_and_fault),
+            ("force_to_master", 6, self._calc_displayed_wrench),
+            ("fault_at_hand", 1, self._calc_fault_code),
+            ("displayed_and_fault", 7, self._calc_displayed_wrench_and_fault),
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
@@ -179,11 +179,11 @@ class ForceDisplay(LeafSystem):
         constants = self._parameters, self._period, self._jacobian
         step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())
 
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
+    def _calc_displayed_wrench(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLOTS])
 
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+    def _calc_fault_code(self, context: Context, output: BasicVector) -> None:
         output[0] = self._drive.Eval(context)[_FAULT_SLOT]
 
-    def _calc_force_and_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_AND_FAULT_SLOTS])
+    def _calc_displayed_wrench_and_fault(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_WRENCH_AND_FAULT_SLOTS])

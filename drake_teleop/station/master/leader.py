@@ -150,13 +150,13 @@ def limit_wrench_to_motor_torques(leader, q, wrench, shortened):
 
 
 @njit(cache=True)
-def _flag_rows_with_motor_at_limit(leader, q, F, share):
+def _flag_samples_with_motor_at_limit(leader, q, F, torque_share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
     for row in range(rows):
         limited_leader_motor_torques_into(leader, q[row], F[row], torque)
         for i in range(n):
-            flags[row] |= abs(torque[i]) >= share * leader[2][_TORQUE_LIMIT_ROW, i]
+            flags[row] |= abs(torque[i]) >= torque_share * leader[2][_TORQUE_LIMIT_ROW, i]
     return flags
 
 
@@ -239,7 +239,7 @@ class LeaderDevice:
         The motors compensate the weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         constants = self.compiled_constants
-        return np.asarray(_flag_rows_with_motor_at_limit(constants, q.copy(), F.copy(), share))
+        return np.asarray(_flag_samples_with_motor_at_limit(constants, q.copy(), F.copy(), share))
 
     def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)

@@ -79,7 +79,7 @@ class Leader:
             plant.Finalize()
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
-        home = self._home_positions(arm)
+        home = self._home_joint_positions(arm)
         arm_without_hand = _with_end_frame_E_placed_at_home(arm, home, np.array(position))
         phi = arm_without_hand.phi_load
         phi[0] += hand_mass
@@ -99,7 +99,7 @@ class Leader:
         )
         return LeaderDevice(held, arm_without_hand, joint_table, home, parameters)
 
-    def _home_positions(self, arm: ArmModel) -> Array:
+    def _home_joint_positions(self, arm: ArmModel) -> Array:
         if self.home:
             return values_per_joint(arm, self.home, "master.leader.home")
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)

@@ -69,9 +69,9 @@ _M11_COS2Q2 = 0.5 * _cosine_terms
 _cosine_terms = INERTIA_A[1] - INERTIA_A[2] + INERTIA_DF[1] - INERTIA_DF[2]
 _M11_COS2Q3 = 0.5 * (_cosine_terms - _LINK_2_INERTIA - _LINK_3_INERTIA)
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
-_M22 = INERTIA_BE[0] + INERTIA_C[0] + _LINK_1_INERTIA
-_M33 = INERTIA_A[0] + INERTIA_DF[0] + _LINK_2_INERTIA + _LINK_3_INERTIA
-_REFLECTED_MOTOR_INERTIAS = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
+_M22_KG_M2 = INERTIA_BE[0] + INERTIA_C[0] + _LINK_1_INERTIA
+_M33_KG_M2 = INERTIA_A[0] + INERTIA_DF[0] + _LINK_2_INERTIA + _LINK_3_INERTIA
+_REFLECTED_MOTOR_INERTIAS_KG_M2 = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
 _GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
 _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
@@ -82,7 +82,7 @@ def _main_axes_mass_matrix_into(q, M):
     M[0, 0] = _M11_CONSTANT_TERM_KG_M2 + _M11_COS2Q2 * math.cos(2.0 * q[1])
     M[0, 0] += _M11_COS2Q3 * math.cos(2.0 * q[2])
     M[0, 0] += 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
-    M[1, 1], M[2, 2] = _M22, _M33
+    M[1, 1], M[2, 2] = _M22_KG_M2, _M33_KG_M2
     M[1, 2] = M[2, 1] = -_M23_MAX * math.sin(q[1] - q[2])
 
 
@@ -113,7 +113,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J (6, 6) is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
     for i in range(3):
-        M[i, i] += _REFLECTED_MOTOR_INERTIAS[i]
+        M[i, i] += _REFLECTED_MOTOR_INERTIAS_KG_M2[i]
     tip_mass = WRIST_MASS_KG + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.

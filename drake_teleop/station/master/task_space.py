@@ -47,11 +47,11 @@ def mass_matrix_into(J, device, M):
 
 
 @njit(cache=True)
-def _friction_force_per_speed(motion, coulomb, viscous, speed_of_tanh):
-    speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
-    if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
-        return viscous + coulomb / speed_of_tanh
-    return viscous + coulomb * math.tanh(speed / speed_of_tanh) / speed
+def _friction_force_over_speed(velocity, coulomb, viscous, tanh_speed):
+    speed = math.hypot(math.hypot(velocity[0], velocity[1]), velocity[2])
+    if speed < 1e-9 * tanh_speed:  # tanh(x) = x, without 0 / 0
+        return viscous + coulomb / tanh_speed
+    return viscous + coulomb * math.tanh(speed / tanh_speed) / speed
 
 
 @njit(cache=True)
@@ -59,7 +59,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
     mass = device.mass + device.hand_mass
-    drag = _friction_force_per_speed(
+    drag = _friction_force_over_speed(
         v[:3], device.dry_friction[0], device.damping[0], FRICTION_TANH_SPEED_M_S
     )
     for i in range(3):
@@ -74,7 +74,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
-    drag = _friction_force_per_speed(
+    drag = _friction_force_over_speed(
         omega, device.dry_friction[3], device.damping[3], FRICTION_TANH_SPEED_RAD_S
     )
     # Joint torques of motors and stops, then of moments about B's axes.
@@ -122,7 +122,7 @@ def inverse_kinematics(pose: Array, device: DeviceParameters) -> Array:
     return q
 
 
-def _is_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDArray[np.bool_]:
+def _are_axes_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDArray[np.bool_]:
     centre = np.append(device.workspace_centre, np.zeros(3))
     half = np.append(device.half_workspace, device.max_rotation)
     return np.abs(q - centre) > half + margin
@@ -130,11 +130,11 @@ def _is_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDAr
 
 def is_any_axis_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
     has_end_stop = np.append([True] * 3, device.max_rotation > 0.0)
-    return (_is_past_end_stop(q, device, 0.0) & has_end_stop).any(axis=1)
+    return (_are_axes_past_end_stop(q, device, 0.0) & has_end_stop).any(axis=1)
 
 
 def check_limits(q: Array, device: DeviceParameters) -> None:
-    if _is_past_end_stop(q, device, 1e-9).any():
+    if _are_axes_past_end_stop(q, device, 1e-9).any():
         centre, half = device.workspace_centre, device.half_workspace
         low, high = centre - half, centre + half
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))

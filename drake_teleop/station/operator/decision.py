@@ -34,7 +34,7 @@ from drake_teleop.station.operator.perception import (
 DECISION_PERIOD_S = 0.005
 """Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
 
-_OPERATOR_RANDOM_STREAM = 2  # random stream; the network's lines use others
+_OPERATOR_RANDOM_STREAM_NUMBER = 2  # random stream; the network's lines use others
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def pack_operator_parameters(
     there_and_back = training.forward_delay_s + training.backward_delay_s + _STATION_RESPONSE_TIME_S
     delays = perception.vision_delay + there_and_back, perception.reaction_time + there_and_back
     # 53 bits of a key are exact in a float.
-    key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM)
+    key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM_NUMBER)
     own = training.R_WB, training.translation_scale, training.force_gain, *delays, key
     errors = ("vision_noise", "depth_error", "aim_error", "weber_fraction")
     vision = [getattr(perception, name) for name in errors]
@@ -118,16 +118,16 @@ _STEP_COUNT, _NEXT_MOVE_TIME, _CRITERION_MET_SINCE, _ASSUMED_CONTACT_STIFFNESS =
 _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
 MEMORY_SIZE = PLAN_SLICE.stop
 
-_EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
+_STEPS_PER_EYE_FIXATION = 50  # steps of a fixation, 0.25 s
 _STATION_RESPONSE_TIME_S = 0.05  # end of a move to its effect, without network, estimate
-_APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
+_APPROACH_UPDATE_PERIOD_S = 0.3  # s, update interval of the careful approach, estimate
 # Largest perceived depth without contact; beyond, the operator gives up; estimate.
-_GIVE_UP_DEPTH_M = 0.03
-_MIN_CONTACT_TRUST = 0.1  # trust with vision only, estimate
+_MAX_APPROACH_DEPTH_M = 0.03
+_MIN_TRUST_IN_FELT_CONTACT = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_ASSUMED_STIFFNESS, _MIN_ASSUMED_STIFFNESS, _MAX_ASSUMED_STIFFNESS = 2000.0, 200.0, 50000.0
 _MAX_PRESS_CORRECTION_M = 0.003  # m, longest correction of the force, at the tool, estimate
-_STUCK_SHARE_OF_PUSH_FORCE = 0.5  # share of the push force above which the peg is stuck, estimate
+_MIN_STUCK_FORCE_OVER_PUSH_FORCE = 0.5  # above it the peg is stuck, estimate
 # Compliance to lateral force [N/m], largest yield [m], estimates.
 _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
 # Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
@@ -144,7 +144,7 @@ def initial_memory() -> Array:
 
 
 @njit(cache=True)
-def _to_hand_motion(person, tool_motion_W):
+def _tool_to_hand_motion(person, tool_motion_W):
     motion = np.zeros(3)
     for i in range(3):
         for k in range(3):
@@ -164,13 +164,13 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     It is the true `displacement_W` plus an error that is constant for 50 steps (an eye fixation).
     """
     for i in range(3):
-        draw = _draw_normal_number(person, step // _EYE_FIXATION_STEPS, 4 + i)
+        draw = _draw_normal_number(person, step // _STEPS_PER_EYE_FIXATION, 4 + i)
         seen_W[i] = displacement_W[i] + person.vision_noise * draw
 
 
 @njit(cache=True)
 def _plan_submovement(person, memory, step, time, error_W):
-    change = _to_hand_motion(person, error_W)
+    change = _tool_to_hand_motion(person, error_W)
     length = math.sqrt(dot(change, change))
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person.acceleration)
@@ -227,7 +227,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     unnoticed = math.inf
     if person.force_gain > 0.0:
         unnoticed = felt[DETECTION_THRESHOLD_INDEX] / (person.force_gain * person.gentle_force)
-    state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_CONTACT_TRUST)
+    state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_TRUST_IN_FELT_CONTACT)
     if state[PHASE_INDEX] == PHASE_WAITING and time >= task.start_time:
         _enter_phase(state, memory, PHASE_MOVING, time)
     if state[PHASE_INDEX] in (PHASE_WAITING, PHASE_OVER):
@@ -235,7 +235,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     if time - task.start_time > task.timeout:
         _finish_task(state, memory, time, -1.0)
     elif state[PHASE_INDEX] == PHASE_MOVING:
-        _move_by_vision(task, person, step, time, seen_W, state, memory)
+        _move_to_target_by_vision(task, person, step, time, seen_W, state, memory)
     elif state[PHASE_INDEX] == PHASE_APPROACHING:
         _approach_contact(task, person, time, seen_W, felt, state, memory)
     elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_MOVE_TIME]:
@@ -253,7 +253,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 
 
 @njit(cache=True)
-def _perceived_standoff_target(task, person):
+def _perceived_standoff_target_W(task, person):
     depth = 0.0
     if task.kind != tasks.KIND_REACH:
         depth = person.depth_error * _draw_normal_number(person, 0, 15)
@@ -266,15 +266,15 @@ def _perceived_standoff_target(task, person):
 
 @njit(cache=True)
 def _perceived_depth_beyond_surface(task, person, seen_W):
-    target, beyond = _perceived_standoff_target(task, person), -task.standoff
+    target, beyond = _perceived_standoff_target_W(task, person), -task.standoff
     for i in range(3):
         beyond += (seen_W[i] - target[i]) * task.approach_axis[i]
     return beyond
 
 
 @njit(cache=True)
-def _move_by_vision(task, person, step, time, seen_W, state, memory):
-    error = _perceived_standoff_target(task, person) - seen_W
+def _move_to_target_by_vision(task, person, step, time, seen_W, state, memory):
+    error = _perceived_standoff_target_W(task, person) - seen_W
     off = math.sqrt(dot(error, error))
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
     met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
@@ -298,16 +298,16 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING
         _enter_phase(state, memory, phase, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_DEPTH_M:
+    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _MAX_APPROACH_DEPTH_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
-        speed, change = _to_hand_motion(person, speed_W * task.approach_axis), np.empty(3)
+        speed, change = _tool_to_hand_motion(person, speed_W * task.approach_axis), np.empty(3)
         for i in range(3):
             now = evaluate_plan(memory[PLAN_SLICE], time, i)[1]
-            change[i] = 0.5 * _APPROACH_UPDATE_S * (now + speed[i])
-        plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
-        memory[_NEXT_MOVE_TIME] = time + _APPROACH_UPDATE_S
+            change[i] = 0.5 * _APPROACH_UPDATE_PERIOD_S * (now + speed[i])
+        plan_move(memory, time, _APPROACH_UPDATE_PERIOD_S, change, speed)
+        memory[_NEXT_MOVE_TIME] = time + _APPROACH_UPDATE_PERIOD_S
 
 
 @njit(cache=True)
@@ -318,7 +318,7 @@ def _perceived_contact_force(task, person, felt, memory):
 
 
 @njit(cache=True)
-def _displacement_to_set_force(task, memory, force):
+def _calc_press_correction_m(task, memory, force):
     effect = force - memory[_LAST_PRESS_FORCE]
     if effect * memory[_LAST_PRESS_MOTION] > 0.0:
         stiffness = 0.5 * (memory[_ASSUMED_CONTACT_STIFFNESS] + effect / memory[_LAST_PRESS_MOTION])
@@ -340,13 +340,13 @@ def _control_press_force(task, person, step, time, felt, state, memory):
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
-        move = _displacement_to_set_force(task, memory, force)
+        move = _calc_press_correction_m(task, memory, force)
         duration = _plan_submovement(person, memory, step, time, move * task.approach_axis)
         memory[_NEXT_MOVE_TIME] = time + duration + person.force_delay
 
 
 @njit(cache=True)
-def _lateral_contact_force_W_and_size(task, person, felt):
+def _lateral_contact_force_W_and_norm(task, person, felt):
     lateral = _contact_force_at_tool_along_approach(task, person, felt) * task.approach_axis
     if person.force_gain > 0.0:
         for i in range(3):
@@ -357,13 +357,13 @@ def _lateral_contact_force_W_and_size(task, person, felt):
 
 @njit(cache=True)
 def _is_tool_stuck(task, person, felt):
-    limit = _STUCK_SHARE_OF_PUSH_FORCE * task.force
-    _, sideways = _lateral_contact_force_W_and_size(task, person, felt)
+    limit = _MIN_STUCK_FORCE_OVER_PUSH_FORCE * task.force
+    _, sideways = _lateral_contact_force_W_and_norm(task, person, felt)
     return _contact_force_at_tool_along_approach(task, person, felt) >= limit or sideways >= limit
 
 
 @njit(cache=True)
-def _search_spiral_coordinate(num_searches, axis):
+def _search_spiral_coordinate_m(num_searches, axis):
     radius = _SEARCH_SPIRAL_SCALE_M * math.sqrt(num_searches)
     return radius * math.cos(_GOLDEN_ANGLE_RAD * num_searches - 0.5 * math.pi * axis)
 
@@ -375,18 +375,18 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
     deep = _perceived_depth_beyond_surface(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task.depth
-    if deep and abs(force - task.force) <= _STUCK_SHARE_OF_PUSH_FORCE * task.force:
+    if deep and abs(force - task.force) <= _MIN_STUCK_FORCE_OVER_PUSH_FORCE * task.force:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
-    push = _displacement_to_set_force(task, memory, force)
-    move, sideways = _lateral_contact_force_W_and_size(task, person, felt)
+    push = _calc_press_correction_m(task, memory, force)
+    move, sideways = _lateral_contact_force_W_and_norm(task, person, felt)
     if sideways >= state[FORCE_THRESHOLD_INDEX] / person.force_gain:
         move *= min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
     else:
         n = memory[_NUM_SLOT_SEARCHES]
         memory[_NUM_SLOT_SEARCHES] += 1.0
         for k in range(2):
-            move[k] = _search_spiral_coordinate(n + 1, k) - _search_spiral_coordinate(n, k)
+            move[k] = _search_spiral_coordinate_m(n + 1, k) - _search_spiral_coordinate_m(n, k)
         move[2] = 0.0
     move += push * task.approach_axis
     duration = _plan_submovement(person, memory, step, time, move)

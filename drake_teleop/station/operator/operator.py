@@ -129,13 +129,13 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> Array:
 
 
 @njit(cache=True)
-def _minimum_jerk_ramp(time, length):
-    u = time / length
+def _minimum_jerk_ramp_and_rate(time, duration):
+    u = time / duration
     if u <= 0.0:
         return 0.0, 0.0
     if u >= 1.0:
         return 1.0, 0.0
-    return u * u * u * (10.0 + u * (6.0 * u - 15.0)), 30.0 * (u * (1.0 - u)) ** 2 / length
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0)), 30.0 * (u * (1.0 - u)) ** 2 / duration
 
 
 @njit(cache=True)
@@ -151,8 +151,8 @@ def intended_motion_into(packed, start, t, pose, twist):
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]
-        fade_in, fade_in_rate = _minimum_jerk_ramp(t - row[0], row[1])
-        fade_out, fade_out_rate = _minimum_jerk_ramp(t - row[2], row[3])
+        fade_in, fade_in_rate = _minimum_jerk_ramp_and_rate(t - row[0], row[1])
+        fade_out, fade_out_rate = _minimum_jerk_ramp_and_rate(t - row[2], row[3])
         angle = row[4] * (t - row[0]) + row[5]
         level = (fade_in - fade_out) * math.sin(angle)
         rate = (fade_in_rate - fade_out_rate) * math.sin(angle)
@@ -221,11 +221,11 @@ def _hand_wrench_at_time(intent, time, impedance, intent_pose, intent_twist, pos
 
 
 @njit(cache=True)
-def _perceive_and_decide(
+def _update_operator_perception_and_decision(
     task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
-    memory, force_memory, seen_displacements, perceived_forces,
+    decision_memory, force_memory, seen_displacements, perceived_forces,
 ):  # fmt: skip
-    step = int(memory[0])
+    step = int(decision_memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
     forward_kinematics(arm, slave_q, R_WS, p_WS)
     for i in range(3):
@@ -243,11 +243,11 @@ def _perceive_and_decide(
     # The next entry to be overwritten is the oldest.
     seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
     felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
-    decision.update_decision(task, person, time, seen, felt, task_state, memory)
+    decision.update_decision(task, person, time, seen, felt, task_state, decision_memory)
 
 
-def _make_ring_buffer(delay: float, start: Array) -> Array:
-    return np.tile(start, (round(delay / decision.DECISION_PERIOD_S) + 1, 1))
+def _make_delay_buffer(delay_s: float, initial_value: Array) -> Array:
+    return np.tile(initial_value, (round(delay_s / decision.DECISION_PERIOD_S) + 1, 1))
 
 
 class Operator(LeafSystem):
@@ -301,8 +301,8 @@ class Operator(LeafSystem):
             senses, period = config.perception, decision.DECISION_PERIOD_S
             nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
             view_delay = senses.vision_delay + training.backward_delay_s
-            self._seen_displacements = _make_ring_buffer(view_delay, np.zeros(3))
-            self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
+            self._seen_displacements = _make_delay_buffer(view_delay, np.zeros(3))
+            self._perceived_forces = _make_delay_buffer(senses.reaction_time, nothing_felt)
             person = decision.pack_operator_parameters(training, senses, config.movement)
             task_and_person = decision.pack_task_parameters(config.task), person
             hand_and_arm = senses.compiled_parameters(period), hand.mass, arm.table
@@ -319,7 +319,7 @@ class Operator(LeafSystem):
             moving.add(self.discrete_state_ticket(self._groups[1]))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
-        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intended_pose), moving)
 
     def _declare_intended_motion_sources(self) -> set[DependencyTicket]:
         # `LiveHand` replaces these ports by a path to external targets.
@@ -331,9 +331,9 @@ class Operator(LeafSystem):
         state = [states.get_mutable_value(group) for group in self._groups]
         state[3] = state[3].reshape(self._seen_displacements.shape)
         state[4] = state[4].reshape(self._perceived_forces.shape)
-        stylus = self._wrench.Eval(context), self._twist.Eval(context)
+        inputs = context.get_time(), self._wrench.Eval(context), self._twist.Eval(context)
         slave_q = self._slave.Eval(context)[: self._joints]
-        _perceive_and_decide(*self._task_parameters, context.get_time(), *stylus, slave_q, *state)
+        _update_operator_perception_and_decision(*self._task_parameters, *inputs, slave_q, *state)
 
     def _intent_at_present(self, context: Context) -> tuple[Array, ...]:
         """Return segments, pose and twist relative to which they move, and the decision memory."""
@@ -357,6 +357,6 @@ class Operator(LeafSystem):
         stylus = self._pose.Eval(context), self._twist.Eval(context)
         _hand_wrench_at_time(intent, time, *own, *stylus, output.get_mutable_value())
 
-    def _calc_intent(self, context: Context, output: BasicVector) -> None:
+    def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
         intent, pose = self._intent_at_present(context), output.get_mutable_value()
         _intended_plus_planned_motion_into(intent, context.get_time(), pose, self._intent_twist)

@@ -17,18 +17,18 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
-_FORCE_MODEL_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
+_FORCE_MODEL_DRIFT_STD_PER_SQRT_S = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
 _INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 # Measurement noise of the filter, 0.1 N at 200 Hz, estimate.
 _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ = 0.007
 _FRICTION_SMOOTHING_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
-_NUM_MODEL_PARAMETERS = 6
+_FORCE_MODEL_SIZE = 6
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
-_MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_INDEX = 12, 13, 14
-_COVARIANCE_INDEX = _FORCE_MODEL_INDEX + _NUM_MODEL_PARAMETERS
-MEMORY_SIZE = _COVARIANCE_INDEX + _NUM_MODEL_PARAMETERS**2
+_MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_START = 12, 13, 14
+_COVARIANCE_START = _FORCE_MODEL_START + _FORCE_MODEL_SIZE
+MEMORY_SIZE = _COVARIANCE_START + _FORCE_MODEL_SIZE**2
 """Size of the memory of `update_perception_into`."""
 
 EXCESS_FORCE_START, DETECTION_THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
@@ -61,7 +61,7 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_COVARIANCE_INDEX:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
+    memory[_COVARIANCE_START:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
     return memory
 
 
@@ -82,7 +82,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     for i in range(3):
         if first:
             memory[i], memory[3 + i] = -hand_force[i], velocity[i]
-            memory[_FORCE_MODEL_INDEX + 3 + i] = -hand_force[i]
+            memory[_FORCE_MODEL_START + 3 + i] = -hand_force[i]
         memory[6 + i], memory[9 + i] = memory[i], memory[3 + i]
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
@@ -92,15 +92,15 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
-    theta, expected_square, excess_square = memory[_FORCE_MODEL_INDEX:_COVARIANCE_INDEX], 0.0, 0.0
-    rows, excess = np.zeros((3, _NUM_MODEL_PARAMETERS)), out[:3]
+    theta, expected_square, excess_square = memory[_FORCE_MODEL_START:_COVARIANCE_START], 0.0, 0.0
+    rows, excess = np.zeros((3, _FORCE_MODEL_SIZE)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
         a = (memory[3 + i] - memory[9 + i]) / dt
         rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3 + i] = a, v, v / speed, 1.0
         felt = 0.5 * (memory[i] + memory[6 + i]) + hand_mass * a
         expected = 0.0
-        for j in range(_NUM_MODEL_PARAMETERS):
+        for j in range(_FORCE_MODEL_SIZE):
             expected += rows[i, j] * theta[j]
         excess[i] = felt - expected
         expected_square += expected * expected
@@ -110,39 +110,39 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     noticed = attentive and math.sqrt(excess_square) >= out[DETECTION_THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        P = memory[_COVARIANCE_INDEX:].reshape(_NUM_MODEL_PARAMETERS, _NUM_MODEL_PARAMETERS)
-        _update_force_model(theta, P, rows, excess, dt)
+        P = memory[_COVARIANCE_START:].reshape(_FORCE_MODEL_SIZE, _FORCE_MODEL_SIZE)
+        _update_force_model_by_kalman_filter(theta, P, rows, excess, dt)
 
 
 @njit(cache=True)
-def _update_force_model(theta, P, rows, excess, dt):
-    gain = np.empty(_NUM_MODEL_PARAMETERS)
-    for j in range(_NUM_MODEL_PARAMETERS):
-        P[j, j] += _FORCE_MODEL_DRIFT_STD[j] * _FORCE_MODEL_DRIFT_STD[j] * dt
+def _update_force_model_by_kalman_filter(theta, P, regressor, excess_force, dt):
+    gain = np.empty(_FORCE_MODEL_SIZE)
+    for j in range(_FORCE_MODEL_SIZE):
+        P[j, j] += _FORCE_MODEL_DRIFT_STD_PER_SQRT_S[j] * _FORCE_MODEL_DRIFT_STD_PER_SQRT_S[j] * dt
     before = theta.copy()
     for i in range(3):
-        noise, residual = _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ, excess[i]
+        noise, residual = _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ, excess_force[i]
         variance = noise * noise / dt
-        for j in range(_NUM_MODEL_PARAMETERS):
-            residual -= rows[i, j] * (theta[j] - before[j])
+        for j in range(_FORCE_MODEL_SIZE):
+            residual -= regressor[i, j] * (theta[j] - before[j])
             gain[j] = 0.0
-            for k in range(_NUM_MODEL_PARAMETERS):
-                gain[j] += P[j, k] * rows[i, k]
-            variance += rows[i, j] * gain[j]
-        for j in range(_NUM_MODEL_PARAMETERS):
+            for k in range(_FORCE_MODEL_SIZE):
+                gain[j] += P[j, k] * regressor[i, k]
+            variance += regressor[i, j] * gain[j]
+        for j in range(_FORCE_MODEL_SIZE):
             theta[j] += gain[j] * residual / variance
-            for k in range(_NUM_MODEL_PARAMETERS):
+            for k in range(_FORCE_MODEL_SIZE):
                 P[j, k] -= gain[j] * gain[k] / variance
 
 
 @njit(cache=True)
-def _perceive_recorded_motion(
-    times, hand_force, velocity, parameters, dt, hand_mass, attentive, memory, out
+def _perceive_contact_of_recorded_motion(
+    times, hand_force, velocity, parameters, dt, hand_mass, detection_start_s, memory, out
 ):
     for k in range(times.shape[0]):
-        awake = times[k] >= attentive
+        attentive = times[k] >= detection_start_s
         update_perception_into(
-            memory, parameters, dt, hand_mass, hand_force[k], velocity[k], awake, out[k]
+            memory, parameters, dt, hand_mass, hand_force[k], velocity[k], attentive, out[k]
         )
 
 
@@ -175,7 +175,7 @@ def perceive_contact(
         raise DrakeTeleopError(what, where="t", remedy="give at least two samples in order of time")
     dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.compiled_parameters(dt)
-    _perceive_recorded_motion(
+    _perceive_contact_of_recorded_motion(
         times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out
     )
     return out

@@ -10,7 +10,7 @@ from drake_teleop.common.compiled import njit
 NUM_CONTACT_FIT_SUMS = 5  #: number of sums of the fit; all are 0 at the start
 # Relative increase of the squared speed changes: where speed and displacement are proportional, the
 # fit then assigns the force to stiffness.
-_DAMPING_RIDGE_SHARE = 0.05
+_RELATIVE_RIDGE_PENALTY_OF_DAMPING = 0.05
 
 
 @njit(cache=True)
@@ -26,7 +26,7 @@ def update_contact_fit(sums, force_change, displacement, speed_change, kept_weig
     sums[2] += speed_change * speed_change
     sums[3] += force_change * displacement
     sums[4] += force_change * speed_change
-    square = (1.0 + _DAMPING_RIDGE_SHARE) * sums[2]
+    square = (1.0 + _RELATIVE_RIDGE_PENALTY_OF_DAMPING) * sums[2]
     determinant = sums[0] * square - sums[1] * sums[1]
     damping = sums[0] * sums[4] - sums[1] * sums[3]
     if not damping > 0.0:  # after this branch the determinant is not 0

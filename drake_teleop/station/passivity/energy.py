@@ -35,11 +35,11 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
 
 
 @njit(cache=True)
-def _cumulative_work_into(wrench, pose, share, work):
+def _cumulative_work_into(wrench, pose, present_weight, work):
     dx, f = np.zeros(6), np.zeros(6)
     for k in range(1, len(wrench)):
         pose_difference_into(pose[k], pose[k - 1], dx)
         for i in range(6):
-            f[i] = wrench[k - 1, i] + share * (wrench[k, i] - wrench[k - 1, i])
+            f[i] = wrench[k - 1, i] + present_weight * (wrench[k, i] - wrench[k - 1, i])
         for g in range(2):
             work[k, g] = work[k - 1, g] + dot_of_group(f, dx, g)

@@ -19,16 +19,16 @@ UNUSED_SLAVE_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never
 SLAVE_RESERVE_SHARE_AT_MASTER = 0.7  #: of the slave's reserve, which the master may hold in contact
 _MIN_KEPT_SLAVE_RESERVE_SHARE = 0.05
 _SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1.05
-_MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # in multiples of the reserve
+_MAX_SLAVE_ENERGY_PER_RESERVE = 4.0  # in multiples of the reserve
 _SLAVE_MEASUREMENT_FILTER_S = 3e-3
-_SLAVE_REST_SPEED = 0.05  # m/s
+_MAX_SLAVE_REST_SPEED_M_PER_S = 0.05  # m/s
 _ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 5.0, 50.0  # 1/s
-_LONGEST_DELAY_DECAY_S = 5.0
+_LONGEST_DELAY_DECAY_TIME_CONSTANT_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
 _HAND_PRESSING_SPEED = 0.06  # m/s
 _MIN_FIT_SAMPLE_LENGTH_M, _MIN_FAST_FIT_SAMPLE_LENGTH_M = 2e-4, 2e-3
 _MIN_FIT_SPAN_M, _MAX_FIT_SPAN_M = 1e-3, 1e-2
-_MIN_FAST_FIT_SPEED = 0.15  # m/s
+_MIN_SPEED_FOR_FAST_FIT_M_PER_S = 0.15  # m/s
 _STIFFNESS_SHARE_FILTER_S, _STIFFNESS_SHARE_DEADBAND = 0.02, 0.1
 _MIN_LOST_FORCE_OF_REMOVED_WALL_N = 0.3
 _CONTACT_DIRECTION_FILTER_S = 3.0
@@ -36,10 +36,10 @@ _SLIP_FORCE_FADE_S, _FRICTION_DECAY_S = 0.6, 1.0
 _STIFFNESS_GAIN_RISE_S, _STIFFNESS_GAIN_FALL_S = 0.5, 1.0
 _MIN_STIFFNESS_GAIN, _MAX_STIFFNESS_GAIN = 0.1, 10.0
 _COMMAND_FILTER_S, _MAX_COMMAND_ACCELERATION, _STOPPING_SPEED_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2
-_MAX_FEEDFORWARD_SILENCE_S = 0.02
+_MAX_SILENCE_WITH_FEEDFORWARD_S = 0.02
 _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS, _MAX_SILENCE_FOR_GAIN_S = 0.5, 0.06
-_MOTOR_ENERGY_HORIZON_S = 4e-3
-_WALL_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
+_MOTOR_ENERGY_PREDICTION_HORIZON_S = 4e-3
+_MAX_WALL_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
 _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
@@ -133,7 +133,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
-    kept = 1.0 - T / _LONGEST_DELAY_DECAY_S
+    kept = 1.0 - T / _LONGEST_DELAY_DECAY_TIME_CONSTANT_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
     trip = (memory[slots.STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip, 0.0)
@@ -148,19 +148,19 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for i in range(6):
         filtered[i] += share * (load[i] - filtered[i])
     for g in range(2):
-        _update_group_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
-    _identify_contact(received, in_contact, dx, contact, T, p, memory)
+        _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
+    _update_contact_fit_and_rendered_force(received, in_contact, dx, contact, T, p, memory)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
         fields.pose_difference_into(received[fields.POSE], now, error)
     fields.pose_difference_into(now, pose, memory[_MOTOR_WRENCH])
-    _generate_command(received, connected, T, p, memory, error)
+    _update_command_velocity(received, connected, T, p, memory, error)
     for i in range(6):
         error[i] = T * velocity[i]
     move_pose_into(now, error, now)
     _limit_command_to_motor_energy(now, pose, twist, p, memory)
-    _step_servo_model(received, connected, T, p, memory, error)
+    _advance_servo_model(received, connected, T, p, memory, error)
     copy_into(command, 0, memory, slots.COMMAND.start, 13)
     fields.fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT_FLAG] > 0.0:
@@ -182,7 +182,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 
 @njit(cache=True)
-def _update_group_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
+def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g))
     new = fields.count_newly_received_energy(g, received, memory)
@@ -197,13 +197,13 @@ def _update_group_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _ENERGY_SEND_RATE
     free, returned = ledger[g] - kinetic, 0.0
     needed = missing = hold - received[PACKET_LEDGER_LEVEL][g]
-    if in_contact and speed < _SLAVE_REST_SPEED * ANGLE_PER_LENGTH[g]:
+    if in_contact and speed < _MAX_SLAVE_REST_SPEED_M_PER_S * ANGLE_PER_LENGTH[g]:
         keep, rate = (1.0 - SLAVE_RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
         needed += SLAVE_RESERVE_SHARE_AT_MASTER * reserve
         returned = min(free - _MIN_KEPT_SLAVE_RESERVE_SHARE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
-    lost = max(ledger[g] - returned - _MAX_SLAVE_ENERGY_IN_RESERVES * reserve, 0.0)
+    lost = max(ledger[g] - returned - _MAX_SLAVE_ENERGY_PER_RESERVE * reserve, 0.0)
     memory[slots.SENT_ENERGY][g] += returned
     memory[slots.DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
@@ -216,7 +216,7 @@ def _servo_lag_s(p):
 
 
 @njit(cache=True)
-def _max_displayed_stiffness(received, T, p, memory):
+def _update_max_displayed_stiffness(received, T, p, memory):
     normal, fill_level = memory[CONTACT_DIRECTION], 0.0
     depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
     for g in range(2):
@@ -226,7 +226,7 @@ def _max_displayed_stiffness(received, T, p, memory):
         level = min(max(received[PACKET_LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
-    max_silence = min(max(_MAX_FEEDFORWARD_SILENCE_S, max_silence), _MAX_SILENCE_FOR_GAIN_S)
+    max_silence = min(max(_MAX_SILENCE_WITH_FEEDFORWARD_S, max_silence), _MAX_SILENCE_FOR_GAIN_S)
     goal = _MAX_STIFFNESS_GAIN * fill_level - 1.0
     if memory[_LONGEST_SILENCE] >= max_silence:
         goal = min(goal, 0.0)
@@ -242,7 +242,7 @@ def _max_displayed_stiffness(received, T, p, memory):
 
 
 @njit(cache=True)
-def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
+def _update_contact_fit_and_rendered_force(received, in_contact, dx, wrench, T, p, memory):
     normal, velocity = memory[CONTACT_DIRECTION], memory[FILTERED_OWN_VELOCITY]
     k = memory[_CONTACT_STIFFNESS]
     if not in_contact:
@@ -251,8 +251,8 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         memory[IN_CONTACT_FLAG] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION_FORCE] = 0.0
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
-    k_d = _max_displayed_stiffness(received, T, p, memory)
-    max_change = _max_force_change_by_slip(wrench, size, T, p, memory)
+    k_d = _update_max_displayed_stiffness(received, T, p, memory)
+    max_change = _update_max_force_change_by_slip(wrench, size, T, p, memory)
     inward, rate = -work_along(normal, dx), min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
@@ -267,7 +267,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     memory[_FIT_SAMPLE_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
     tip_speed = length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
-    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _MIN_FAST_FIT_SPEED
+    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _MIN_SPEED_FOR_FAST_FIT_M_PER_S
     length_m = abs(memory[_FIT_SAMPLE_LENGTH])
     if length_m > (_MIN_FIT_SAMPLE_LENGTH_M if slow else _MIN_FAST_FIT_SAMPLE_LENGTH_M):
         memory[_FIT_SPAN] = min(memory[_FIT_SPAN] + length_m, _MAX_FIT_SPAN_M)
@@ -310,7 +310,7 @@ def _is_wall_removed(dx, memory):
 
 
 @njit(cache=True)
-def _max_force_change_by_slip(wrench, normal_force, T, p, memory):
+def _update_max_force_change_by_slip(wrench, normal_force, T, p, memory):
     mean_wrench = memory[MEAN_CONTACT_WRENCH]
     mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - normal_force**2, 0.0))
@@ -320,7 +320,7 @@ def _max_force_change_by_slip(wrench, normal_force, T, p, memory):
 
 
 @njit(cache=True)
-def _generate_command(received, connected, T, p, memory, error):
+def _update_command_velocity(received, connected, T, p, memory, error):
     velocity, feed = memory[slots.COMMAND_TWIST], received[fields.VELOCITY]
     normal, compliance, beyond_wall, inward_speed = memory[CONTACT_DIRECTION], 0.0, 0.0, 0.0
     if memory[IN_CONTACT_FLAG] > 0.0:
@@ -328,7 +328,7 @@ def _generate_command(received, connected, T, p, memory, error):
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
         if beyond_wall > 0.0:
             compliance, inward_speed = 1.0 - memory[_STIFFNESS_SHARE], -work_along(normal, feed)
-    feeds_forward = connected and memory[_SILENCE_TIME] < _MAX_FEEDFORWARD_SILENCE_S
+    feeds_forward = connected and memory[_SILENCE_TIME] < _MAX_SILENCE_WITH_FEEDFORWARD_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             error[i] += compliance * beyond_wall * p[WRENCH_METRIC][g] * normal[i]
@@ -360,7 +360,7 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
         D = _SERVO_DAMPING_FACTOR * p[slots.SERVO_D][g]
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = K * motor_wrench[i] - D * twist[i]
-        if _limit_motor_wrench_of_group(g, D, twist, p, memory):
+        if _limit_group_motor_wrench_to_energy(g, D, twist, p, memory):
             changed = True
             velocity = memory[slots.COMMAND_TWIST]
             is_faster = length_of_group(velocity, g) > length_of_group(twist, g)
@@ -375,7 +375,7 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
 
 
 @njit(cache=True)
-def _limit_motor_wrench_of_group(g, damping, twist, p, memory):
+def _limit_group_motor_wrench_to_energy(g, damping, twist, p, memory):
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[FILTERED_OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed = length_of_group(motor_wrench, g), length_of_group(twist, g)
@@ -388,7 +388,7 @@ def _limit_motor_wrench_of_group(g, damping, twist, p, memory):
     changed = False
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
-        free = _WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
+        free = _MAX_WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
         spring = (1.0 + memory[_STIFFNESS_GAIN_MINUS_ONE]) * free * free
         spring /= 2.0 * max(memory[_CONTACT_STIFFNESS], 1.0)
         available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_ENERGY_IN_CONTACT][g])
@@ -396,8 +396,8 @@ def _limit_motor_wrench_of_group(g, damping, twist, p, memory):
             # Delayed motors gain a little energy at standstill; with an empty balance they yield.
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
-        permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
-    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
+        permitted += mass * speed / _MOTOR_ENERGY_PREDICTION_HORIZON_S  # stops without a rebound
+    reach = _MOTOR_ENERGY_PREDICTION_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         permitted_wrench = max(max(available - margin, 0.0) / reach, permitted)
         fields.scale_group(motor_wrench, g, permitted_wrench / size)
@@ -413,7 +413,7 @@ def _limit_motor_wrench_of_group(g, damping, twist, p, memory):
 
 
 @njit(cache=True)
-def _step_servo_model(received, connected, T, p, memory, error):
+def _advance_servo_model(received, connected, T, p, memory, error):
     model, velocity = memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:

@@ -73,7 +73,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _functions_of_module(module: Any) -> tuple[Any, Any, Any, Any]:
+def _method_functions(module: Any) -> tuple[Any, Any, Any, Any]:
     return module.master_step, module.slave_step, module.record_command, module.initialize
 
 
@@ -85,8 +85,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(*_functions_of_module(two_layer), balance_at_motors=True),
-        "pspm": PassivityMethod(*_functions_of_module(pspm), balance_at_motors=True),
+        "two_layer": PassivityMethod(*_method_functions(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_method_functions(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -104,7 +104,7 @@ METHODS = Registry(
 )
 """All methods by name."""
 
-_DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
+_DEFAULT_MASS_AND_INERTIA = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
 @settings
@@ -191,7 +191,7 @@ def method_parameters(
     p[slots.WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[slots.SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
     p[slots.SERVO_D] = np.multiply(config.servo_damping, power_scale)
-    p[slots.SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
+    p[slots.SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_MASS_AND_INERTIA, power_scale)
     p[slots.SLAVE_PER_MASTER_MOTION] = motion_scale
     fades = config.method != "none"
     p[slots.RETREAT_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf

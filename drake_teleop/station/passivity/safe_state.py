@@ -30,7 +30,7 @@ _CONNECTED_TIME = _layout.number()  # time since the last silence
 _layout = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME + 1)
 _TIME_SINCE_STOP_BEGAN = _layout.number()  # time since it began to stop
 _TIME_SINCE_RESUME_BEGAN = _layout.number()  # time since it began to resume
-_COMMAND_AT_STOP_START = _layout.vector(7)  # command when it began to stop
+_COMMAND_POSE_AT_STOP = _layout.vector(7)  # command when it began to stop
 _COMMAND_VELOCITY_AT_STOP_START = _layout.vector(6)  # its velocity
 _LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
 
@@ -54,7 +54,7 @@ def initial_slave_monitor(pose: Array) -> Array:
     """Return the silence monitor's state (SLAVE_MONITOR_SIZE,) of a slave at rest at `pose`."""
     state = np.zeros(SLAVE_MONITOR_SIZE)
     state[SILENCE_TIME] = np.inf
-    state[_COMMAND_AT_STOP_START] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
+    state[_COMMAND_POSE_AT_STOP] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
     return state
 
 
@@ -100,7 +100,7 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
     """
     _update_silence_time(healthy, fault, T, state)
     last, before = state[_LAST_COMMAND], state[_COMMAND_BEFORE_LAST]
-    start, velocity = state[_COMMAND_AT_STOP_START], state[_COMMAND_VELOCITY_AT_STOP_START]
+    start, velocity = state[_COMMAND_POSE_AT_STOP], state[_COMMAND_VELOCITY_AT_STOP_START]
     step = np.empty(6)
     if state[SILENCE_TIME] <= timeout:
         state[_TIME_SINCE_RESUME_BEGAN] = min(state[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)

@@ -18,18 +18,18 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, limit_group
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
-_KEPT_HAND_INPUT_SHARE = 0.5
+_KEPT_HAND_ENERGY_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
-_SLOW_WRENCH_ONSET_S = 0.1
-_WRENCH_END_SHARE = 0.1  # a wrench below this share of the filtered one ends
+_SLOW_WRENCH_ONSET_TIME_S = 0.1
+_ENDED_WRENCH_SHARE_OF_FILTERED = 0.1  # a wrench below this share of the filtered one ends
 _WRENCH_ONSET_COMPLETE_SHARE = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
 # [m/s, rad/s], for translation and rotation.
-_STIFFNESS_AVERAGING_TRAVEL = (1e-3, 1e-2)
+_STIFFNESS_AVERAGING_TRAVEL_M_RAD = (1e-3, 1e-2)
 _FULL_DRAG_HAND_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET = fields.METHOD_VALUES.start
+_NEWEST_MASTER_PACKET_NUMBER = fields.METHOD_VALUES.start
 _PACKET_SLAVE_ENERGY = fields.SENDER_ENERGY
 
 # Parameters; reserve, drag and stiffness in the master's power units.
@@ -47,7 +47,7 @@ _SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
 _CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET_NUMBER = _layout.vector(2), _layout.vector(2)
-_LAST_COMMAND = _layout.vector(7)  # the command of the last step
+_LAST_COMMAND_POSE = _layout.vector(7)  # the command of the last step
 
 
 @settings
@@ -116,7 +116,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         withheld[g] = 1.0 - share
         memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * work_on_hand
         fields.scale_group(wrench, g, share)
-        _add_group_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
+        _add_hand_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
         _update_ledger_by_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
@@ -124,11 +124,11 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             memory[slots.SENT_ENERGY][g] += surplus
         packet[fields.CUMULATIVE_ENERGY][g] = memory[slots.SENT_ENERGY][g]
     fields.fill_packet(pose, twist, wrench, packet)
-    packet[_NEWEST_MASTER_PACKET] = received[fields.PACKET_NUMBER]
+    packet[_NEWEST_MASTER_PACKET_NUMBER] = received[fields.PACKET_NUMBER]
 
 
 @njit(cache=True)
-def _add_group_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
+def _add_hand_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
     drag = p[_DRAG_WRENCH][g]
     level = memory[slots.STORED_ENERGY][g] + memory[_MASTER_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_TARGET_RESERVE][g]:
@@ -146,21 +146,21 @@ def _update_ledger_by_hand_work_of_group(g, work_on_hand, p, memory):
         ledger[g] = max(ledger[g] - work_on_hand, 0.0)
     else:
         missing = max(p[_TARGET_RESERVE][g] - kept[g], 0.0)
-        more = min(-_KEPT_HAND_INPUT_SHARE * work_on_hand, missing)
+        more = min(-_KEPT_HAND_ENERGY_SHARE * work_on_hand, missing)
         memory[slots.SENT_ENERGY][g] -= work_on_hand + more
     kept[g] = max(kept[g] + more, 0.0)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    copy_into(memory, _LAST_COMMAND.start, memory, slots.COMMAND_POSE.start, 7)
+    copy_into(memory, _LAST_COMMAND_POSE.start, memory, slots.COMMAND_POSE.start, 7)
     for g in range(2):
         fields.count_newly_received_energy(g, received, memory)
         work = dot_of_group(wrench, dx, g)
         memory[_SLAVE_WORK_IN][g] += max(work, 0.0)
         memory[_SLAVE_WORK_OUT][g] += max(-work, 0.0)
     if fields.has_packet_arrived(received):
-        _advance_command(received, wrench, T, p, memory)
+        _advance_command_within_energy(received, wrench, T, p, memory)
     for g in range(2):
         available = _available_slave_energy_of_group(memory, g)
         credit = min(memory[_SLAVE_WORK_IN][g], memory[_COMMAND_WORK_IN][g]) + min(available, 0.0)
@@ -182,19 +182,19 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
     if hand > 0.0:
         gain = max(_estimate_contact_stiffness_of_group(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
-        round_trip = max(memory[slots.STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
+        round_trip = max(memory[slots.STEP_COUNT] - received[_NEWEST_MASTER_PACKET_NUMBER], 1.0) * T
         lag = round_trip + p[slots.SERVO_D][g] / p[slots.SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
-        onset_rate = min(T / _SLOW_WRENCH_ONSET_S, 1.0)
+        onset_rate = min(T / _SLOW_WRENCH_ONSET_TIME_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
-        if size < _WRENCH_END_SHARE * filtered_size:
+        if size < _ENDED_WRENCH_SHARE_OF_FILTERED * filtered_size:
             rate = max(rate, onset_rate)
         else:
             if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
                 memory[_QUICK_ONSET_PACKET_NUMBER][g] = memory[slots.STEP_COUNT]
-            awaited = received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET_NUMBER][g]
-            if lag > _SLOW_WRENCH_ONSET_S and awaited:
+            awaited = received[_NEWEST_MASTER_PACKET_NUMBER] < memory[_QUICK_ONSET_PACKET_NUMBER][g]
+            if lag > _SLOW_WRENCH_ONSET_TIME_S and awaited:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -204,9 +204,9 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
 @njit(cache=True)
 def _estimate_contact_stiffness_of_group(g, dx, wrench, T, memory):
     size, stiffness = length_of_group(dx, g), memory[_CONTACT_STIFFNESS_ESTIMATE]
-    if size > _STIFFNESS_AVERAGING_TRAVEL[g] * T:
+    if size > _STIFFNESS_AVERAGING_TRAVEL_M_RAD[g] * T:
         change = dot_of_group(wrench, dx, g) - dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
-        forget = min(size / _STIFFNESS_AVERAGING_TRAVEL[g], 1.0)
+        forget = min(size / _STIFFNESS_AVERAGING_TRAVEL_M_RAD[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
 
@@ -218,7 +218,7 @@ def _available_slave_energy_of_group(memory, g):
 
 
 @njit(cache=True)
-def _advance_command(received, wrench, T, p, memory):
+def _advance_command_within_energy(received, wrench, T, p, memory):
     now, withheld = memory[slots.COMMAND_POSE], memory[_WITHHELD_COMMAND_MOTION]
     step = memory[slots.COMMAND_TWIST]
     remaining_share = 1.0 - min(T * p[_COMMAND_DRIFT_RATE], 1.0)
@@ -244,7 +244,7 @@ def _advance_command(received, wrench, T, p, memory):
 @njit(cache=True)
 def _add_command_work(command, sign, memory):
     step = np.empty(6)
-    fields.pose_difference_into(command, memory[_LAST_COMMAND], step)
+    fields.pose_difference_into(command, memory[_LAST_COMMAND_POSE], step)
     for g in range(2):
         work = sign * dot_of_group(memory[slots.LAST_PORT_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0

@@ -77,16 +77,16 @@ def _exchange_tank_energy(received, dx, T, p, memory, packet):
 
 
 @njit(cache=True)
-def _max_step_work_of_group(f, dx, g, acceleration, T):
-    return dot_of_group(f, dx, g) + length_of_group(f, g) * acceleration * T * T
+def _max_work_in_period_of_group(wrench, dx, g, acceleration, T):
+    return dot_of_group(wrench, dx, g) + length_of_group(wrench, g) * acceleration * T * T
 
 
 @njit(cache=True)
-def _limit_wrench_to_tank_of_group(f, dx, g, acceleration, T, memory):
-    cost = _max_step_work_of_group(f, dx, g, acceleration, T)
+def _limit_wrench_to_tank_energy(wrench, dx, g, acceleration, T, memory):
+    cost = _max_work_in_period_of_group(wrench, dx, g, acceleration, T)
     level = max(memory[slots.STORED_ENERGY][g], 0.0)
     if cost > level:
-        fields.scale_group(f, g, level / cost)
+        fields.scale_group(wrench, g, level / cost)
 
 
 @njit(cache=True)
@@ -102,7 +102,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         drainable = min(T * p[_MAX_TANK_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
         if work_on_hand > drainable:
             fields.scale_group(wrench, g, drainable / work_on_hand)
-        _limit_wrench_to_tank_of_group(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
+        _limit_wrench_to_tank_energy(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -125,16 +125,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         kept = _TANK_RESERVE_SHARE * p[_TANK_CAPACITY][g]
         available = max(memory[slots.STORED_ENERGY][g] - kept, 0.0)
         acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
-        if _max_step_work_of_group(motor_wrench, dx, g, acceleration, T) > available:
+        if _max_work_in_period_of_group(motor_wrench, dx, g, acceleration, T) > available:
             acceleration = own_acceleration + length_of_group(brake, g) / mass
-            available -= _max_step_work_of_group(brake, dx, g, acceleration, T)
+            available -= _max_work_in_period_of_group(brake, dx, g, acceleration, T)
             acceleration = own_acceleration + length_of_group(spring, g) / mass
-            cost = _max_step_work_of_group(spring, dx, g, acceleration, T)
+            cost = _max_work_in_period_of_group(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
             acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
-            _limit_wrench_to_tank_of_group(motor_wrench, dx, g, acceleration, T, memory)
+            _limit_wrench_to_tank_energy(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
     fields.move_pose_into(pose, spring, memory[slots.COMMAND_POSE])

@@ -93,7 +93,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
             most = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
-            if _limit_group_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
+            if _limit_wrench_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
                 memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
@@ -105,7 +105,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _limit_group_change(g, energy, dx, max_change, last_wrench, wrench):
+def _limit_wrench_change(g, energy, dx, max_change, last_wrench, wrench):
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
         size += (wrench[i] - last_wrench[i]) ** 2
@@ -129,7 +129,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         step[:] = 0.0
         _reflect_wave_while_channel_fills(received, wrench, T, p, memory)
     elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE_BEFORE_HOLD]:
-        _reflect_wave(received, wrench, T, p, memory)
+        _apply_and_reflect_wave(received, wrench, T, p, memory)
         if fields.has_packet_arrived(received):
             _correct_pose_drift(received, wrench, T, p, memory)
         fields.move_pose_into(now, step, now)
@@ -146,7 +146,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 
 @njit(cache=True)
-def _reflect_wave(received, wrench, T, p, memory):
+def _apply_and_reflect_wave(received, wrench, T, p, memory):
     wave, step = memory[_FILTERED_WAVE], memory[slots.COMMAND_TWIST]
     integral = memory[_SENT_WAVE_INTEGRAL]
     _filter_received_wave(received, T, p, memory)

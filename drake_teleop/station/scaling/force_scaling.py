@@ -26,7 +26,7 @@ from drake_teleop.station.slave.arm import (
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
 _CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 _NUM_BLENDED_SCALES = 6
-_JOINT_ANGLES = slice(regressor.FIRST_JOINT_INDEX, regressor.SAMPLE_TIME_INDEX)
+_JOINT_ANGLE_SLICE = slice(regressor.FIRST_JOINT_INDEX, regressor.SAMPLE_TIME_INDEX)
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
 MAX_SAMPLE_AGE_S = 0.05
@@ -134,7 +134,7 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
         gravity = np.empty(3)
-        acceleration_from_specific_force_into(arm, sample[_JOINT_ANGLES], np.zeros(3), gravity)
+        acceleration_from_specific_force_into(arm, sample[_JOINT_ANGLE_SLICE], np.zeros(3), gravity)
         add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
@@ -152,7 +152,7 @@ def find_sample_fault(sample, estimate, time, sample_limits):
         reading = reading and abs(sample[i]) <= sample_limits[i]
     if not reading:
         return _BAD_READING_FAULT
-    if not are_valid_port_values(sample[_JOINT_ANGLES]):
+    if not are_valid_port_values(sample[_JOINT_ANGLE_SLICE]):
         return _BAD_JOINTS_FAULT
     return _NO_FAULT if are_valid_port_values(estimate) else _BAD_LOAD_FAULT
 
@@ -200,7 +200,7 @@ def _rendered_wrench_into(
     blend_scales_at(scale_ramp, time, scales)
     scales[2] *= contact_factor
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
-    forward_kinematics(arm, sample[_JOINT_ANGLES], R_WS, p_WS)
+    forward_kinematics(arm, sample[_JOINT_ANGLE_SLICE], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 

@@ -69,12 +69,12 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _pose_command_into(pose, references, alignment, translation_scale, rotation_scale, out):
-    if references[14] > 0.5:
-        command, master = references[:7], references[7:14]
-        scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
+def _pose_command_into(pose, clutch_references, R_WB, translation_scale, rotation_scale, out):
+    if clutch_references[14] > 0.5:
+        command, master = clutch_references[:7], clutch_references[7:14]
+        scale_pose_into(pose, master, command, R_WB, translation_scale, rotation_scale, out)
     else:
-        vectors.copy_into(out, 0, references, 0, 7)
+        vectors.copy_into(out, 0, clutch_references, 0, 7)
 
 
 class KinematicScaling(DoubleOnlySystem, LeafSystem):
@@ -171,25 +171,25 @@ class JointCoupling(LeafSystem):
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
         self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
         sources = {self._state.ticket(), self.xd_ticket()}
-        joints, pose = weak_callback(self._calc_joints), weak_callback(self._calc_pose)
+        joints, pose = weak_callback(self._calc_joint_command), weak_callback(self._calc_tool_pose)
         self.DeclareVectorOutputPort("leader_joints", n, joints, sources)
         self.DeclareVectorOutputPort("pose_command", 7, pose, sources)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_joints_and_clutch)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update_joints_and_clutch)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_joints_and_clutch)
+        self.DeclareInitializationDiscreteUpdateEvent(self._store_joints_and_clutch)
 
     def _commanded_joint_positions(self, context: Context) -> Array:
         memory, n = context.get_discrete_state(0).value(), len(self._offset)
         joints: Array = memory[:n]
         return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints
 
-    def _calc_joints(self, context: Context, output: BasicVector) -> None:
+    def _calc_joint_command(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._commanded_joint_positions(context))
 
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
+    def _calc_tool_pose(self, context: Context, output: BasicVector) -> None:
         joints = np.array(self._commanded_joint_positions(context))
         pose_into(self._table, joints, output.get_mutable_value())
 
-    def _update_joints_and_clutch(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_joints_and_clutch(self, context: Context, discrete_state: DiscreteValues) -> None:
         memory = discrete_state.get_mutable_value(0)
         joints = self._commanded_joint_positions(context)
         if np.isfinite(joints).all():  # an opened clutch must hold a finite command

@@ -52,17 +52,17 @@ _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 #: Constants: whether the encoders are the only source, and whether they correct the accelerometer;
 #: waits of wrench, acceleration, angles (fractional); low-passes of the sensor and of `encoders`.
-_NUM_ANGLE_SECTIONS = 4
+_NUM_ANGLE_LOW_PASS_SECTIONS = 4
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
 _FLAGGED_SAMPLES_LEFT_INDEX = 1
 _ANGULAR_FUSION_FILTER_START = 2
-_FUSION_FILTER_SIZE = 24
-_LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
-_KINEMATICS_SCRATCH_START = _LINEAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
+_FUSION_FILTER_MEMORY_SIZE = 24
+_LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_MEMORY_SIZE
+_KINEMATICS_SCRATCH_START = _LINEAR_FUSION_FILTER_START + _FUSION_FILTER_MEMORY_SIZE
 _JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + serial_arm.SENSOR_MOTION_SIZE
-_MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
+_MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_LOW_PASS_SECTIONS
 
 
 @settings
@@ -213,7 +213,7 @@ def initialize_motion_estimator(
 def _angle_low_pass_sections(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> Array:
-    filters = np.zeros((_NUM_ANGLE_SECTIONS, 5))
+    filters = np.zeros((_NUM_ANGLE_LOW_PASS_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
         filters[:2] = butterworth_sections(sensor.bandwidth_hz, 1 / period)
@@ -308,16 +308,16 @@ def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
 
 
 @njit(cache=True)
-def _differentiate_joint_angles(constants, is_first, joints, angles):
+def _differentiate_joint_angles(constants, is_first, memory, angles):
     n, period = angles.shape[0], constants.period
     for i in range(n):
         if is_first:
-            joints[2 * n + i] = joints[3 * n + i] = joints[4 * n + i] = angles[i]
-        q0, q1, q2, q3 = angles[i], joints[2 * n + i], joints[3 * n + i], joints[4 * n + i]
-        joints[i] = (3.0 * q0 - 4.0 * q1 + q2) / (2.0 * period)
+            memory[2 * n + i] = memory[3 * n + i] = memory[4 * n + i] = angles[i]
+        q0, q1, q2, q3 = angles[i], memory[2 * n + i], memory[3 * n + i], memory[4 * n + i]
+        memory[i] = (3.0 * q0 - 4.0 * q1 + q2) / (2.0 * period)
         if constants.encoders_only != 0.0:
-            joints[n + i] = (2.0 * q0 - 5.0 * q1 + 4.0 * q2 - q3) / (period * period)
-        joints[2 * n + i], joints[3 * n + i], joints[4 * n + i] = q0, q1, q2
+            memory[n + i] = (2.0 * q0 - 5.0 * q1 + 4.0 * q2 - q3) / (period * period)
+        memory[2 * n + i], memory[3 * n + i], memory[4 * n + i] = q0, q1, q2
 
 
 @njit(cache=True)
@@ -336,7 +336,7 @@ def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
         if starts:
             copy_into(angular, 3, omega, 0, 3)
             copy_into(angular, 15, R, 0, 9)
-        _rotation_between_into(angular[15:], R, motion)
+        _small_rotation_vector_into(angular[15:], R, motion)
         copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
@@ -368,13 +368,13 @@ def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
 
 
 @njit(cache=True)
-def _rotation_between_into(before, R, angle):
+def _small_rotation_vector_into(R_before, R, rotation_vector):
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         value = 0.0
         for row in range(0, 9, 3):
-            value += before[row + k] * R[row + j] - before[row + j] * R[row + k]
-        angle[i] = 0.5 * value
+            value += R_before[row + k] * R[row + j] - R_before[row + j] * R[row + k]
+        rotation_vector[i] = 0.5 * value
 
 
 @njit(cache=True)

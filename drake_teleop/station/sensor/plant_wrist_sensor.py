@@ -60,7 +60,7 @@ _PLANT_PORT_TYPES = {"body_poses": RigidTransform, "body_spatial_velocities": Sp
 _PLANT_PORT_TYPES |= {"body_spatial_accelerations": SpatialAcceleration}
 _PLANT_PORT_TYPES |= {"reaction_forces": SpatialForce}
 # Configuration: R_WB (9), angular velocity of B in W (3), joint positions.
-_BODY_ROTATION_AND_RATE_SIZE = 12
+_BODY_ROTATION_AND_OMEGA_SIZE = 12
 # Groups of the discrete state: held configuration; sample; sensor chain and motion estimator.
 _POSTURE_GROUP_INDEX, _SAMPLE_GROUP_INDEX, _FILTER_GROUP_INDICES = 0, 1, (2, 3)
 
@@ -146,7 +146,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         S, joint = _sensor_frame_and_weld(plant, joint_or_frame)
         self._weld = _weld_properties(plant, S, joint)
         step = plant.time_step() or None
-        self._step_s, self._steps_per_sample = _event_period_and_ratio(step, period)
+        self._step_s, self._steps_per_sample = _event_period_and_sample_steps(step, period)
         self._pairs_steps = step is not None and plant.has_sampled_output_ports()
         config.check(_NAME_IN_ERRORS, 1 / self.period)
 
@@ -168,12 +168,12 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         )
         noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self._noise = noise
-        held = np.full(_BODY_ROTATION_AND_RATE_SIZE + n, np.nan)
+        held = np.full(_BODY_ROTATION_AND_OMEGA_SIZE + n, np.nan)
         for start in (held, sample, chain, estimator):
             self.DeclareDiscreteState(start)
-        self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
+        self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_sample)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._store_rotation_rate_and_joints)
+            self.DeclareInitializationDiscreteUpdateEvent(self._store_rotation_omega_and_joints)
         first, places = 0, np.delete(np.arange(len(sample)), [16, 17, 18])
         for name, size in {**regressor.signal_sizes_of_sample(n), "sample_time": 1}.items():
             place = places[first : first + size]
@@ -192,33 +192,33 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
 
         self.DeclareVectorOutputPort(name, len(indices), calc_part_of_sample, {self.xd_ticket()})
 
-    def _rotation_rate_and_joints(self, context: Context) -> Array:
+    def _rotation_omega_and_joints(self, context: Context) -> Array:
         _, body, _ = self._weld
         R_WB = self._poses.Eval(context)[body].rotation().matrix()
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _store_rotation_rate_and_joints(
+    def _store_rotation_omega_and_joints(
         self, context: Context, discrete_state: DiscreteValues
     ) -> None:
-        discrete_state.set_value(_POSTURE_GROUP_INDEX, self._rotation_rate_and_joints(context))
+        discrete_state.set_value(_POSTURE_GROUP_INDEX, self._rotation_omega_and_joints(context))
 
-    def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
         configuration = discrete_state.value(_POSTURE_GROUP_INDEX).copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._store_rotation_rate_and_joints(context, discrete_state)
+            self._store_rotation_omega_and_joints(context, discrete_state)
         if step % self._steps_per_sample != 0:
             return
         if not self._pairs_steps:
-            configuration = self._rotation_rate_and_joints(context)
+            configuration = self._rotation_omega_and_joints(context)
         reaction, body, geometry = self._weld
         acceleration = self._accelerations.Eval(context)[body].get_coeffs()
         force = self._reactions.Eval(context)[reaction].get_coeffs()
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
         truth = np.empty(TRUE_JOINT_ANGLES.start + 3 + self._n)
-        _true_values_into(geometry, configuration, acceleration, force, truth)
+        _true_sensor_values_into(geometry, configuration, acceleration, force, truth)
         sample = discrete_state.get_mutable_value(_SAMPLE_GROUP_INDEX)
         filters = (discrete_state.get_mutable_value(group) for group in _FILTER_GROUP_INDICES)
         measure_sample_into(self._sensor, self._no_arm, noise, truth, *filters, sample[:-1])
@@ -226,7 +226,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
 
 
 @njit(cache=True)
-def _true_values_into(geometry, configuration, acceleration, reaction, truth):
+def _true_sensor_values_into(geometry, configuration, acceleration, reaction, truth):
     p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity_W, sign = geometry
     R_WB, omega = matrix_at(configuration, 0), vector_at(configuration, 9)
     alpha, a_Bo = vector_at(acceleration, 0), vector_at(acceleration, 3)
@@ -242,8 +242,8 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
         truth[i], truth[3 + i] = sign * f[i], sign * tau[i]
         truth[6 + i], truth[9 + i], truth[12 + i] = s[i], omega[i], alpha[i]
         truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
-    n = configuration.shape[0] - _BODY_ROTATION_AND_RATE_SIZE
-    copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_ROTATION_AND_RATE_SIZE, n)
+    n = configuration.shape[0] - _BODY_ROTATION_AND_OMEGA_SIZE
+    copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_ROTATION_AND_OMEGA_SIZE, n)
 
 
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
@@ -257,7 +257,7 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
         raise DrakeTeleopError(what, where=_NAME_IN_ERRORS, remedy=remedy)
 
 
-def _event_period_and_ratio(step: float | None, period: float | None) -> tuple[float, int]:
+def _event_period_and_sample_steps(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
         what = f"a sampling period of {period} s is not positive and finite"
         remedy = "give the time between samples [s]"

@@ -41,9 +41,9 @@ from drake_teleop.load.regressor import (
 
 #: Samples per block of random numbers: one event of a noise source, one step of a walk.
 SAMPLES_PER_NOISE_BLOCK = 128
-_NUM_CHANNELS = 12
+_NUM_NOISY_CHANNELS = 12
 #: Standard normal numbers of a block: 12 for each sample, then 12 for the random walks.
-NOISE_BLOCK_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
+NOISE_BLOCK_SIZE = _NUM_NOISY_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
 
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
 NUM_FLAGGED_SAMPLES_AFTER_LOSS = 40
@@ -53,9 +53,9 @@ PRESET_NAMES = (
     *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
     *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
 )
-_LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
+_LOW_PASS_POSITIONS = ("none", "before_noise", "after_converter")
 _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
-_ROTATION_TOLERANCE = 1e-6
+_MAX_ORTHOGONALITY_ERROR_OF_R_SA = 1e-6
 _OVERLOAD_LIMIT_IN_RANGES = 10.0
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
 _MAX_SATURATED_READING_IN_RANGES = 1.5
@@ -91,7 +91,7 @@ class WristSensorConfig:
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "accelerometer axes by rows"
     )
 
-    low_pass: str = choice("after_converter", _LOW_PASS_CHOICES, "low-pass position in the chain")
+    low_pass: str = choice("after_converter", _LOW_PASS_POSITIONS, "low-pass position in the chain")
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
     force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white noise of raw samples, 1 sigma")
@@ -178,7 +178,7 @@ class WristSensorConfig:
     def check(self, where: str, rate_hz: float) -> None:
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
-        if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
+        if error > _MAX_ORTHOGONALITY_ERROR_OF_R_SA or np.linalg.det(R_SA) < 0:
             what = "is not a rotation: its rows must be orthogonal unit vectors with determinant +1"
             remedy = "give nine numbers row by row; its columns are the axes of A in S"
             raise DrakeTeleopError(what, where=f"{where}.R_SA", remedy=remedy)
@@ -273,13 +273,13 @@ READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 #: Constants of the chain: those up to `range` are of 12 channels, and `offset` may change in a run.
 #: Calibrations: (6, 6) of the wrench, (2, 3, 3) of s and alpha from S into A; low-pass: (2, 5).
-_LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
+_LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_POSITIONS
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
 _RANDOM_WALK_START = 1
-FILTER_MEMORY_START = _RANDOM_WALK_START + _NUM_CHANNELS
-_DELAY_LINE_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_CHANNELS
-_DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
+FILTER_MEMORY_START = _RANDOM_WALK_START + _NUM_NOISY_CHANNELS
+_DELAY_LINE_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_NOISY_CHANNELS
+_DELAY_LINE_ROW_SIZE = _NUM_NOISY_CHANNELS + 2
 
 
 def initialize_sensor_chain(
@@ -292,7 +292,7 @@ def initialize_sensor_chain(
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
     ranges = config.ranges()
-    limits = ranges if config.saturates else np.full(_NUM_CHANNELS, np.inf)
+    limits = ranges if config.saturates else np.full(_NUM_NOISY_CHANNELS, np.inf)
     sections = np.zeros((_NUM_LOW_PASS_SECTIONS, 5))
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
@@ -310,7 +310,7 @@ def initialize_sensor_chain(
         motion_calibration=[force @ R_SA.T, angular @ R_SA.T],
         accelerometer_position=p_SoAo_S,
         low_pass=sections,
-        low_pass_stage=_LOW_PASS_CHOICES.index(config.low_pass),
+        low_pass_stage=_LOW_PASS_POSITIONS.index(config.low_pass),
         latency_samples=latencies,
         encoder_quantum=config.encoder_resolution,
         is_ideal=config.ideal,
@@ -356,13 +356,13 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     count = int(memory[0])
     line = memory[_DELAY_LINE_START:].reshape((-1, _DELAY_LINE_ROW_SIZE + angles.shape[0]))
     shift_delay_line(line)
-    row, channels = line[0], line[0, :_NUM_CHANNELS]
+    row, channels = line[0], line[0, :_NUM_NOISY_CHANNELS]
     walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
     filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
     sections, place = constants.low_pass[:], constants.low_pass_stage
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
-        step = noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
-        for i in range(_NUM_CHANNELS):
+        step = noise[_NUM_NOISY_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
+        for i in range(_NUM_NOISY_CHANNELS):
             walks[i] += constants.walk_step_std[i] * step[i]
 
     _apply_calibration_errors(constants, truth, channels)
@@ -370,15 +370,15 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         if count == 0:
             settle_low_pass(sections, filtered, channels)
         low_pass_in_place(sections, filtered, channels)
-    for i in range(_NUM_CHANNELS):
+    for i in range(_NUM_NOISY_CHANNELS):
         channels[i] += constants.offset[i] + count * constants.drift_per_sample[i]
     if place == _LOW_PASS_AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
-    first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
-    for i in range(_NUM_CHANNELS):
+    first = _NUM_NOISY_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
+    for i in range(_NUM_NOISY_CHANNELS):
         channels[i] += constants.noise_std[i] * noise[first + i] + walks[i]
-    row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
-    row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
+    row[_NUM_NOISY_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
+    row[_NUM_NOISY_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
     quantum, turned = constants.encoder_quantum, row[_DELAY_LINE_ROW_SIZE:]
@@ -392,7 +392,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     force, acceleration = line[int(late[0])], line[int(late[1])]
     copy_into(reading, READ_WRENCH.start, force, 0, 6)
     copy_into(reading, READ_ACCELERATION.start, acceleration, 6, 6)
-    reading[READ_SATURATED] = max(force[_NUM_CHANNELS], acceleration[_NUM_CHANNELS + 1])
+    reading[READ_SATURATED] = max(force[_NUM_NOISY_CHANNELS], acceleration[_NUM_NOISY_CHANNELS + 1])
     encoders = line[int(late[2])]
     copy_into(reading, READ_ANGLES.start, encoders, _DELAY_LINE_ROW_SIZE, angles.shape[0])
 
