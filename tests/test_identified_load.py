@@ -122,7 +122,7 @@ def test_edited_sources_or_models_change_the_cache_key(identifications, tmp_path
     hashes.append(module._hash_source_files(package, models))
     assert len(set(hashes)) == 4
     for each in hashes:
-        monkeypatch.setattr(module, "_SOURCES_HASH", each)
+        monkeypatch.setattr(module, "_SOURCE_FILES_HASH", each)
         identified_load(Scenario())
     assert len(identifications) == 4
 

@@ -118,7 +118,7 @@ def test_joint_margin_counts_more_than_cube_size():
         best._replace(cube_half_m=0.03, joint_margin=0.9),
         best._replace(cube_half_m=0.0, joint_margin=0.0),
     ]
-    assert max([*worse, best], key=place._merit_of_start_place) is best
+    assert max([*worse, best], key=place._start_place_sort_key) is best
 
 
 def turned(rpy, tmp_path):

@@ -44,14 +44,14 @@ def test_motion_is_designed_once_for_all_seeds_and_again_for_another_sensor(monk
         found = FourierTrajectory(np.zeros(6), *np.full((2, 6, 3), len(designs)), 1 / period)
         return SimpleNamespace(trajectory=found)
 
-    monkeypatch.setattr(identification, "_TRAJECTORIES_AND_KAPPAS", {})
+    monkeypatch.setattr(identification, "_EXCITATION_BY_INPUT_HASH", {})
     monkeypatch.setattr(identification, "excite", excite)
     monkeypatch.setattr(identification, "RobotFromScenario", lambda scenario: None)
     monkeypatch.setattr(identification, "criterion_values", lambda *_: {"kappa_w10": 4.0})
 
     def designed(**changes) -> float:
         scenario = replace(LoadScenario("identification"), **changes)
-        trajectory, _ = identification._trajectory_and_kappa(scenario, lambda _: None)
+        trajectory, _ = identification._get_or_design_motion(scenario, lambda _: None)
         trajectory.rho[1:] = 99.0  # callers may change their copy
         return trajectory.rho[0, 0]
 

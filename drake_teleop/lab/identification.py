@@ -41,7 +41,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeIdentificationStation
 
 #: Designed trajectory and its criterion kappa_w10, by a hash of all inputs of the design.
-_TRAJECTORIES_AND_KAPPAS: dict[str, tuple[FourierTrajectory, float]] = {}
+_EXCITATION_BY_INPUT_HASH: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -147,10 +147,10 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _trajectory_and_kappa(scenario, stage)
+            trajectory, kappa = _get_or_design_motion(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
-            _check_trajectory(robot, trajectory, simulation.duration)
+            _check_given_trajectory(robot, trajectory, simulation.duration)
             kappa = criterion_values(robot, trajectory)["kappa_w10"]
         station = MakeIdentificationStation(scenario, trajectory)
         update = stage("Identify the load")
@@ -186,19 +186,19 @@ def identify_by_batch(
     return identify_batch(wrench, s, omega, alpha, method="total", noise=noise).identification
 
 
-def _trajectory_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
+def _get_or_design_motion(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
     # The environment's files may change.
-    if key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment:
+    if key not in _EXCITATION_BY_INPUT_HASH or scenario.environment:
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, progress=stage).trajectory
-        _TRAJECTORIES_AND_KAPPAS[key] = found, criterion_values(robot, found)["kappa_w10"]
-    return copy.deepcopy(_TRAJECTORIES_AND_KAPPAS[key])
+        _EXCITATION_BY_INPUT_HASH[key] = found, criterion_values(robot, found)["kappa_w10"]
+    return copy.deepcopy(_EXCITATION_BY_INPUT_HASH[key])
 
 
-def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
+def _check_given_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         what = f"has {len(trajectory.q0)} joints, but the arm has {robot.arm.num_joints}"
         raise DrakeTeleopError(what, where="trajectory", remedy="compute a trajectory for this arm")

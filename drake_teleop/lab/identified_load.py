@@ -62,7 +62,7 @@ def identified_load(
     # Another seed: noise of identification and run must be independent.
     before = identification_scenario(scenario, scenario.simulation.seed + 1)
     detects = scenario.contact_detection is not None
-    path = (folder or cache_folder()) / f"load-{_cache_key(before, detects)}.npz"
+    path = (folder or cache_folder()) / f"load-{_identified_load_cache_key(before, detects)}.npz"
     # A registered estimator may have changed since.
     fresh = fresh or before.load_estimator.method not in METHODS.shipped
     if not fresh and (cached := read_cached_load(path)) is not None:
@@ -89,14 +89,14 @@ def _hash_source_files(package: Path, models: Path) -> str:
 
 
 # Hashed at import: the sources may be edited while this process runs the old ones.
-_SOURCES_HASH = _hash_source_files(Path(__file__).parents[1], models_dir())
+_SOURCE_FILES_HASH = _hash_source_files(Path(__file__).parents[1], models_dir())
 
 
-def _cache_key(identification: Scenario, with_noise_floor: bool) -> str:
+def _identified_load_cache_key(identification: Scenario, with_noise_floor: bool) -> str:
     from llvmlite.binding import get_host_cpu_name
 
     computed_by = [f"{name} {version(name)}" for name in ("drake", "numpy", "scipy", "numba")]
-    computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
+    computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCE_FILES_HASH]
     models = [sha256(path.read_bytes()).hexdigest() for path in identification.slave.model_files()]
     what = (__version__, dataclasses.asdict(identification), with_noise_floor, computed_by, models)
     return sha256(repr(what).encode()).hexdigest()

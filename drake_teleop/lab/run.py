@@ -136,7 +136,7 @@ def _run_into_folder(
     write_scenario(scenario_file, setup)
     try:
         if drive is not None:
-            return _repeat_drive(drive, stage, log)
+            return _repeat_recorded_drive(drive, stage, log)
         return run_scenario(setup, stage, log, fresh=fresh)
     except BaseException as error:
         if log.is_dir() and not any(log.iterdir()):
@@ -184,7 +184,7 @@ def run_scenario(
     return ScenarioRun(scenario, result, identification, source, factor)
 
 
-def _repeat_drive(drive: RecordedDrive, progress: StartStage, log: Path) -> ScenarioRun:
+def _repeat_recorded_drive(drive: RecordedDrive, progress: StartStage, log: Path) -> ScenarioRun:
     start = time.perf_counter()
     result = drive.repeat(progress("Repeat the drive"), log)
     factor = drive.scenario.simulation.duration / (time.perf_counter() - start)
@@ -266,17 +266,17 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "seed": run.scenario.simulation.seed,
         "duration_s": round(float(result.t[-1]), 6),
         "samples": len(result.t),
-        **_named_peak_norms("peak_measured", "", measured),
-        **_named_peak_norms("peak_contact", "", calculated),
-        **_named_peak_norms("residual", "_max", calculated[free]),
+        **_peak_force_torque_by_name("peak_measured", "", measured),
+        **_peak_force_torque_by_name("peak_contact", "", calculated),
+        **_peak_force_torque_by_name("residual", "_max", calculated[free]),
         "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
-        "joint_speed_use": _largest_limit_use(result["slave_state"][:, n:], arm.velocity_limit),
-        "joint_torque_use": _largest_limit_use(result["joint_torque"], arm.effort_limit),
+        "joint_speed_use": _max_ratio_to_limit(result["slave_state"][:, n:], arm.velocity_limit),
+        "joint_torque_use": _max_ratio_to_limit(result["joint_torque"], arm.effort_limit),
         "mass_error_percent": 100 * abs(mass / true_mass - 1),
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
     }
     if "force_to_master" in result:
-        summary |= _named_peak_norms("peak", "_to_master", result["force_to_master"])
+        summary |= _peak_force_torque_by_name("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_delays(result, contact_spans(result.t, contact))
     slave, surroundings = run.scenario.slave, run.scenario.surroundings
@@ -331,7 +331,7 @@ def _moving_body_displacements(result: SimulationResult) -> dict[str, dict[str, 
     return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 
 
-def _named_peak_norms(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
+def _peak_force_torque_by_name(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
     names = (f"{prefix}_force{suffix}_N", f"{prefix}_torque{suffix}_Nm")
     if not len(wrench):
         return dict.fromkeys(names)
@@ -352,5 +352,5 @@ def _mass_and_com(phi: Array) -> tuple[float, Array]:
     return float(phi[0]), phi[1:4] / phi[0]
 
 
-def _largest_limit_use(values: Array, limit: Array) -> float:
+def _max_ratio_to_limit(values: Array, limit: Array) -> float:
     return float(np.max(np.abs(values) / limit))

@@ -19,9 +19,9 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 #: Contact force at the slave that the page shows as contact [N]; noise and motion remain below.
 MIN_CONTACT_FORCE_N = 2.0
-_WARNED_LIMIT_FRACTION = 0.999
-_WARNED_HAND_FORCE_N = 59.0  # N; the limit of a hand is 60 N
-_WARNED_PACKET_SILENCE_S = 0.05  # s
+_WARNING_LIMIT_SHARE = 0.999
+_WARNING_HAND_FORCE_N = 59.0  # N; the limit of a hand is 60 N
+_WARNING_PACKET_SILENCE_S = 0.05  # s
 
 
 @njit(cache=True)
@@ -61,8 +61,8 @@ class PageValueCalculator:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints
         self._limits = (
-            ("speed", "slave_state", slice(n, None), _WARNED_LIMIT_FRACTION * arm.velocity_limit),
-            ("torque", "joint_torque", slice(None), _WARNED_LIMIT_FRACTION * arm.effort_limit),
+            ("speed", "slave_state", slice(n, None), _WARNING_LIMIT_SHARE * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _WARNING_LIMIT_SHARE * arm.effort_limit),
         )
         self._peak_force = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
@@ -86,16 +86,16 @@ class PageValueCalculator:
             self._table, t, states, contact_S, hand, twist, self._last_row, self._energy
         )
         return {
-            "f": [_rounded_or_zero(pair, 4) for pair in self._forces],
+            "f": [_round_or_zero_if_not_finite(pair, 4) for pair in self._forces],
             "contact": bool(touches),
-            "energy": _rounded_or_zero(self._energy, 5),
-            "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
+            "energy": _round_or_zero_if_not_finite(self._energy, 5),
+            "words": list(dict.fromkeys(self._warning_texts(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
-            "tool": _rounded_or_zero(self._last_row[1:], 5),
-            "stylus": _rounded_or_zero(rows["pose_master"][-1, 4:], 5),
+            "tool": _round_or_zero_if_not_finite(self._last_row[1:], 5),
+            "stylus": _round_or_zero_if_not_finite(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
+    def _warning_texts(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -104,22 +104,22 @@ class PageValueCalculator:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak_force:
+        if self._forces[2, 1] >= _WARNING_LIMIT_SHARE * self._peak_force:
             yield f"the device renders its largest force, {self._peak_force:g} N"
         hand = np.empty(2)
         norm_range_into(rows["hand_wrench_E"], zeros, hand)
-        if hand[1] > _WARNED_HAND_FORCE_N:
+        if hand[1] > _WARNING_HAND_FORCE_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:
             at_limit = (np.abs(rows[name][:, part]) >= limits).any(axis=0)
             if at_limit.any():
                 joints = [str(k + 1) for k in np.flatnonzero(at_limit)]
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
-        if "ports" in rows and rows["ports"][:, 4:6].max() > _WARNED_PACKET_SILENCE_S:
+        if "ports" in rows and rows["ports"][:, 4:6].max() > _WARNING_PACKET_SILENCE_S:
             yield "the network delivers no packets"
         if any(abs(getattr(inputs, name)) == INPUT_RANGES[name][1] for name in ("x", "y", "z")):
             yield "the hand is at the edge of its box, 0.3 m wide"
 
 
-def _rounded_or_zero(values: Array, digits: int) -> list[float]:
+def _round_or_zero_if_not_finite(values: Array, digits: int) -> list[float]:
     return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

@@ -85,7 +85,7 @@ class DeviceClient:
         commanded = (0.0,) * 6 if command is None else command.wrench
         wrench = self.guard.limit_wrench(pose.position, commanded, age, period)
         self._device.set_wrench(wrench)
-        self._send_pose(pose, now, age)
+        self._send_state(pose, now, age)
         return wrench
 
     def _receive_force_commands(self) -> None:
@@ -102,9 +102,9 @@ class DeviceClient:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send_pose(self, pose: device_packets.DeviceState, now: float, age: float) -> None:
+    def _send_state(self, pose: device_packets.DeviceState, now: float, force_age: float) -> None:
         self._number += 1
-        behind = age if age < 1.0 else 0.0
+        behind = force_age if force_age < 1.0 else 0.0
         if behind:
             self.force_ages_s.append(behind)
         state = pose._replace(number=self._number, t=now, behind=behind)

@@ -17,7 +17,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
-_FORCE_FADE_START_S = 0.02  # s
+_FORCE_FADE_START_AGE_S = 0.02  # s
 _FORCE_RISE_N_S = 100.0  # N/s, of the force limit after silence
 _MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
@@ -62,7 +62,7 @@ class DeviceGuard:
         next_motion = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._allowed_force_fraction(age, period)
+        share = self._update_force_limit_and_find_fade(age, period)
         force, torque = _zeros_if_any_not_finite(wrench[:3]), _zeros_if_any_not_finite(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -72,7 +72,7 @@ class DeviceGuard:
         if share == 0.0:  # the timeout overrides the slew limit
             force, torque = np.zeros((2, 3))
         elif self._observe:
-            force = _limit_norm(self._limit_returned_energy(force, next_motion), limits.force)
+            force = _limit_norm(self._limit_force_by_energy(force, next_motion), limits.force)
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
@@ -81,16 +81,16 @@ class DeviceGuard:
         self._force, self._torque, self._velocity = np.zeros((3, 3))
         self._position = None
 
-    def _allowed_force_fraction(self, age: float, period: float) -> float:
+    def _update_force_limit_and_find_fade(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
         self._force_limit = min(self._force_limit + _FORCE_RISE_N_S * period, self._limits.force)
-        share = (COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_S)
+        share = (COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_AGE_S)
         return min(max(share, 0.0), 1.0) if age < COMMAND_TIMEOUT_S else 0.0
 
-    def _limit_returned_energy(self, force: Array, next_motion: Array) -> Array:
+    def _limit_force_by_energy(self, force: Array, next_motion: Array) -> Array:
         distance, available = math.hypot(*next_motion), self._stored_energy - _STORED_ENERGY_KEPT_J
         returned = float(force @ next_motion)
         if returned <= available or distance < 1e-12 or not force.any():

@@ -26,11 +26,11 @@ from drake_teleop.live.device_packets import (
 from drake_teleop.live.inputs import inputs_at_displacement
 from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
-_CLIENT_END_TIMEOUT_S = 2.0  # s
+_CLIENT_EXIT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
-_LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
+_NUM_PACKETS_OF_LINK_STATISTICS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_AFTER_START_S = 0.05
+_CLUTCH_OPEN_AT_CONNECT_S = 0.05
 
 
 class DeviceLink:
@@ -64,8 +64,8 @@ class DeviceLink:
         self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
         # Arrival minus the device's time; the minimum is the clock offset.
-        self._latencies: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
-        self._force_ages: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
+        self._latencies: deque[float] = deque(maxlen=_NUM_PACKETS_OF_LINK_STATISTICS)
+        self._force_ages: deque[float] = deque(maxlen=_NUM_PACKETS_OF_LINK_STATISTICS)
         self._client: subprocess.Popen[bytes] | None = None
         if kind == "haply":
             station = f"udp://{LOCALHOST}:{self.port}"
@@ -128,7 +128,7 @@ class DeviceLink:
         moved = np.subtract(state.position, first.position)
         back = conjugate_quaternion(first.quaternion_wxyz)
         values = inputs_at_displacement(moved, quaternion_product(state.quaternion_wxyz, back))
-        if state.flags & CLUTCH_OPEN_FLAG or now - self._connected_at < _CLUTCH_OPEN_AFTER_START_S:
+        if state.flags & CLUTCH_OPEN_FLAG or now - self._connected_at < _CLUTCH_OPEN_AT_CONNECT_S:
             values["clutch"] = 0
         return values
 
@@ -138,7 +138,7 @@ class DeviceLink:
         behind = np.array(self._force_ages or [0.0])
         elapsed = np.inf
         if len(self._latencies) > 1:
-            elapsed = min(now - self._connected_at, 1e-3 * _LINK_STATISTICS_PACKETS)
+            elapsed = min(now - self._connected_at, 1e-3 * _NUM_PACKETS_OF_LINK_STATISTICS)
         return {
             "rate_hz": float(len(late) / max(elapsed, 1e-3)),
             "late_p99_ms": float(1e3 * (np.percentile(late, 99) - late.min())),
@@ -149,11 +149,11 @@ class DeviceLink:
 
     def status_text(self) -> str:
         if not self.refused:
-            return self._link_text()
+            return self._describe_link()
         reason = f"the last one {self.refusal}"
-        return f"{self._link_text()}. Refused packets: {self.refused}; {reason}"
+        return f"{self._describe_link()}. Refused packets: {self.refused}; {reason}"
 
-    def _link_text(self) -> str:
+    def _describe_link(self) -> str:
         now = self._polled_at
         if self.is_device_silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"
@@ -173,7 +173,7 @@ class DeviceLink:
             return
         self._client.terminate()
         try:
-            self._client.wait(_CLIENT_END_TIMEOUT_S)
+            self._client.wait(_CLIENT_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._client.kill()
             self._client.wait()

@@ -27,7 +27,7 @@ from drake_teleop.lab.excitation.limits import (
 from drake_teleop.lab.excitation.optimizer import DesignProblem, _DescentSearch
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
-    _motion_error_polynomials,
+    _motion_error_transfer_function,
     predicted_deviations,
 )
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -111,7 +111,7 @@ def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
     for gains in fusion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _motion_error_polynomials(gains, T)
+        numerator, denominator = _motion_error_transfer_function(gains, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
@@ -268,7 +268,7 @@ def test_improving_iterates_are_recorded_with_start_and_evaluations():
     search = _DescentSearch(problem, 9, None, lambda *_: None)
     search.start = 7
     for k in range(4):
-        search._evaluate_once(np.array([float(k)]), 3.0, 5.0)
+        search._evaluate_or_reuse_last(np.array([float(k)]), 3.0, 5.0)
     noted = [
         (x.num_evaluations, x.start_index, x.criterion_value, x.trajectory) for x in search.found
     ]

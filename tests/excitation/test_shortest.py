@@ -94,6 +94,6 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
 
 
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MAX_ROUNDS_WITHOUT_MOTION", 1)
+    monkeypatch.setattr(module, "_MAX_INFEASIBLE_ROUNDS", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
         design_shortest_motion(slave, parse_tolerance("inertia 0.00001 %"), starts=1)

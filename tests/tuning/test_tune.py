@@ -361,8 +361,8 @@ def test_settings_change_method_scales_and_filter_alone():
 def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "CANDIDATE_METHODS", ("ledger", "wave"))
     monkeypatch.setattr(search, "CANDIDATE_SIGMAS", (0.0,))
-    monkeypatch.setattr(search, "_LOW_PASSES_HZ", ())
-    monkeypatch.setattr(search, "_MAX_UNSTABLE_TO_STABLE_GAMMA_RATIO", 2.0)
+    monkeypatch.setattr(search, "_CANDIDATE_LOW_PASS_CUTOFFS_HZ", ())
+    monkeypatch.setattr(search, "_GAMMA_RATIO_AT_BISECTION_END", 2.0)
     arguments = {"hands": ["medium"], "walls": [1.0], "network": "lan", "jobs": 1}
     summary = tune("touch", tmp_path, progress=False, **arguments)
     tuned = LoadScenario(tmp_path / "tuned.yaml")

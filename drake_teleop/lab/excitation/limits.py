@@ -296,13 +296,13 @@ def capsule_distances(motions, capsule_links, capsule_ends, capsule_radius, caps
 
 
 @njit(cache=True)
-def _transform_capsules_to_world(motions, rows, ends, placed):
-    for k in range(len(rows)):
+def _transform_capsules_to_world(motions, links, ends_L, ends_W):
+    for k in range(len(links)):
         for e in range(2):
-            p = vector_at(ends[k, e], 0)
-            if rows[k] >= 0:
-                p = _point_in_world(motions[rows[k]], p)
-            placed[k, e, 0], placed[k, e, 1], placed[k, e, 2] = p
+            p = vector_at(ends_L[k, e], 0)
+            if links[k] >= 0:
+                p = _point_in_world(motions[links[k]], p)
+            ends_W[k, e, 0], ends_W[k, e, 1], ends_W[k, e, 2] = p
 
 
 @register_jitable

@@ -28,7 +28,7 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
     q = trajectory.evaluate(times)[0]
     root = robot.scene.diagram.CreateDefaultContext()
     context = robot.scene.plant.GetMyMutableContextFromRoot(root)
-    poses = [_link_poses(robot, context, posture) for posture in q]
+    poses = [_set_posture_and_get_poses_W(robot, context, posture) for posture in q]
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
     motion = trajectory_sensor_motion(robot, trajectory)
@@ -61,7 +61,7 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
     replay.write(path, make_scene)
 
 
-def _link_poses(
+def _set_posture_and_get_poses_W(
     robot: Robot, context: Context, posture: Array
 ) -> tuple[dict[BodyIndex, RigidTransform], RigidTransform]:
     plant = robot.scene.plant

@@ -21,8 +21,8 @@ from drake_teleop.load.trajectory import FourierTrajectory
 Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 
-_SAMPLES_PER_PERIOD_AND_HARMONIC = 24
-_RANDOM_MOTION_LIMIT_SHARE = 0.35  # random motions' share of speed and acceleration limits
+_SAMPLES_PER_PERIOD_OF_TOP_HARMONIC = 24
+_JOINT_LIMIT_SHARE_OF_RANDOM_MOTION = 0.35  # of speed and acceleration limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class DesignProblem:
     ) -> None:
         self._criterion, self._period_s, self._num_harmonics = criterion, period_s, num_harmonics
         self._table, self._limits, self._home = robot.arm.table, robot.limits, robot.home_posture
-        free, samples = 2 * (num_harmonics - 1), _SAMPLES_PER_PERIOD_AND_HARMONIC * num_harmonics
+        free, samples = 2 * (num_harmonics - 1), _SAMPLES_PER_PERIOD_OF_TOP_HARMONIC * num_harmonics
         sine, cosine = np.hsplit(np.eye(free), 2)
         basis = FourierTrajectory.rest_to_rest(np.zeros(free), sine, cosine, 1 / period_s)
         #: (3, T, free): q, qd, qdd of unit coefficients.
@@ -70,7 +70,7 @@ class DesignProblem:
         bounds, harmonics = self._limits, self._num_harmonics
         rate = 2 * np.pi / self._period_s * np.sqrt(harmonics)
         size = np.minimum(bounds.velocity / rate, bounds.acceleration / rate**2)
-        amplitude = _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, bounds.q_half)
+        amplitude = _JOINT_LIMIT_SHARE_OF_RANDOM_MOTION * np.minimum(size, bounds.q_half)
         spread = np.tile(np.repeat(amplitude, harmonics - 1), 2)
         q0 = self._home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
@@ -86,8 +86,8 @@ class DesignProblem:
         q_qd_qdd, g = self._evaluate_motion(x), self._gradients
         s, omega, alpha = self._vectors
         value, g_V = self._criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        smooth, largest = self._write_gradients(q_qd_qdd, g_V, limit_sharpness, g)
-        return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
+        smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g)
+        return Evaluation(value, smooth, self._gradients_by_coefficients(), largest)
 
     def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
         # q, qd, qdd (3, T, n); also writes the motions of links and sensor.
@@ -100,7 +100,7 @@ class DesignProblem:
         self._vectors = limits.sensor_motion_series(self._motions)
         return q_qd_qdd
 
-    def _write_gradients(
+    def _write_joint_gradients(
         self, q_qd_qdd: Array, g_V: Array, sharpness: float, gradients: Array
     ) -> tuple[Array, float]:
         # Gradients (8, 3, T, n) of a function of V and of uses; returns smooth and largest uses.
@@ -116,7 +116,7 @@ class DesignProblem:
         s, omega, alpha = self._vectors
         return self._criterion.value(s, omega, alpha, self._period_s)
 
-    def _gradients_by_unknowns(self) -> Array:
+    def _gradients_by_coefficients(self) -> Array:
         g = self._gradients
         by_q0 = g[:, 0].sum(axis=1)
         # (8, free, n), summed over position, velocity, acceleration and time.
@@ -133,14 +133,14 @@ _MAX_LIMIT_USE_OF_FEASIBLE_MOTION = 0.9885  # on the grid
 # Number of candidates in a batch, and number of them from which a descent starts.
 _START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
-_LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
+_LBFGS_SETTINGS_BY_STAGE = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
-_SLSQP_STAGES = ((12.0, 200.0, 80), (40.0, 400.0, 120))
+_SLSQP_SETTINGS_BY_STAGE = ((12.0, 200.0, 80), (40.0, 400.0, 120))
 # A start ends without a feasible iterate after so many evaluations, or after the first stage of
 # SLSQP outside this factor of the best.
 _MAX_INFEASIBLE_EVALUATIONS, _MAX_CRITERION_RATIO_TO_BEST = 250, 1.08
 # A bounded descent is repeated while it improves the criterion by this factor.
-_MAX_CRITERION_RATIO_FOR_REPEAT = 0.995
+_MAX_CRITERION_RATIO_TO_REPEAT_DESCENT = 0.995
 
 
 @dataclass(frozen=True)
@@ -212,8 +212,8 @@ class _DescentSearch:
             batch = [self._problem.candidate(rng, near_home=near) for near in sides]
             merit = []
             for x in batch:
-                self._count_evaluation()
-                point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
+                self._count_evaluation_and_check_time()
+                point = self._problem.evaluate(x, *_LBFGS_SETTINGS_BY_STAGE[0][:2])
                 merit.append(point.log_criterion + 10 * max(point.smooth_limit_uses.max() - 1, 0))
             for k in np.argsort(merit)[:_NUM_DESCENT_STARTS]:
                 yield batch[k]
@@ -221,25 +221,25 @@ class _DescentSearch:
     def descend_from(self, x: Array) -> None:
         self._evaluations, self._best_of_start = 0, float("inf")
         penalised = self._penalised_value_and_gradient
-        for *sharpness_and_weight, iterations in _LBFGS_STAGES:
+        for *sharpness_and_weight, iterations in _LBFGS_SETTINGS_BY_STAGE:
             given, options = tuple(sharpness_and_weight), {"maxiter": iterations}
             x = self._minimize(penalised, x, given, "L-BFGS-B", jac=True, options=options).x
         is_bounded = self._problem.bounds(x) is not None
-        for k, stage in enumerate(_SLSQP_STAGES):
+        for k, stage in enumerate(_SLSQP_SETTINGS_BY_STAGE):
             hopeless = self._best_of_start > _MAX_CRITERION_RATIO_TO_BEST * self._best
             if k > 0 and hopeless and not is_bounded:
                 return
             x = self._run_slsqp(x, *stage)
         before = float("inf")
-        while is_bounded and self._best_of_start < _MAX_CRITERION_RATIO_FOR_REPEAT * before:
+        while is_bounded and self._best_of_start < _MAX_CRITERION_RATIO_TO_REPEAT_DESCENT * before:
             before = self._best_of_start
-            x = self._run_slsqp(x, *_SLSQP_STAGES[-1])
+            x = self._run_slsqp(x, *_SLSQP_SETTINGS_BY_STAGE[-1])
 
     def _run_slsqp(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, iterations: int
     ) -> Array:
         def evaluate(x: Array) -> Evaluation:
-            return self._evaluate_once(x, criterion_sharpness, limit_sharpness)
+            return self._evaluate_or_reuse_last(x, criterion_sharpness, limit_sharpness)
 
         return self._minimize(
             lambda x: evaluate(x).log_criterion,
@@ -258,26 +258,26 @@ class _DescentSearch:
     def _penalised_value_and_gradient(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
-        point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
+        point = self._evaluate_or_reuse_last(x, criterion_sharpness, limit_sharpness)
         excess = np.maximum(point.smooth_limit_uses - USABLE_LIMIT_SHARE, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
-    def _evaluate_once(
+    def _evaluate_or_reuse_last(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float
     ) -> Evaluation:
         key = np.array([*x, criterion_sharpness, limit_sharpness]).tobytes()
         if key != self._key:
-            self._count_evaluation()
+            self._count_evaluation_and_check_time()
             self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
             self._key = key
             if self._last.largest_limit_use <= _MAX_LIMIT_USE_OF_FEASIBLE_MOTION:
-                self._record_iterate(x)
+                self._record_iterate_if_improved(x)
             elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and np.isinf(self._best_of_start):
                 raise _InfeasibleStartError
         return self._last
 
-    def _record_iterate(self, x: Array) -> None:
+    def _record_iterate_if_improved(self, x: Array) -> None:
         value = self._problem.value()
         if value < self._best_of_start:
             self._best_of_start = value
@@ -287,7 +287,7 @@ class _DescentSearch:
             counts = self._all_evaluations, self.start
             self.found.append(FeasibleIterate(seconds, *counts, value, trajectory))
 
-    def _count_evaluation(self) -> None:
+    def _count_evaluation_and_check_time(self) -> None:
         self._evaluations += 1
         self._all_evaluations += 1
         done = self.start / self._starts

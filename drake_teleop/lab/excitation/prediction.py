@@ -46,7 +46,7 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = fusion_gains(estimation, sensor, num_joints, period_s)
-        polynomials = _motion_error_polynomials
+        polynomials = _motion_error_transfer_function
         filters = polynomials(linear, period_s), polynomials(angular, period_s)
     place = sensor.accelerometer_pose()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period_s, walk**2, place, filters)
@@ -92,7 +92,7 @@ def _covariance_from_noise_influence(influence: Array, variances: Array) -> Arra
     return rows.T @ rows
 
 
-def _motion_error_polynomials(gains: Array, period: float) -> tuple[Array, Array]:
+def _motion_error_transfer_function(gains: Array, period: float) -> tuple[Array, Array]:
     denominator = np.array([1.0, *(gains / period)])
     return denominator * [1.0, 1.0, 1.0, 0.0], denominator
 

@@ -29,13 +29,13 @@ from drake_teleop.station.slave.plant import (
 )
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random
+_NUM_COLLISION_TEST_POSTURES = 1000  # random
 # Usable share of joint limits; the rest is for tracking errors and feedback.
 _USABLE_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _USABLE_SENSOR_FORCE_SHARE, _USABLE_SENSOR_TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
-_HEAVIEST_LOAD_RATIO = 1.3
+_MAX_LOAD_OVER_MODELLED_LOAD = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
 _ASSUMED_PAYLOAD_COM_ALONG_Z_S_M, _ASSUMED_PAYLOAD_GYRATION_RADIUS_M = 0.08, 0.05
 _DEFAULT_PAYLOAD_KG = 2.0
@@ -43,7 +43,7 @@ _MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 
 # The station's wrist centre and ball tip, and their box in front of the arm and above the table.
 _TOOL_POINTS_IN_WORKSPACE_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
-_WORKSPACE_BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
+_WORKSPACE_BOX_CORNERS_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
 _SENSOR_ORIGIN_S, _UNLIMITED_BOX = np.zeros((1, 3)), (np.zeros(3), np.full(3, np.inf))
 
 
@@ -79,10 +79,10 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
-    reserve = (_HEAVIEST_LOAD_RATIO - 1) * slave.arm.phi_load
+    reserve = (_MAX_LOAD_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
     scene = CollisionScene(parse, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
-    lower, upper = np.array(_WORKSPACE_BOX_W)
+    lower, upper = np.array(_WORKSPACE_BOX_CORNERS_W)
     sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
     return _make_robot(
         scene,
@@ -123,7 +123,7 @@ def RobotFromModel(
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
-        reserve = (_HEAVIEST_LOAD_RATIO - 1) * load
+        reserve = (_MAX_LOAD_OVER_MODELLED_LOAD - 1) * load
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
@@ -161,7 +161,7 @@ def _make_robot(
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
-    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES_FOR_SHAPE_DISTANCES, len(half)))
+    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_COLLISION_TEST_POSTURES, len(half)))
     postures = middle + finite_half_ranges(half) * random
     candidates, touching = scene.find_collision_candidates_and_touching(postures, start)
     if touching:

@@ -35,17 +35,17 @@ PROBABILITY_ALL_WITHIN_TOLERANCE = 0.95
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
-_MAX_STEP_OF_PERIOD_LOGARITHM = 0.15
+_MAX_LOG_PERIOD_CHANGE = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
-_TOLERANCE_MARGIN_FACTOR_AFTER_MISS = 1.005  # after a round that missed the tolerance
-_MAX_ROUNDS_WITHOUT_MOTION = 3  # before the search fails
+_ERROR_FACTOR_GROWTH_AFTER_MISS = 1.005  # after a round that missed the tolerance
+_MAX_INFEASIBLE_ROUNDS = 3  # before the search fails
 # Largest error over tolerance of a motion that later rounds vary; number of such starts.
 _MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
-_SEED_STEP_BETWEEN_ROUNDS = 2**33
+_SEED_INCREMENT_PER_ROUND = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
 _MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
-_TOLERANCE_SHARPNESS_RATIO = 4.0  # sharpness of the tolerances' maximum over the criterion's
+_TOLERANCE_OVER_CRITERION_SHARPNESS = 4.0  # ratio of the maxima's sharpnesses
 _INFORMATION_REGULARISATION = 1e-11  # of balanced information, which is singular without motion
 
 
@@ -80,11 +80,11 @@ def design_shortest_motion(
         problem = ShortestMotionProblem(robot, harmonics, errors * factor[:, np.newaxis], around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
         found = optimizer.minimise_criterion(
-            problem, seed=seed + _SEED_STEP_BETWEEN_ROUNDS * k, starts=num_starts, progress=progress
+            problem, seed=seed + _SEED_INCREMENT_PER_ROUND * k, starts=num_starts, progress=progress
         )
         found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
         if not found:
-            if (rounds_without_motion := rounds_without_motion + 1) == _MAX_ROUNDS_WITHOUT_MOTION:
+            if (rounds_without_motion := rounds_without_motion + 1) == _MAX_INFEASIBLE_ROUNDS:
                 break
             around = None
             continue
@@ -108,7 +108,7 @@ def design_shortest_motion(
         last_factor, factor = factor, factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         if worst > 1.0 and k > 0:
-            factor = _TOLERANCE_MARGIN_FACTOR_AFTER_MISS * np.maximum(factor, last_factor)
+            factor = _ERROR_FACTOR_GROWTH_AFTER_MISS * np.maximum(factor, last_factor)
     if best is not None:
         return best
     what = "no motion within the limits reaches the tolerance"
@@ -163,7 +163,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
     def bounds(self, x: Array) -> optimizer.Bounds:
         """Return the bounds of the unknowns; only log T is bounded, about its value in x."""
-        ends = x[-1] + np.array([-_MAX_STEP_OF_PERIOD_LOGARITHM, _MAX_STEP_OF_PERIOD_LOGARITHM])
+        ends = x[-1] + np.array([-_MAX_LOG_PERIOD_CHANGE, _MAX_LOG_PERIOD_CHANGE])
         low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
@@ -176,16 +176,16 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         self._period = T = float(np.exp(log_period))
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[0] = 0.0
-        sharpness = _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
-        use, worst, g_V = self._largest_error_over_tolerance(sharpness)
-        smooth, largest = self._write_gradients(q_qd_qdd, g_V, limit_sharpness, g[1:])
+        sharpness = _TOLERANCE_OVER_CRITERION_SHARPNESS * criterion_sharpness
+        use, worst, g_V = self._max_error_ratio_with_gradient(sharpness)
+        smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g[1:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
         by_log_period[1] -= 0.25
         by_log_period[0] = 1.0
         g[:, 1] /= T
         g[:, 2] /= T**2
-        gradients = np.hstack([self._gradients_by_unknowns(), by_log_period[:, np.newaxis]])
+        gradients = np.hstack([self._gradients_by_coefficients(), by_log_period[:, np.newaxis]])
         return optimizer.Evaluation(
             float(x[-1]), np.append(use, smooth), gradients, max(worst, largest)
         )
@@ -220,7 +220,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _largest_error_over_tolerance(self, sharpness: float) -> tuple[float, float, Array]:
+    def _max_error_ratio_with_gradient(self, sharpness: float) -> tuple[float, float, Array]:
         rows = self._weighted_regressor_rows(*self._vectors)
         variances, v, u = self._variances_of_estimates(rows, self._period)
         logs = 0.5 * np.log(variances)

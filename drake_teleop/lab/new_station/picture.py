@@ -21,14 +21,14 @@ _BASE_COLOUR, _TOOL_COLOUR, _WALL_COLOUR = (0.36, 0.38, 0.42), (0.84, 0.37, 0.0)
 _WALL_THICKNESS_M = 0.1
 _LIGHT_DIRECTION = np.array([0.35, -0.5, 0.8])
 _VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from the tool
-_NUM_WALL_DIVISIONS = 8  # divisions of the wall in the picture
-_HULL_SAMPLE_DIRECTIONS = np.random.default_rng(0).normal(size=(250, 3))  # of extreme points
+_NUM_DRAWN_CELLS_PER_WALL_EDGE = 8  # divisions of the wall in the picture
+_EXTREME_POINT_SEARCH_DIRECTIONS = np.random.default_rng(0).normal(size=(250, 3))
 
 
 def draw_start_posture(plan: StationPlan, title: str) -> Figure:
     """Draw the station in its start posture, shapes as convex hulls."""
     shapes, wall = plan.posture_shapes, plan.wall
-    triangles, colours = _arm_triangles(shapes)
+    triangles, colours = _arm_triangles_and_colours(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shaded_colours(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
@@ -47,9 +47,9 @@ def draw_start_posture(plan: StationPlan, title: str) -> Figure:
             axes.add_collection3d(Poly3DCollection(surfaces, **paint))
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
             _draw_base_plane_grid(axes, lower, upper, plan.base_plane_height)
-            _draw_triad(axes, shapes, 0.12 * float(max(upper - lower)))
+            _draw_sensor_axes(axes, shapes, 0.12 * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
-            _fit_view(axes, lower, upper, plan.base_plane_height)
+            _set_equal_axis_limits(axes, lower, upper, plan.base_plane_height)
         gap = 1e3 * (plan.lowest_tool_point_W[2] - wall.position[2])
         plane = round(plan.base_plane_height, 3) + 0.0  # not -0
         caption = f"tool (orange) {gap:.0f} mm above the wall; base plane: z_W = {plane:g} m; "
@@ -61,7 +61,7 @@ def draw_start_posture(plan: StationPlan, title: str) -> Figure:
     return figure
 
 
-def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
+def _arm_triangles_and_colours(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
     anchored, rank = shapes.anchored_bodies(), 0
     triangles, colours = [], []
     for body in sorted(shapes.moving_bodies() | anchored, key=int):
@@ -80,8 +80,8 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
 
 
 def _hull_triangles(points: Array) -> Array:
-    if len(points) > len(_HULL_SAMPLE_DIRECTIONS):
-        points = points[np.unique((points @ _HULL_SAMPLE_DIRECTIONS.T).argmax(axis=0))]
+    if len(points) > len(_EXTREME_POINT_SEARCH_DIRECTIONS):
+        points = points[np.unique((points @ _EXTREME_POINT_SEARCH_DIRECTIONS.T).argmax(axis=0))]
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
@@ -93,14 +93,14 @@ def _hull_triangles(points: Array) -> Array:
     return np.asarray(triangles)
 
 
-def _box_triangles(top: Array, size: Array) -> Array:
+def _box_triangles(top_centre: Array, size: Array) -> Array:
     # Small triangles are better sorted by depth than large ones.
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
-    counts = [_NUM_WALL_DIVISIONS, _NUM_WALL_DIVISIONS, 2]
+    counts = [_NUM_DRAWN_CELLS_PER_WALL_EDGE, _NUM_DRAWN_CELLS_PER_WALL_EDGE, 2]
     cells = np.array(list(product(*map(range, counts)))) / counts
     unit = np.concatenate([_hull_triangles(cell + corners / counts) for cell in cells])
     is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
-    return top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
+    return top_centre + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
 
 
 def _shaded_colours(triangles: Array, colour: tuple[float, float, float]) -> Array:
@@ -119,14 +119,14 @@ def _draw_base_plane_grid(axes: Any, lower: Array, upper: Array, height: float) 
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
 
 
-def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:
+def _draw_sensor_axes(axes: Any, shapes: PostureShapes, length: float) -> None:
     X_WS = shapes.X_WS
     start, ends = X_WS.translation(), X_WS.translation() + length * X_WS.rotation().matrix().T
     for end, colour in zip(ends, (VERMILION, GREEN, BLUE), strict=True):
         axes.plot(*np.array([start, end]).T, color=colour, linewidth=2.0, zorder=10)
 
 
-def _fit_view(axes: Any, lower: Array, upper: Array, plane: float) -> None:
+def _set_equal_axis_limits(axes: Any, lower: Array, upper: Array, plane: float) -> None:
     lower = np.minimum(lower, [np.inf, np.inf, plane])
     middle, half = (lower + upper) / 2.0, 0.5 * float(max(upper - lower))
     for set_limits, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):

@@ -45,7 +45,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_warnings
 
 WALL_EDGES_M = (0.4, 0.25, 0.15)  #: edges of the walls that are tried, the first preferred
-_TRIAL_WALL_NAMES = {edge: f"wall of {edge:g} m" for edge in WALL_EDGES_M}
+_TRIAL_WALL_NAME_BY_EDGE_M = {edge: f"wall of {edge:g} m" for edge in WALL_EDGES_M}
 #: Rotation R_SA from each axis of S to z.
 TOOL_AXES = {
     "z": RotationMatrix(),
@@ -59,17 +59,17 @@ _CUBE_HALF_EDGES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of t
 # Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise; of
 # postures whose shapes are checked if all solved ones overlap.
 _NUM_SOLVED_POSTURES, _NUM_BEST_STARTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
-_MAX_SCORE_LOSS_FOR_LARGER_CUBE = 0.3  # largest disadvantage of a start with a larger cube
+_MAX_POSTURE_SCORE_LOSS_FOR_LARGER_CUBE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
-_MAX_ERROR_OVER_DISPLACEMENT = 0.1  # position error over displacement, below six dof
+_MAX_POSITION_ERROR_OVER_DISPLACEMENT = 0.1  # position error over displacement, below six dof
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
 _MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
 MIN_LOAD_SHARE_HELD_BY_MOTORS = 0.05  #: Share of the load that weak motors must hold at rest.
 _SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
-_MAX_JOINT_MOVE_TO_CORNER = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_MAX_JOINT_CHANGE_RAD_M = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
-_LOWEST_POINT_TOLERANCE_M = 1e-4  # points within this height of the lowest share the contact
+_HEIGHT_RANGE_OF_LOWEST_POINTS_M = 1e-4  # these points share the contact
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
 _MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
@@ -127,7 +127,7 @@ class TrialWalls(Environment):
         return 1e-3
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        for edge, name in _TRIAL_WALL_NAMES.items():
+        for edge, name in _TRIAL_WALL_NAME_BY_EDGE_M.items():
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
             AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
@@ -153,20 +153,20 @@ def find_start_place(
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     has_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6
     found = list[StartPlace]()
-    for rows in _order_postures_to_solve(pointed, postures, region, shapes):
-        solved = _solved_starts(pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, has_six_dof)
-        found += [_with_largest_wall(shapes, place, region) for place in solved]
+    for rows in _iter_posture_rows_by_score(pointed, postures, region, shapes):
+        solved = _solve_starts(pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, has_six_dof)
+        found += [_with_largest_fitting_wall(shapes, place, region) for place in solved]
         if not all(place.has_overlaps for place in found):
             break
     found.sort(key=lambda place: place.posture_score, reverse=True)
-    least_score = found[0].posture_score - _MAX_SCORE_LOSS_FOR_LARGER_CUBE if found else 0.0
+    least_score = found[0].posture_score - _MAX_POSTURE_SCORE_LOSS_FOR_LARGER_CUBE if found else 0.0
     good = [place for place in found if place.posture_score > least_score]
     best = None
     for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
         if best is None or best.cube_half_m == 0.0:
             tested = places[:_MAX_TESTED_CUBES]
             cubes = [_with_reachable_cube(pointed, each, has_six_dof, vertical) for each in tested]
-            best = max(cubes, key=_merit_of_start_place, default=None)
+            best = max(cubes, key=_start_place_sort_key, default=None)
     if best is None or best.cube_half_m == 0.0:
         causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
         what = (
@@ -180,7 +180,7 @@ def find_start_place(
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
-def _rows_away_from_limits(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+def _prefer_rows_away_from_limits(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
     roomy = least_joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
     for share in (1.0, MIN_LOAD_SHARE_HELD_BY_MOTORS):
@@ -192,13 +192,13 @@ def _rows_away_from_limits(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
-def _order_postures_to_solve(
+def _iter_posture_rows_by_score(
     arm: ArmModel, postures: Postures, region: StartRegion, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
     if not len(postures.q):
         return
     order = np.argsort(posture_scores(arm, postures, region))[::-1]
-    usable = order[np.isin(order, _rows_away_from_limits(arm, postures.q))]
+    usable = order[np.isin(order, _prefer_rows_away_from_limits(arm, postures.q))]
     yield usable
     if shapes is None:
         return
@@ -211,17 +211,17 @@ def _order_postures_to_solve(
         yield few[clear]
 
 
-def _solved_starts(
+def _solve_starts(
     arm: ArmModel, postures: Postures, region: StartRegion, has_six_dof: bool
 ) -> Iterator[StartPlace]:
     if has_six_dof:
         pairs = zip(postures.q, postures.p_WS, strict=True)
         solved = [s for q, p_WS in pairs for s in _starts_at_rounded_position(arm, q, p_WS)]
     else:  # position and orientation are coupled
-        solved = [s for k in range(len(postures.q)) for s in _coupled_starts(arm, postures, k)]
+        solved = [s for k in range(len(postures.q)) for s in _starts_below_6_dof(arm, postures, k)]
     if not solved:
         return
-    rows = _rows_away_from_limits(arm, np.array([q for q, _, _ in solved]))
+    rows = _prefer_rows_away_from_limits(arm, np.array([q for q, _, _ in solved]))
     solved = [solved[k] for k in rows]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), least_joint_margins(arm, exact.q)
@@ -230,7 +230,7 @@ def _solved_starts(
         yield StartPlace(pose, by_position, q, 0.0, float(room), float(merit))
 
 
-def _coupled_starts(arm: ArmModel, at: Postures, k: int) -> Iterator[tuple[Array, Array, bool]]:
+def _starts_below_6_dof(arm: ArmModel, at: Postures, k: int) -> Iterator[tuple[Array, Array, bool]]:
     # The posture, and that after the smallest rotation of its tool to downwards, if reachable.
     R_WA, q = at.R_WS[k], at.q[k]
     yield q, arm.pose(q), False
@@ -260,7 +260,7 @@ def _starts_at_rounded_position(
                 yield found, pose, False
 
 
-def _with_largest_wall(
+def _with_largest_fitting_wall(
     shapes: PostureShapes | None, place: StartPlace, region: StartRegion
 ) -> StartPlace:
     # Overlaps reduce the score; without `shapes` wall and score are unchanged.
@@ -269,7 +269,7 @@ def _with_largest_wall(
     shapes.move_to(place.q)
     p_WB = lowest_tool_point(shapes)
     p_WB[2] += (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0
-    walls = [shapes.plant.GetBodyByName(name) for name in _TRIAL_WALL_NAMES.values()]
+    walls = [shapes.plant.GetBodyByName(name) for name in _TRIAL_WALL_NAME_BY_EDGE_M.values()]
     for wall in walls:
         shapes.plant.SetFreeBodyPose(shapes.context, wall, RigidTransform(p_WB))
     depths = {wall.index(): 0.0 for wall in walls}
@@ -301,7 +301,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
     if not len(points):
         phi = shapes.arm.phi_load
         points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
-    lowest = points[points[:, 2] < points[:, 2].min() + _LOWEST_POINT_TOLERANCE_M]
+    lowest = points[points[:, 2] < points[:, 2].min() + _HEIGHT_RANGE_OF_LOWEST_POINTS_M]
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
@@ -319,7 +319,7 @@ def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], a
     return float(coordinates_along_axis(shapes, bodies, axis).max(initial=0.0))
 
 
-def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]:
+def _start_place_sort_key(place: StartPlace) -> tuple[float, float, bool, float]:
     enough_room = min(place.joint_margin, _SUFFICIENT_START_JOINT_MARGIN)
     enough_space = min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_EDGE_M)
     return enough_room, enough_space, place.is_set_by_position, place.cube_half_m
@@ -348,21 +348,21 @@ def _can_reach_corner(
     target = place.pose + np.append(np.zeros(4), displacement)
     q, status = find_posture(arm, target, place.q)
     if has_six_dof:
-        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_MOVE_TO_CORNER)
+        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_CHANGE_RAD_M)
     error = np.linalg.norm(arm.pose(q)[4:] - target[4:])
-    return bool(error < _MAX_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
+    return bool(error < _MAX_POSITION_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
 
 
 _MIN_COSINE_TOOL_TO_AXIS = 0.75  # smallest cosine of the angle between tool and axis
 _ROUNDING_TOLERANCE_M = 1e-9
-_MIN_NORM_OF_DIRECTION_M = 0.02  # below, the offset of a centre of mass has no direction
+_MIN_OFFSET_WITH_DIRECTION_M = 0.02  # below, the offset of a centre of mass has no direction
 
 
 def nearest_sensor_axis(direction: Array) -> str:
     """Return the axis of S nearest to a vector (3,) [m]; "" if it is short or between axes."""
     size = np.linalg.norm(direction)
     k = int(np.argmax(np.abs(direction)))
-    if size < _MIN_NORM_OF_DIRECTION_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
+    if size < _MIN_OFFSET_WITH_DIRECTION_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
         return ""
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 

@@ -20,14 +20,14 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
 from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 
-_PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08  # of the cube around the default start (E)
+_DEFAULT_MASTER_WORKSPACE_HALF_EDGE_M = 0.08  # of the cube around the default start (E)
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
-_STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
+_STAND_IN_TOOL_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_BALL_RADIUS_M = 0.05, 0.1, 0.012
-_STAND_IN_FREE_LENGTH_M = 0.05
-_STAND_IN_TOOL_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
+_FREE_ROD_LENGTH_M = 0.05
+_STAND_IN_MASS_AND_MOMENT = _STAND_IN_TOOL_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
 _SUFFICIENT_POSTURE_SCORE = 1.5  # of a start, at which no further substitute axis is tried
 _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
@@ -78,7 +78,7 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM_NAME,
 ) -> StationPlan:
-    stand_in = _stand_in_tool("z", _STAND_IN_LENGTH_M)
+    stand_in = _make_stand_in_tool("z", _STAND_IN_LENGTH_M)
     slave = Slave(
         model=str(arm),
         sensor_frame=sensor_frame,
@@ -86,7 +86,7 @@ def plan_station(
         tool=stand_in if tool is None else Tool(model=str(tool)),
     )
     shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
-    load = shapes.arm.phi_load[:4] - (_STAND_IN_TOOL_LOAD if tool is None else 0.0)
+    load = shapes.arm.phi_load[:4] - (_STAND_IN_MASS_AND_MOMENT if tool is None else 0.0)
     has_load, own_tool = load[0] > _MIN_TOOL_MASS_KG, False
     p_SScm_S = load[1:] / load[0] if has_load else np.zeros(3)
     tool_axis = start.sensor_axis_along_tool(shapes.arm, p_SScm_S)
@@ -94,7 +94,7 @@ def plan_station(
         slave.tool, own_tool = None, True
         shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
     plane = find_base_plane_height(shapes)
-    place, axis, shapes = _find_start_and_axis(slave, shapes, plane, tool_axis)
+    place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, tool_axis)
     on_sensor = None if tool is not None else slave.tool
     is_along_tool = axis == tool_axis or on_sensor is not None
     share = 1.0 if own_tool else start.MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
@@ -104,10 +104,10 @@ def plan_station(
         what = f"no {posture} was found in which {tool_axis}_S, away from the arm, points down"
         texts.append(f"{axis}_S downwards at the start, as {what}")
     if on_sensor is not None:
-        on_sensor.mass = _largest_mass_to_hold(model, place.q)
+        on_sensor.mass = _largest_holdable_tool_mass_kg(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
     figures = FIGURES.get(device)
-    room = _PHANTOM_WORKSPACE_HALF_EDGE_M if figures is None else min(figures.size) / 2.0
+    room = _DEFAULT_MASTER_WORKSPACE_HALF_EDGE_M if figures is None else min(figures.size) / 2.0
     peak = PEAK_FORCE_N if figures is None else figures.peak_force
     translation_scale = _floor_to_two_significant_digits(min(place.cube_half_m / room, 1.0))
     by_force = peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N)
@@ -119,7 +119,7 @@ def plan_station(
     direction = "down" if cosine > start.MIN_COS_OF_TOOL_DOWN else tilt
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
-    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _largest_speed_use_of_swing(model, place, swing))
+    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_over_joint_limit(model, place, swing))
     swing = _floor_to_two_significant_digits(swing)
     wall_position = lowest - [0.0, 0.0, 1.5 * swing]
     return StationPlan(
@@ -149,7 +149,7 @@ def plan_station(
     )
 
 
-def _find_start_and_axis(
+def _find_start_and_tool_axis(
     slave: Slave, shapes: PostureShapes, plane: float, tool_axis: str
 ) -> tuple[start.StartPlace, str, PostureShapes]:
     # The start, its axis of S that points down, and the shapes; a stand-in tool is set along that
@@ -160,7 +160,7 @@ def _find_start_and_axis(
     is_stand_in = slave.tool is not None and not slave.tool.model
     substitutes = start.opposite_axis(tool_axis), *start.TOOL_AXES
     for axis in dict.fromkeys((tool_axis, *substitutes)):
-        stand_in = _stand_in_tool(axis, _stand_in_length(shapes, axis))
+        stand_in = _make_stand_in_tool(axis, _stand_in_tool_length_m(shapes, axis))
         if is_stand_in and slave.tool != stand_in:
             slave.tool = stand_in
             shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
@@ -179,7 +179,7 @@ def _find_start_and_axis(
         raise errors[0]
     best = max(found, key=lambda each: each[0].posture_score)
     if is_stand_in:
-        slave.tool = _stand_in_tool(best[1], _stand_in_length(best[2], best[1]))
+        slave.tool = _make_stand_in_tool(best[1], _stand_in_tool_length_m(best[2], best[1]))
     return best
 
 
@@ -205,17 +205,17 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
     return float(min(sensor_heights.min(), 0.0) if hangs else plane)
 
 
-def _stand_in_tool(axis: str, length: float) -> Tool:
+def _make_stand_in_tool(axis: str, length: float) -> Tool:
     along = start.TOOL_AXES[axis].matrix()[:, 2]
     ball = Ball(_STAND_IN_BALL_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
     com = (_STAND_IN_COM_M * along).round(6).tolist()
-    return Tool(mass=_STAND_IN_MASSES_KG[0], com=com, shapes=[ball])
+    return Tool(mass=_STAND_IN_TOOL_MASSES_KG[0], com=com, shapes=[ball])
 
 
-def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
+def _stand_in_tool_length_m(shapes: PostureShapes, axis: str) -> float:
     link_bodies = shapes.bodies_welded_to_sensor() - {shapes.tool_body}
     end = start.extent_beyond_sensor(shapes, link_bodies, axis)
-    return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _STAND_IN_FREE_LENGTH_M)) / 100.0))
+    return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_ROD_LENGTH_M)) / 100.0))
 
 
 def _without_weak_torque_limits(
@@ -235,18 +235,18 @@ def _without_weak_torque_limits(
     return replace(arm, effort_limit=np.where(weak, np.inf, arm.effort_limit)), names, texts
 
 
-def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
+def _largest_holdable_tool_mass_kg(arm: ArmModel, q: Array) -> float:
     phi = arm.phi_load
-    for mass in _STAND_IN_MASSES_KG:
+    for mass in _STAND_IN_TOOL_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
         if np.abs(torque / arm.effort_limit).max() < start.MAX_HOLDING_TORQUE_USE:
             break
     return mass
 
 
-def _largest_speed_use_of_swing(arm: ArmModel, place: start.StartPlace, swing: float) -> float:
+def _swing_speed_over_joint_limit(arm: ArmModel, place: start.StartPlace, swing_m: float) -> float:
     above = place.pose.copy()
-    above[6] += swing
+    above[6] += swing_m
     displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)
     return float((2.0 * np.pi * SWING_HZ * displacement / arm.velocity_limit).max())
 

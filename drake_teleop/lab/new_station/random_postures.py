@@ -28,10 +28,10 @@ _PREFERRED_RADIUS_OVER_REACH = 0.6
 _PREFERRED_TOOL_HEIGHT_OVER_REACH = 0.25
 _MIN_PREFERRED_HEIGHT_OVER_REACH = -0.4
 _MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
-_MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
+_MIN_TOOL_END_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 _HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_JOINT_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
-_MAX_RATIO_OF_ZERO_SINGULAR_VALUE = 1e-9  # singular values that are 0, over the largest
+_MAX_RELATIVE_ZERO_SINGULAR_VALUE = 1e-9  # singular values that are 0, over the largest
 _MAX_NEUTRAL_ELBOW_OFFSET_OVER_REACH = 0.03  # smaller offsets have no direction
 _SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
@@ -131,7 +131,7 @@ def select_suitable_postures(
     lowest_origin = plane + _MIN_JOINT_ORIGIN_HEIGHT_M
     raised = postures.origins[:, :, 2].max(axis=0) > lowest_origin
     raised[0] = False
-    in_region = tool_height > _MIN_TOOL_HEIGHT_M
+    in_region = tool_height > _MIN_TOOL_END_HEIGHT_M
     for values, (low, high) in (
         (radius, _SENSOR_RADIUS_RANGE_OVER_REACH),
         (from_first[:, 2], _SENSOR_HEIGHT_RANGE_OVER_REACH),
@@ -150,15 +150,15 @@ def select_suitable_postures(
         rows = rows[met[rows]]
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
     sides = 2.0 * np.pi * np.arange(_NUM_EXAMINED_SIDES) / _NUM_EXAMINED_SIDES
-    counts = np.array([float(_is_angle_on_side(angle, side).sum()) for side in sides])
+    counts = np.array([float(_is_azimuth_on_side(angle, side).sum()) for side in sides])
     counts[0] *= _FRONT_POSTURE_COUNT_FACTOR
     side = float(sides[int(np.argmax(counts))])
     region = StartRegion(plane, tool_length, first, reach, raised, side, tuple(removed))
-    return postures[rows[_is_angle_on_side(angle, side)]], region
+    return postures[rows[_is_azimuth_on_side(angle, side)]], region
 
 
-def _is_angle_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
-    return np.cos(angle - side) > np.cos(_HALF_ANGLE_OF_SIDE_RAD)
+def _is_azimuth_on_side(azimuth: Array, side_azimuth: float) -> NDArray[np.bool_]:
+    return np.cos(azimuth - side_azimuth) > np.cos(_HALF_ANGLE_OF_SIDE_RAD)
 
 
 def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Array:
@@ -201,7 +201,7 @@ def sensor_degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     """Return the degrees of freedom of the sensor: the largest rank of the Jacobian."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _jacobian_singular_values(arm, few)
-    return int((values > _MAX_RATIO_OF_ZERO_SINGULAR_VALUE * values[:, :1]).sum(axis=1).max())
+    return int((values > _MAX_RELATIVE_ZERO_SINGULAR_VALUE * values[:, :1]).sum(axis=1).max())
 
 
 def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:

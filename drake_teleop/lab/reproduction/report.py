@@ -251,7 +251,7 @@ def scaling_figure(run: experiments.MotionRun, component: int, symbol: str, unit
 
     `symbol` is the component in Matplotlib's math text.
     """
-    time, time_unit = _time_axis(run.result.t)
+    time, time_unit = _scale_time_to_ms_or_s(run.result.t)
     traces = [wrench[:, component] for wrench in run.scaled_wrenches.values()]
     scale = run.scenario.force_scaling.force_scale
     at_master_and_back = (lambda v: np.asarray(v) * scale, lambda v: np.asarray(v) / scale)
@@ -270,14 +270,14 @@ def scaling_figure(run: experiments.MotionRun, component: int, symbol: str, unit
             right = axes.secondary_yaxis("right", functions=at_master_and_back)
             right.set_ylabel(f"at the master [{unit}]", color=GREY)
             right.spines["right"].set_visible(True)
-        rows[0].set(ylim=_common_value_range(traces), xlim=(time[0], time[-1]))
+        rows[0].set(ylim=_common_y_limits(traces), xlim=(time[0], time[-1]))
         rows[-1].set_xlabel(f"t [{time_unit}]")
     return figure
 
 
 def contact_figure(run: experiments.RunsWithAndWithoutContact, detected_s: float | None) -> Figure:
     """Draw Fig. 8: measured force and calculated contact force [N], with shaded contact."""
-    time, time_unit = _time_axis(run.touched.result.t)
+    time, time_unit = _scale_time_to_ms_or_s(run.touched.result.t)
     per_second = 1e3 if time_unit == "ms" else 1.0
     traces = [run.touched.scaled_wrenches[sigma][:, FORCE_Z_INDEX] for sigma in (1.0, 0.0)]
     touched, turning_s = run.in_contact, experiments.time_of_largest_raw_force_after_contact(run)
@@ -302,16 +302,16 @@ def contact_figure(run: experiments.RunsWithAndWithoutContact, detected_s: float
         _write_note_above_axes(rows[0], peak)
         threshold = f"threshold {_format_number(run.threshold_N)} N"
         _write_note_above_axes(rows[1], f"{contact_peak}   ·   {threshold}")
-        rows[0].set(ylim=_common_value_range(traces), xlim=(time[0], time[-1]))
+        rows[0].set(ylim=_common_y_limits(traces), xlim=(time[0], time[-1]))
         rows[1].set_xlabel(f"t [{time_unit}]")
     return figure
 
 
-def _time_axis(t: Array) -> tuple[Array, str]:
+def _scale_time_to_ms_or_s(t: Array) -> tuple[Array, str]:
     return (t * 1e3, "ms") if t[-1] - t[0] <= 2 else (t, "s")
 
 
-def _common_value_range(traces: Sequence[Array]) -> tuple[float, float]:
+def _common_y_limits(traces: Sequence[Array]) -> tuple[float, float]:
     low, high = min(0.0, float(np.min(traces))), max(0.0, float(np.max(traces)))
     margin = 0.1 * (high - low) or 1.0
     return low - margin, high + margin

@@ -34,9 +34,9 @@ def propose_points(points: Array, objective: ArrayLike, candidates: Array, count
     points, candidates = points / lengths, candidates / lengths
     chosen: list[int] = []
     for _ in range(count):
-        mean, deviation = _predict_points(points, y, candidates, noise)
+        mean, deviation = _predict_mean_std(points, y, candidates, noise)
         # Improvement over the best predicted mean, not over the best noisy value.
-        best = _predict_points(points, y, points, noise)[0].min()
+        best = _predict_mean_std(points, y, points, noise)[0].min()
         u = (best - mean) / deviation
         improvement = deviation * (u * ndtr(u) + norm.pdf(u))
         improvement[chosen] = -1.0
@@ -61,7 +61,7 @@ def _fit_kernel_lengths_and_noise(points: Array, y: Array) -> tuple[Array, float
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 
 
-def _predict_points(points: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
+def _predict_mean_std(points: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
     K = _matern_kernel(points, points)
     K[np.diag_indices_from(K)] += noise
     lower, _ = cho_factor(K, lower=True)

@@ -181,7 +181,7 @@ class Study:
         candidates = list({str(p): p for p in drawn if str(p) not in tried}.values())
         if len(candidates) <= count:
             return candidates
-        places, others = self._coordinates(points), self._coordinates(candidates)
+        places, others = self._point_coordinates(points), self._point_coordinates(candidates)
         chosen = propose_points(places, objective, others, count)
         return [candidates[index] for index in chosen]
 
@@ -204,6 +204,6 @@ class Study:
             for point in shares.tolist()
         ]
 
-    def _coordinates(self, points: Sequence[FactorValues]) -> Array:
+    def _point_coordinates(self, points: Sequence[FactorValues]) -> Array:
         values = [[f.coordinates(point[f.field]) for f in self.factors] for point in points]
         return np.array([np.concatenate(row) for row in values])

@@ -53,8 +53,8 @@ class FactorialModel:
         The weights (comparable levels, n) map values of points to means over used combinations.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in factors]
-        row, rows = self._combination_indices(factors)
-        column, columns = self._combination_indices(others)
+        row, rows = self._index_level_combinations(factors)
+        column, columns = self._index_level_combinations(others)
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
         is_compared, combinations = largest_complete_block(point >= 0)
@@ -71,16 +71,16 @@ class FactorialModel:
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
         """Return the means `weights @ table` over seeds, and their half widths."""
         mean, half = means_and_half_widths_over_seeds(weights @ table)
-        return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
+        return mean, np.hypot(half, self._half_widths_due_to_missing_seeds(table, weights))
 
-    def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+    def _index_level_combinations(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
         place, count = np.zeros(len(self.has_value), dtype=np.int64), 1
         for factor in factors:
             place = place * self.counts[factor] + self.levels[factor]
             count *= self.counts[factor]
         return place, count
 
-    def _half_widths_of_missing_seeds(self, table: Array, weights: Array) -> Array:
+    def _half_widths_due_to_missing_seeds(self, table: Array, weights: Array) -> Array:
         points, seeds = table.shape
         runs = self.has_value.sum(axis=1)
         freedom = runs.sum() - points - seeds + 1
@@ -205,18 +205,18 @@ def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    data = _MeasureData(study, rows, measure)
+    data = _MeasureEffectModel(study, rows, measure)
     factors = [] if data.is_empty else data.factors
     return {factor.field: data.main_effect(k) for k, factor in enumerate(factors)}
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    data = _MeasureData(study, rows, measure)
+    data = _MeasureEffectModel(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
     return [] if data.is_empty else [found for pair in pairs if (found := data.pair_means(*pair))]
 
 
-class _MeasureData:
+class _MeasureEffectModel:
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
         self.factors = varied_factors(study)
         values = values_by_seed(rows, measure)
@@ -254,7 +254,7 @@ class _MeasureData:
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        reasons_and_counts = self._reasons_and_counts(is_compared, levels.index, used, factor)
+        reasons_and_counts = self._summarise_coverage(is_compared, levels.index, used, factor)
         return MainEffect(levels.names, runs, mean, half, effect, effect_half, *reasons_and_counts)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
@@ -269,12 +269,12 @@ class _MeasureData:
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why, used, unused, fitted = self._reasons_and_counts(is_compared, cell, over, first, second)
+        why, used, unused, fitted = self._summarise_coverage(is_compared, cell, over, first, second)
         fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
         reasons = np.array(why).reshape(shape)
         return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
-    def _reasons_and_counts(
+    def _summarise_coverage(
         self, compared: BooleanArray, cell: NDArray[np.int64], used: BooleanArray, *factors: int
     ) -> tuple[list[str], int, int, bool]:
         # The last four fields of `MainEffect`; `used` flags combinations.

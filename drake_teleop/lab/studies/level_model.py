@@ -51,8 +51,8 @@ def missing_value_reasons(
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_RANGE_PARTS_AND_PRODUCTS = [(parts, True) for parts in (5, 4, 3)]
-_RANGE_PARTS_AND_PRODUCTS += [(parts, False) for parts in (5, 4, 3, 2)]
+_MODEL_FORMS_BY_PREFERENCE = [(parts, True) for parts in (5, 4, 3)]
+_MODEL_FORMS_BY_PREFERENCE += [(parts, False) for parts in (5, 4, 3, 2)]
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_LEVEL_COMBINATIONS = 50_000
 
@@ -128,7 +128,7 @@ class LevelModel:
             there &= ~failed[at[i], at[j]]
         count = math.prod(shape[: len(factors)])
         rows, columns = largest_complete_block(there.reshape(count, -1))
-        terms = self._regression_terms(at).reshape(count, -1, self.X.shape[1])
+        terms = self._regressor_rows_of_levels(at).reshape(count, -1, self.X.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
@@ -145,7 +145,7 @@ class LevelModel:
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
-            over_points = design * self._relative_std(terms)
+            over_points = design * self._std_over_residual_std(terms)
             halves.append(np.hypot(over_points, self._pooled_half_width_over_seeds(table, terms)))
         return effects, halves
 
@@ -155,10 +155,10 @@ class LevelModel:
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
-        over_points = self._half_width_over_points(table, 1) * self._relative_std(terms)
+        over_points = self._half_width_over_points(table, 1) * self._std_over_residual_std(terms)
         return each.mean(axis=1), np.hypot(over_points, over_seeds)
 
-    def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
+    def _regressor_rows_of_levels(self, at: dict[int, NDArray[np.int64]]) -> Array:
         count = len(next(iter(at.values())))
         terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
@@ -182,7 +182,7 @@ class LevelModel:
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (num_columns * self._degrees_of_freedom), least)
 
-    def _relative_std(self, terms: Array) -> Array:
+    def _std_over_residual_std(self, terms: Array) -> Array:
         return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
 
     def _half_width_over_points(self, table: Array, num_intervals: int) -> float:
@@ -195,7 +195,7 @@ class LevelModel:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
         moved = np.sum((effect_rows @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
-        relative_variance = np.sum(self._relative_std(effect_rows) ** 2)
+        relative_variance = np.sum(self._std_over_residual_std(effect_rows) ** 2)
         noise = self._residual_variance(apart, seeds - 1) * relative_variance
         deviation = np.sqrt(max(moved - noise, 0.0) / len(effect_rows) / seeds)
         return _student_quantile(len(self.factors), seeds - 1) * float(deviation)
@@ -214,7 +214,7 @@ def fit_level_model(
     missing by chance, not by failure.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _RANGE_PARTS_AND_PRODUCTS:
+    for parts, products in _MODEL_FORMS_BY_PREFERENCE:
         levels = [factor_levels(f, c, parts) for f, c in zip(factors, columns, strict=True)]
         model = _build_level_model(levels, products, known, by_chance)
         if model is not None:

@@ -20,18 +20,18 @@ def _force_norms(result: SimulationResult, signal: str) -> Array:
     return np.linalg.norm(result[signal][:, :3], axis=1) if signal in result else np.zeros(1)
 
 
-def _work_of_hand(result: SimulationResult) -> float:
+def _work_of_hand_J(result: SimulationResult) -> float:
     power = np.sum(result["hand_wrench_E"] * result["twist_master"], axis=1)
     return float(np.trapezoid(power, result.t))
 
 
-def _time_of_rendered_force_above(result: SimulationResult, threshold: float) -> float:
+def _seconds_with_force_above_threshold(result: SimulationResult, threshold: float) -> float:
     above = _force_norms(result, "force_to_master") > threshold
     return float(np.trapezoid(above.astype(float), result.t))
 
 
 #: Measures of every run, from its signals and the study's `force_threshold` [N].
-_MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
+_MEASURE_FUNCTION_BY_NAME: dict[str, Callable[[SimulationResult, float], float]] = {
     # Largest displayed force.
     "peak_force_to_master_N": lambda result, _: _force_norms(result, "force_to_master").max(),
     "rms_force_to_master_N": lambda result, _: np.sqrt(
@@ -40,16 +40,16 @@ _MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = 
     # Largest true force between tool and environment.
     "peak_contact_force_N": lambda result, _: _force_norms(result, "true_contact_wrench_W").max(),
     # Work of the hand on the stylus: integral of F.v + tau.omega.
-    "hand_work_J": lambda result, _: _work_of_hand(result),
+    "hand_work_J": lambda result, _: _work_of_hand_J(result),
     # Time of a displayed force above the threshold.
-    "time_above_force_s": _time_of_rendered_force_above,
+    "time_above_force_s": _seconds_with_force_above_threshold,
 }
 #: Names of all measures; for those of tasks see `task_measures.py`.
-MEASURES = (*_MEASURES_OF_EVERY_RUN, *TASK_MEASURE_NAMES)
+MEASURES = (*_MEASURE_FUNCTION_BY_NAME, *TASK_MEASURE_NAMES)
 
 
 def default_measures() -> list[str]:
-    return list(_MEASURES_OF_EVERY_RUN)
+    return list(_MEASURE_FUNCTION_BY_NAME)
 
 
 def evaluate_measures(
@@ -60,8 +60,8 @@ def evaluate_measures(
         what = "the run identifies the load without a hand, so it has no measures"
         remedy = "give the operator an intent or a task, or set load_estimator.enabled: false"
         raise DrakeTeleopError(what, where="operator.intent", remedy=remedy)
-    own = [name for name in names if name in _MEASURES_OF_EVERY_RUN]
-    found = {name: float(_MEASURES_OF_EVERY_RUN[name](result, force_threshold)) for name in own}
+    own = [name for name in names if name in _MEASURE_FUNCTION_BY_NAME]
+    found = {name: float(_MEASURE_FUNCTION_BY_NAME[name](result, force_threshold)) for name in own}
     if len(own) < len(names):
         from drake_teleop.station.task_measures import task_measures
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _MAX_UNROTATED_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
-_HATCH_OF_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
+_HATCH_BY_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
@@ -85,7 +85,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
     _label_levels(axes, found.level_names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
-        bar = _hatched_cell_without_value(found.missing_reasons[level], (level - 0.5, 0.0))
+        bar = _make_hatched_cell(found.missing_reasons[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
@@ -108,14 +108,14 @@ def _describe_used_combinations(found: effects.MainEffect | effects.PairMeans) -
     return f"over {used} of {used + unused} combinations of the other factors" if unused else ""
 
 
-def _hatched_cell_without_value(why: str, corner: tuple[float, float]) -> Rectangle:
-    return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_OF_REASON[why], fc="white", ec=GREY, lw=0)
+def _make_hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
+    return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_BY_REASON[why], fc="white", ec=GREY, lw=0)
 
 
 def _draw_hatch_legend(figure: Figure, missing_reasons: Iterable[str]) -> None:
-    names = [why for why in _HATCH_OF_REASON if why in missing_reasons and why != TOO_FEW_POINTS]
+    names = [why for why in _HATCH_BY_REASON if why in missing_reasons and why != TOO_FEW_POINTS]
     if names:
-        patches = [_hatched_cell_without_value(why, (0.0, 0.0)) for why in names]
+        patches = [_make_hatched_cell(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
 
 
@@ -133,7 +133,7 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
                 why, corner = found.missing_reasons[row, column], (column - 0.5, row - 0.5)
-                axes.add_patch(_hatched_cell_without_value(why, corner))
+                axes.add_patch(_make_hatched_cell(why, corner))
             axes.grid(False)
             _label_levels(axes, found.level_names[1])
             axes.set_yticks(range(len(found.level_names[0])), found.level_names[0])

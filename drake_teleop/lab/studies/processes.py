@@ -96,7 +96,7 @@ def _joblib_pool(jobs: int) -> Any:
 def _joblib_task(run: RunRows, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
-    return delayed(_run_and_count_start)(run, chunk, store)
+    return delayed(_run_chunk_with_start_count)(run, chunk, store)
 
 
 def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
@@ -111,7 +111,7 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     return found
 
 
-def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
+def _run_chunk_with_start_count(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     store.count_start_of_chunk(chunk[0]["run"])
     try:
         return run(chunk)
@@ -168,7 +168,7 @@ def _run_on_executor(run: RunRows, chunks: Sequence[Chunk], executor: Executor) 
 def _check_worker_versions(client: Any) -> None:
     for worker, found in client.run(_make_version_reader(), on_error="return").items():
         if found != __version__:
-            raise _version_error(worker, found, __version__)
+            raise _version_mismatch_error(worker, found, __version__)
 
 
 def _make_version_reader() -> Callable[[], str]:
@@ -181,13 +181,13 @@ def _make_version_reader() -> Callable[[], str]:
     return read_version
 
 
-def _version_error(worker: str, found: Any, expected: str) -> DrakeTeleopError:
+def _version_mismatch_error(worker: str, found: Any, expected: str) -> DrakeTeleopError:
     what = f"worker {worker} has drake_teleop {found}, this process has {expected}"
     remedy = "install the same version on all workers and start them again"
     return DrakeTeleopError(what, where="--cluster", remedy=remedy)
 
 
-def _check_version_before_run(run: RunRows) -> RunRows:
+def _with_version_check(run: RunRows) -> RunRows:
     # For workers that join later.
     version, expected = _make_version_reader(), __version__
 
@@ -195,7 +195,7 @@ def _check_version_before_run(run: RunRows) -> RunRows:
         from distributed import get_worker
 
         if (found := version()) != expected:
-            raise _version_error(get_worker().address, found, expected)
+            raise _version_mismatch_error(get_worker().address, found, expected)
         return run(chunk)
 
     return run_on_same_version
@@ -204,14 +204,14 @@ def _check_version_before_run(run: RunRows) -> RunRows:
 def _run_on_cluster(run: RunRows, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
-    run = _check_version_before_run(run)
+    run = _with_version_check(run)
     futures = client.map(run, chunks, pure=False)
     chunk_of = dict(zip(futures, chunks, strict=True))
     for future in as_completed(futures):
-        yield _rows_of_future(future, chunk_of.pop(future), run, client)
+        yield _await_rows(future, chunk_of.pop(future), run, client)
 
 
-def _rows_of_future(future: Any, chunk: Chunk, run: RunRows, client: Any) -> Chunk:
+def _await_rows(future: Any, chunk: Chunk, run: RunRows, client: Any) -> Chunk:
     from distributed import KilledWorker
 
     try:
@@ -220,5 +220,5 @@ def _rows_of_future(future: Any, chunk: Chunk, run: RunRows, client: Any) -> Chu
         if len(chunk) == 1:
             return [chunk[0] | {"error": PROCESS_ENDED_ERROR}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
-        found = [row for part, rows in alone for row in _rows_of_future(part, rows, run, client)]
+        found = [row for part, rows in alone for row in _await_rows(part, rows, run, client)]
     return found

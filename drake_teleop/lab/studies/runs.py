@@ -32,7 +32,7 @@ RunFunction: TypeAlias = Callable[[FactorValues, int], dict[str, float]]
 
 ONE_TIME_COST_KEY = "seconds_once"
 """Name of the time [s] for work that most other runs do not repeat, e.g. load identification."""
-_RUN_SECONDS_KEY = "seconds"
+_RUN_TIME_S_KEY = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
 # waits at the end. The first chunks have one run, for early results and time estimates.
@@ -71,7 +71,7 @@ def run_study(
     identity |= {"version": __version__, "single_runs": _NUM_SINGLE_RUNS}  # determines chunks
     schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
-    chunks = _group_into_chunks(first_rows)
+    chunks = _split_rows_into_chunks(first_rows)
     chunks = chunks if part is None else part.chunks(chunks)
     total = sum(map(len, chunks)) if part else study.num_points() * study.repeats
     with open_store(part.folder(out) if part else out, identity) as store:
@@ -93,8 +93,8 @@ def run_study(
                         columns = {name: [row.get(name) for row in found] for name in schema}
                         store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
-                    new = study.next_points(points, _mean_objectives(study, store, len(points)))
-                    chunks = _group_into_chunks(study.rows(new, len(points)))
+                    new = study.next_points(points, _objective_means(study, store, len(points)))
+                    chunks = _split_rows_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
             remedy = f"{out} contains {counter.done} of {counter.total} runs; repeat the command"
@@ -104,14 +104,14 @@ def run_study(
         return store.read()
 
 
-def _group_into_chunks(rows: Chunk) -> list[Chunk]:
+def _split_rows_into_chunks(rows: Chunk) -> list[Chunk]:
     size = min(max(len(rows) // _TARGET_NUM_CHUNKS, 1), _MAX_RUNS_PER_CHUNK)
     chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
     chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     return chunks
 
 
-def _mean_objectives(study: Study, store: Store, points: int) -> Array:
+def _objective_means(study: Study, store: Store, points: int) -> Array:
     if not study.objective:
         return np.empty(0)
     import polars as pl
@@ -139,9 +139,9 @@ class StudyProgress:
     def add_finished_runs(self, rows: Chunk) -> None:
         self.done += len(rows)
         for row in rows:
-            if _RUN_SECONDS_KEY in row:  # missing if the run ended its process
+            if _RUN_TIME_S_KEY in row:  # missing if the run ended its process
                 first = self._num_timed < _NUM_RUNS_FOR_TIME_ESTIMATE
-                self._recent.append(row[_RUN_SECONDS_KEY] - first * row.get(ONE_TIME_COST_KEY, 0.0))
+                self._recent.append(row[_RUN_TIME_S_KEY] - first * row.get(ONE_TIME_COST_KEY, 0.0))
                 self._num_timed += 1
         self._report_progress()
 
@@ -168,7 +168,7 @@ def _run_chunk(work: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:
             except Exception as error:  # other runs must continue
                 measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
             # Not stored in the table, which must be reproducible.
-            found.append(row | measures | {_RUN_SECONDS_KEY: time.monotonic() - start})
+            found.append(row | measures | {_RUN_TIME_S_KEY: time.monotonic() - start})
     return found
 
 

@@ -69,12 +69,12 @@ def scaling_study_command(
     for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
-    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
+    tables = {task: _criterion_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
     answers = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {selection: _find_best_scales(found) for selection, found in answers.items()},
-        "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
+        "eta": _summarise_measures_by_eta(rows[_ETA_STUDY_NAME]),
     }
     with files.output_folder(out, "answer.json"):
         files.write_table(out / "answer.csv", _merit_table(answers))
@@ -98,7 +98,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     draws = generator.multinomial(count, equal, _NUM_BOOTSTRAP_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
-        np.mean([_mean_ratios_to_unscaled(tables[task][name], weights) for name in names], axis=0)
+        np.mean([_means_over_unscaled(tables[task][name], weights) for name in names], axis=0)
         for task, names in counted.items()
         if names
     ]
@@ -118,7 +118,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     return ScaleRating(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
-def _mean_ratios_to_unscaled(table: Array, weights: Array) -> Array:
+def _means_over_unscaled(table: Array, weights: Array) -> Array:
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
@@ -132,7 +132,7 @@ def _sigmas_and_gammas() -> tuple[list[float], list[float]]:
     return factors[_SIGMA_KEY], factors[_GAMMA_KEY]
 
 
-def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
+def _criterion_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _sigmas_and_gammas()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA_KEY in rows.columns else 1
@@ -185,7 +185,7 @@ def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
     return pl.concat(map(pl.DataFrame, tables))
 
 
-def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
+def _summarise_measures_by_eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA_KEY].unique().to_list())
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Chunk: TypeAlias = list[dict[str, Any]]
 """Rows that one process runs together."""
-_PART_FILE_NAME = "run_{:08d}.parquet"
+_PART_FILE_NAME_FORMAT = "run_{:08d}.parquet"
 _MAX_SHARDS_IN_MESSAGE = 20
 
 
@@ -37,20 +37,20 @@ class Store:
     folder: Path
 
     def first_runs_of_finished_chunks(self) -> set[int]:
-        return set(map(_first_run_of_part, self.part_files()))
+        return set(map(_first_run_number, self.part_files()))
 
     def part_files(self) -> list[Path]:
-        return sorted(self.folder.glob(_PART_FILE_NAME.format(0).replace("0", "[0-9]")))
+        return sorted(self.folder.glob(_PART_FILE_NAME_FORMAT.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
         parts = self.part_files()
         whole = _read_run_numbers_if_undamaged(parts)
         for part in parts:
-            if not {_first_run_of_part(part)} & (whole or _read_run_numbers_if_undamaged([part])):
+            if not {_first_run_number(part)} & (whole or _read_run_numbers_if_undamaged([part])):
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        path = self.folder / _PART_FILE_NAME.format(rows["run"][0])
+        path = self.folder / _PART_FILE_NAME_FORMAT.format(rows["run"][0])
         files.write_table(path, rows, temporary_base=self.folder)
 
     def add_part(self, part: Path) -> None:
@@ -65,21 +65,21 @@ class Store:
                 shutil.copyfile(part, temporary)
 
     def count_start_of_chunk(self, first_run: int) -> None:
-        path = self._start_counts_folder / str(first_run)
+        path = self._run_start_counts_folder / str(first_run)
         with files.wrap_write_errors(path):
-            self._start_counts_folder.mkdir(exist_ok=True)
+            self._run_start_counts_folder.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
 
     def clear_start_count_of_chunk(self, first_run: int) -> None:
-        (self._start_counts_folder / str(first_run)).unlink(missing_ok=True)
+        (self._run_start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
     def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
-        marks = (mark for mark in self._start_counts_folder.glob("*") if mark.name.isdecimal())
+        marks = (mark for mark in self._run_start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
     @property
-    def _start_counts_folder(self) -> Path:
+    def _run_start_counts_folder(self) -> Path:
         return self.folder.with_name("running")
 
     def read(self) -> pl.DataFrame:
@@ -94,7 +94,7 @@ class Store:
             return pl.read_parquet(parts).sort("run")
 
 
-def _first_run_of_part(part: Path) -> int:
+def _first_run_number(part: Path) -> int:
     return int(part.stem.removeprefix("run_"))
 
 
@@ -121,7 +121,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
         store.remove_damaged_parts()
         yield store
         with suppress(OSError):  # missing, or with marks
-            store._start_counts_folder.rmdir()
+            store._run_start_counts_folder.rmdir()
 
 
 @contextmanager

@@ -45,7 +45,7 @@ class StationRunFunction:
     def scenario(self, values: FactorValues, seed: int) -> scenarios.Scenario:
         changes = values | {"simulation.seed": seed}
         return scenarios.ScenarioFromData(
-            _with_fields(self.scenario_data, changes), self.scenario_file
+            _copy_with_changed_fields(self.scenario_data, changes), self.scenario_file
         )
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
@@ -97,7 +97,7 @@ def study_command(
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
-            changed = _with_fields(packages, {factor.field: value})
+            changed = _copy_with_changed_fields(packages, {factor.field: value})
             place = f"{path}:factors[{index}]"
             config = scenarios.settings_without_range_check(scenarios.Scenario, changed, place)
             check_all_field_values(config, place)
@@ -131,7 +131,7 @@ def LoadStudy(path: str | Path) -> Study:
     return study
 
 
-def _with_fields(data: Any, changes: dict[str, Any]) -> Any:
+def _copy_with_changed_fields(data: Any, changes: dict[str, Any]) -> Any:
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")

@@ -44,12 +44,12 @@ _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window 
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_PRESS_DEPTH_M = 0.02
 _USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
-_FILTER_DELAY_TIMES_BANDWIDTH = 0.416  # of the 4th-order Butterworth filter
+_FILTER_DELAY_BANDWIDTH_PRODUCT = 0.416  # of the 4th-order Butterworth filter
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
 _MIN_WALL_N_M, _MAX_WALL_N_M = 100.0, 60e3  # N/m, range of the leaf's model
-_NUM_TESTED_WALLS = 4  # from the softest to the stiffest
-_MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
+_NUM_TESTED_WALL_STIFFNESSES = 4  # from the softest to the stiffest
+_MAX_DT_S = 2e-3  # longer than the events' period; else tiny steps precede the events
 GIVEN_SETTINGS_NAME = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
 
@@ -92,7 +92,7 @@ class OperatingRange:
         """
         low, high = self.walls
         margin, hands = self.requirements.loop_gain_margin, list(self.hands)
-        walls = np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()
+        walls = np.geomspace(high, low, _NUM_TESTED_WALL_STIFFNESSES if low < high else 1).tolist()
         parts = [(margin, part, walls) for part in (hands[:1], hands[:1], hands[1:]) if part]
         return [*parts, (1.0, [*dict.fromkeys((hands[0], hands[-1]))], [high])]
 
@@ -103,8 +103,8 @@ class OperatingRange:
 
 def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str) -> OperatingRange:
     """Return the operating range of these grips, walls [kN/m] and this task."""
-    _check_names("hands", hands, tuple(GRIP_IMPEDANCES))
-    _check_names("task", [task], tuple(REQUIREMENTS_OF_TASK))
+    _check_names_are_known("hands", hands, tuple(GRIP_IMPEDANCES))
+    _check_names_are_known("task", [task], tuple(REQUIREMENTS_OF_TASK))
     if not hands:
         raise DrakeTeleopError("no grip is given", where="hands", remedy="give one, such as light")
     if not walls:
@@ -121,7 +121,7 @@ def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str
     return OperatingRange(between, (1e3 * min(walls), 1e3 * max(walls)), task)
 
 
-def _check_names(where: str, names: Sequence[str], known: tuple[str, ...]) -> None:
+def _check_names_are_known(where: str, names: Sequence[str], known: tuple[str, ...]) -> None:
     for name in names:
         if name not in known:
             remedy = suggest_name(name, known, f"choose among {', '.join(known)}")
@@ -134,7 +134,7 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
     `network` is a preset; None keeps the scenario's network.
     """
     if network is not None:
-        _check_names("network", [network], tuple(PRESETS))
+        _check_names_are_known("network", [network], tuple(PRESETS))
         scenario = replace(scenario, channel=Channel(network=network))
     if scenario.has_no_network_or_passivity:
         what = "the scenario has neither network nor passivity method"
@@ -142,7 +142,7 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
         remedy = f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}"
         raise DrakeTeleopError(what, where="network", remedy=remedy)
     force_scale = scenario.force_scaling.force_scale
-    simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
+    simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_DT_S, end_with_task=False)
     return replace(
         scenario.without_environment(),
         simulation=simulation,
@@ -247,7 +247,7 @@ class OneAxisGammaSearch:
         settings = settings_from_values(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
-        linear = self._linear_gamma_limit(axis, settings)
+        linear = self._max_gamma_of_linear_model(axis, settings)
         cap = self.gamma_upper_bounds[settings.low_pass_hz]
         if settings.method == "none":
             cap = min(cap, linear)
@@ -268,7 +268,7 @@ class OneAxisGammaSearch:
         gamma = max(shares, default=0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": shares.get(gamma, 0.0)}
 
-    def _linear_gamma_limit(self, axis: OneAxis, settings: TunedSettings) -> float:
+    def _max_gamma_of_linear_model(self, axis: OneAxis, settings: TunedSettings) -> float:
         sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
@@ -288,7 +288,7 @@ class OneAxisGammaSearch:
         shown = {f.name: getattr(held, f.name) for f in dataclasses.fields(AxisParameters)}
         model = OneDof(**shown | {"wall_stiffness": wall, "gamma": settings.gamma})
         ideal = self.base_scenario.wrist_sensor.ideal
-        added = 0.0 if ideal else _FILTER_DELAY_TIMES_BANDWIDTH / settings.low_pass_hz
+        added = 0.0 if ideal else _FILTER_DELAY_BANDWIDTH_PRODUCT / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
         passivity, intent = settings.passivity(self.operating_range), one_dof.operator_intent(task)
         filtered = dataclasses.replace(backward, delay=backward.delay + added)

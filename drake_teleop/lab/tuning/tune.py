@@ -38,11 +38,11 @@ FAILURE_SEARCH_WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall at which the chosen settings are tested for failure."""
 FAILURE_SEARCH_GAMMA_FACTOR = 1.2
 """Factor of gamma times margin at which the chosen settings are tested for failure."""
-_LOW_PASSES_HZ = (100.0, 50.0)  # Hz, candidates below the sensor's own bandwidth
+_CANDIDATE_LOW_PASS_CUTOFFS_HZ = (100.0, 50.0)  # Hz, candidates below the sensor's own bandwidth
 _MAX_GAMMA_REDUCTION_FACTOR = 16.0  # from the limit in one axis to that of the station
-_MAX_UNSTABLE_TO_STABLE_GAMMA_RATIO = 1.15  # at which the bisection ends
+_GAMMA_RATIO_AT_BISECTION_END = 1.15  # smallest unstable over largest stable gamma
 # Gammas this factor above and below the limit of noise are assumed to fail and to hold.
-_NOISE_LIMIT_GAMMA_STEP_FACTOR = 1.03
+_GAMMA_FACTOR_AROUND_NOISE_LIMIT = 1.03
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -136,12 +136,12 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
     unscaled = TunedSettings(press_trial.GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
-    given = execute("as_given", _study_of_settings(unscaled, ends, [stiffest]), trial)
+    given = execute("as_given", _make_press_study(unscaled, ends, [stiffest]), trial)
     unscaled = dataclasses.replace(unscaled, method="ledger")
-    quiet = execute("noise", _study_of_settings(unscaled, ends, [stiffest]), trial)
+    quiet = execute("noise", _make_press_study(unscaled, ends, [stiffest]), trial)
     noise = max(1e-9, *(row["rest_force_N"] for row in quiet))  # N at gamma = 1
     lowest = np.inf if base.wrist_sensor.ideal else stated.requirements.min_low_pass_hz
-    low_passes = [own, *(f for f in _LOW_PASSES_HZ if lowest <= f < own)]
+    low_passes = [own, *(f for f in _CANDIDATE_LOW_PASS_CUTOFFS_HZ if lowest <= f < own)]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = margin / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
     caps = {f: min(MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
@@ -152,7 +152,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     ]
     study = Study(factors=factors, measures=press_trial.SEARCH_MEASURES)
     rows = execute("search", study, press_trial.OneAxisGammaSearch(base, stated, caps))
-    search = [_add_predicted_threshold(row, trial, noises) for row in rows]
+    search = [_add_predicted_force_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
         if row["gamma"] > 0.0:
@@ -161,7 +161,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _max_station_gamma(press_trial.settings_from_values(row), trial, execute)
+        gamma, inside = _search_max_gamma(press_trial.settings_from_values(row), trial, execute)
         if inside:
             chosen = dataclasses.replace(press_trial.settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
@@ -172,13 +172,13 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
         raise DrakeTeleopError(what, where="tune", remedy=remedy)
     _, chosen, inside = found[0]
     larger = dataclasses.replace(chosen, gamma=FAILURE_SEARCH_GAMMA_FACTOR * margin * chosen.gamma)
-    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
+    beyond = execute("larger_gamma", _make_press_study(larger, ends, [stiffest], repeats=2), trial)
     walls = [factor * stiffest for factor in FAILURE_SEARCH_WALL_FACTORS]
-    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
+    beyond += execute("stiffer_walls", _make_press_study(chosen, ends, walls, repeats=2), trial)
     return SearchResult(chosen, search, given, inside, beyond)
 
 
-def _max_station_gamma(
+def _search_max_gamma(
     settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     def all_meet_requirements(rows: list[Row]) -> bool:
@@ -192,7 +192,7 @@ def _max_station_gamma(
         for seed, (factor, hands, walls) in enumerate(trial.operating_range.tested_parts):
             tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
-            rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
+            rows += execute(name, _make_press_study(tried, hands, walls, seed=seed), trial)
             if not all_meet_requirements(rows):
                 break
         else:
@@ -202,9 +202,9 @@ def _max_station_gamma(
             if all_meet_requirements([row | {"rest_force_N": 0.0} for row in rows]):
                 # Noise grows with gamma.
                 quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
-                smaller = max(smaller, quiet / _NOISE_LIMIT_GAMMA_STEP_FACTOR)
-                failed = min(failed, quiet * _NOISE_LIMIT_GAMMA_STEP_FACTOR)
-        if failed == np.inf or failed <= _MAX_UNSTABLE_TO_STABLE_GAMMA_RATIO * stable:
+                smaller = max(smaller, quiet / _GAMMA_FACTOR_AROUND_NOISE_LIMIT)
+                failed = min(failed, quiet * _GAMMA_FACTOR_AROUND_NOISE_LIMIT)
+        if failed == np.inf or failed <= _GAMMA_RATIO_AT_BISECTION_END * stable:
             break
         gamma = float(np.sqrt(stable * failed)) if stable else smaller
     return stable, inside
@@ -236,7 +236,7 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _add_predicted_threshold(
+def _add_predicted_force_threshold(
     row: Row, trial: StationPressTrial, noise_N_by_low_pass_hz: dict[float, float]
 ) -> Row:
     gamma = row["gamma_limit"] / trial.operating_range.requirements.loop_gain_margin
@@ -252,7 +252,7 @@ def _add_predicted_threshold(
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
 
 
-def _study_of_settings(
+def _make_press_study(
     settings: TunedSettings, hands: list[str], walls: list[float], seed: int = 0, repeats: int = 1
 ) -> Study:
     numbers = dataclasses.asdict(settings)
