@@ -204,7 +204,7 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
     words = advise_motion(
         rest, DT, 30.0, derivatives_over_tolerances(parse_tolerance("mass 1 %"), PHI), NOISE
     )
-    assert f"about {'xyz'[axis]}" not in words and "turn" in words
+    assert f"about {'xyz'[axis]}" not in words and "rotate" in words
 
 
 def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: Path) -> None:
