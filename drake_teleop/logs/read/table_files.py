@@ -99,7 +99,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     if head.startswith(_UTF_16_BYTE_ORDER_MARKS):
         source = path.read_text("utf-16").encode()
         head = source[:_INSPECTED_HEAD_BYTES]
-    elif not _is_utf_8(head):
+    elif b"\0" not in head and not _is_utf_8(head):  # no binary file
         source = path.read_bytes().decode("cp1252", "replace").encode()
         head = source[:_INSPECTED_HEAD_BYTES]
     if (text := _normalize_line_ends_and_decimal_commas(path, source, head)) is not None:
