@@ -230,10 +230,7 @@ def identify_log(
 def _read_and_fit_load(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
-    """Return the log as read, its load, and findings on its poses.
-
-    The load is fitted to splines of the poses if they allow it, otherwise to the motion as read.
-    """
+    """Return the log as read, its load, and findings on its poses."""
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     fitted, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
@@ -280,15 +277,12 @@ def _correct_delay(
     method: str,
     cutoff_hz: float | None,
 ) -> tuple[LoadFitOfLog, tuple[Finding, ...]]:
-    """Return the load and the findings on poses with an estimated delay corrected by `why`.
-
-    Without acceleration a delay is undetermined, because an acceleration resembles one.
-    """
+    """Return the load and the findings on poses with an estimated delay corrected by `why`."""
     source, motion = fitted.delay_source, fitted.motion
     if source != "estimated":
         return fitted, frame_findings
     delay_s = fitted.delay_s + why.delay_s
-    if why.is_acceleration_missing:
+    if why.is_acceleration_missing:  # an acceleration resembles a delay
         source, fitted = "undetermined", _fit_load_to_motion(log, method, cutoff_hz, 0.0)
     elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S and motion is None:
         fitted = _fit_load_to_motion(log, method, cutoff_hz, delay_s)
@@ -306,7 +300,6 @@ def _errors_beside_the_load(
     too_still: str | None,
     check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
-    """Return errors of motion or units, with which no load may be stated."""
     errors = tuple(finding for finding in frame_findings if finding.name == "units")
     if too_still is not None:
         text = f"payload not identifiable: {too_still}; {MORE_MOTION_REMEDY}"
@@ -328,7 +321,6 @@ def _apply_explanation(
     frame_findings: tuple[Finding, ...],
     note: str,
 ) -> tuple[Identification, tuple[Finding, ...], str]:
-    """Return the load fitted with the causes of `why`, these causes, and a note."""
     causes = why.causes
     if frame_findings:
         causes = explained_log.replace_frame_causes(why, frame_findings[0])
@@ -342,14 +334,11 @@ def _apply_explanation(
 def _unexplained_misfit(
     why: MisfitExplanation | None, load: Identification, corrections: list[Finding]
 ) -> MisfitExplanation | None:
-    """Return `why` if its residual is neither noise nor an effect of unknown accelerations.
-
-    Vibrations may leave a large residual in a record that identifies the load.
-    """
+    """Return `why` if its residual is neither noise nor an effect of unknown accelerations."""
     if why is None or not why.is_misfit or why.is_acceleration_missing:
         return None
     if load.identifiable[6:].any() and not (corrections and why.is_residual_large):
-        return None
+        return None  # vibrations may leave a large residual
     return why
 
 

@@ -86,7 +86,6 @@ class _LowPassedSamples(NamedTuple):
 
 
 def _low_passed_samples(log: Log) -> _LowPassedSamples:
-    """Return copies of few samples, so that the results for many edits need little memory."""
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))

@@ -26,7 +26,6 @@ def left_handed_pose_finding(
 
     A mirrored motion explains [P f; -P tau], where P is a signed permutation with determinant -1.
     The comparison includes all axes of wrench and gravity, and wrong signs of wrench and torque.
-    Without `splines` the motion is that of the log.
     """
     few = log.select_rows(slice(None, None, 1 + len(log) // _MAX_COMPARED_SAMPLES))
     wrench = (few.wrench - few.wrench.mean(axis=0)).reshape(-1, 2, 3)

@@ -15,13 +15,9 @@ _CUTOFFS_HZ = np.geomspace(0.02, 2.0, 25)
 
 
 def high_pass_finding(log: Log, delay_s: float) -> Finding | None:
-    """Return a finding if a high-pass of first order on the load's wrench explains the wrench.
-
-    A high-pass resembles the removed delay `delay_s` of the motion, so that the comparison includes
-    the motion with and without it.
-    """
+    """Return a finding if a high-pass of first order on the load's wrench explains the wrench."""
     least, fitting = [np.inf, np.inf], 0.0
-    for moved in (log, remove_delay(log, -delay_s)):
+    for moved in (log, remove_delay(log, -delay_s)):  # a high-pass resembles a delay
         few = moved.select_rows(slice(None, None, max(1, int(1.0 / (_COMPARED_RATE_HZ * log.dt)))))
         t = few.t - few.t[0]
         scale = np.linalg.norm(few.wrench.std(axis=0).reshape(2, 3), axis=1).repeat(3) + 1e-12

@@ -179,8 +179,7 @@ def _is_utf_8(head: bytes) -> bool:
 def _find_table_below_text(lines: list[str], start: int) -> tuple[int, int, list[str]] | None:
     """Return the line of the header, the first line of numbers, and the units between them.
 
-    Return None if the table begins at line `start`, or if a line in it is unclear. Without a
-    header the line of the header is the first line of numbers.
+    Return None if the table begins at line `start`, or if a line in it is unclear.
     """
     rows = [_split_cells(line) for line in lines]
 
@@ -282,7 +281,6 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
 
 
 def _read_excel(path: Path) -> Table:
-    """Return the sheet with the log; raise an error if another one has a similar table."""
     import polars as pl
 
     sheets = pl.read_excel(path, sheet_id=0, raise_if_empty=False)

@@ -83,8 +83,6 @@ class NetworkChannel(SteppedBlock):
 
 
 class _PassivityEndBlock(SteppedBlock):
-    """Base class of the blocks `PassivityAtMaster` and `PassivityAtSlave`."""
-
     __slots__ = ()
 
     def __init__(

@@ -251,7 +251,6 @@ def position_servo_torque_into(
 def _interface_constants_and_memory(
     arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
 ) -> tuple[tuple[Array, ...], Array]:
-    """Return the constant arguments and the initial memory of `position_servo_torque_into`."""
     n, queued = arm.num_joints, round(interface.dead_time * interface.command_hz)
     gains = interface.acceleration_per_error, interface.lookahead
     drives = 2 * np.pi * interface.drive_bandwidth_hz

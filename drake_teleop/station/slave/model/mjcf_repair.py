@@ -163,7 +163,6 @@ def _weld_other_joints_and_list_moving(
 
 
 def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
-    """Report couplings that constrain `joints` as faults, and other couplings as left out."""
     model, moving = mjcf.model, {joint.name for joint in joints}
     # Moving body of the chain that carries each body.
     carriers = dict.fromkeys((body.name for body in arm.with_descendants()), "world")
