@@ -77,7 +77,7 @@ def pack_for_compiled_code(**values: ArrayLike) -> Records:
 
 
 def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
-    """Broadcast arrays (*shape, n), given as name=(array, n); return shape and tables (N, n)."""
+    """Broadcast arrays (..., n), given as name=(array, n); return leading shape, tables (N, n)."""
     tables = {
         name: finite_array(name, value, n, leading=True) for name, (value, n) in arrays.items()
     }
