@@ -45,7 +45,7 @@ SAID = {
     "result-panic_2.parquet": "the file is damaged: wrench.f_x goes beyond the end of the file",
     "result-panic_3.parquet": "is not a simulation result",
     "result-times_in_pairs.parquet": "is not a simulation result",
-    "robot-large_shape.urdf": "l2 has a shape of 2.02e+05 m (at most 1000 m)",
+    "robot-large_shape.urdf": "body 'l2' has a shape of 2.02e+05 m (at most 1000 m)",
     "robot-two_roots.urdf": "",
     "robot-no_radius.urdf": "",
     "robot-1e300_m.urdf": "",
