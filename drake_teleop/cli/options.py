@@ -172,7 +172,7 @@ POSITIVE_NUMBERS_TYPE = CommaSeparated("number", POSITIVE_TYPE)
 
 
 class RegisteredName(click.Choice):
-    """Parameter type of names in the registry of `kind`: `shipped`, or registered by the user."""
+    """Type of an option that takes a `shipped` name or one that the user registers as `kind`."""
 
     def __init__(self, kind: str, *shipped: str) -> None:
         super().__init__(shipped)

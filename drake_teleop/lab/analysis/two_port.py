@@ -81,7 +81,7 @@ def power_ratio(axis: OneAxis) -> float:
 
 
 def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
-    """Return H with the power at the slave's port multiplied by `ratio` > 0."""
+    """Return hybrid matrix H with the power at the slave's port multiplied by `ratio` > 0."""
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
         what = f"{np.min(ratio):g}, a factor of the slave's power, is not positive"
@@ -98,7 +98,7 @@ def power_scaled_matrices(H: Complex, axis: OneAxis) -> tuple[Complex, Complex]:
 
 
 def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
-    """Return H with impedances [N s/m] of hand and environment included."""
+    """Return hybrid matrix H with impedances [N s/m] of hand and environment included."""
     h11, h12, h21, h22 = matrix_entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)

@@ -14,6 +14,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.new_station.plan import StationPlan
 from drake_teleop.lab.new_station.random_postures import postures_at
+from drake_teleop.station.slave.model.model_repair import MISSING_SHAPES_TEXT
 from drake_teleop.station.slave.posture_shapes import PostureShapes
 
 _LINK_COLOURS = ((0.74, 0.77, 0.82), (0.52, 0.57, 0.65))
@@ -54,7 +55,7 @@ def draw_start_posture(plan: StationPlan, title: str) -> Figure:
         plane = round(plan.base_plane_height, 3) + 0.0  # not -0
         caption = f"tool (orange) {gap:.0f} mm above the wall; base plane: z_W = {plane:g} m; "
         caption += "axes of S: x red, y green, z blue; "
-        is_incomplete = any("shapes are missing of" in text for text in plan.assumptions)
+        is_incomplete = any(MISSING_SHAPES_TEXT in text for text in plan.assumptions)
         caption += "shapes of some links are missing" if is_incomplete else "meshes as convex hulls"
         caption += ", sticks replace them" if shapes.has_sticks else ""
         figure.supxlabel(caption, x=0.02, ha="left", fontsize=9, color=BLACK)

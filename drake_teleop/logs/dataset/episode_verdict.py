@@ -217,7 +217,7 @@ class HypothesisSearch:
         return self._best_fit(fit_from_rows)
 
     def best_lag(self, x: WrenchHypothesis) -> float:
-        """Return the lag [frames] at which hypothesis x has the least spread."""
+        """Return the lag [frames] at which the load of `x` leaves the least residual spread."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / TRIED_LAGS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)

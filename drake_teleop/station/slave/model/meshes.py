@@ -18,7 +18,11 @@ from drake_teleop.common.errors import silent_stderr
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import model_references
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
-from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
+from drake_teleop.station.slave.model.model_repair import (
+    MISSING_SHAPES_TEXT,
+    ModelRepair,
+    join_names,
+)
 
 _NUM_VALUES_BY_SHAPE_AND_SIZE = {
     "box": {"size": 3},
@@ -58,7 +62,7 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
             for shape in [*link.findall("collision"), *link.findall("visual")]:
                 link.remove(shape)
     for fault, links in lost.items():
-        model.add_repair("shapes are missing of", f"{join_names(links)}: {fault}")
+        model.add_repair(MISSING_SHAPES_TEXT, f"{join_names(links)}: {fault}")
 
 
 def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:

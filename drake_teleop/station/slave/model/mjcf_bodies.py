@@ -18,6 +18,7 @@ from drake_teleop.station.slave.model.mjcf_elements import (
     Mjcf,
     smallest_rotation_of_z_to,
 )
+from drake_teleop.station.slave.model.model_repair import MISSING_SHAPES_TEXT
 
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 # Numbers in size.
@@ -298,7 +299,7 @@ class MjcfWriter:
                 hull = self._add_mesh_asset(contact_mesh, hull=True)
                 SubElement(element, "geom", values | invisible | hull)
             except ValueError as error:
-                self._model.add_repair(f"{error}; shapes are missing of", body.name)
+                self._model.add_repair(f"{error}; {MISSING_SHAPES_TEXT}", body.name)
 
     def _add_mesh_asset(self, mesh: mjcf_meshes.Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull

@@ -18,7 +18,11 @@ from drake_teleop.station.slave.model import model_numbers
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint, MjcfWriter
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
-from drake_teleop.station.slave.model.model_repair import ModelRepair, join_names
+from drake_teleop.station.slave.model.model_repair import (
+    MISSING_SHAPES_TEXT,
+    ModelRepair,
+    join_names,
+)
 
 _DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 # Dynamics whose output has no range.
@@ -62,7 +66,7 @@ def repair_mjcf(model: ModelRepair) -> None:
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if shape.has_contact or not body.geoms:
-                model.add_repair(f"{fault}; shapes are missing of", body.name)
+                model.add_repair(f"{fault}; {MISSING_SHAPES_TEXT}", body.name)
     model.auxiliary_bodies = {body.name for body in bodies if body.is_auxiliary}
     model.raise_faults()
     model.text = MjcfWriter(mjcf).write(world, [] if purpose.is_scene else with_motor)

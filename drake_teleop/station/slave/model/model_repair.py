@@ -13,6 +13,7 @@ from xml.etree.ElementTree import Element
 from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 
+MISSING_SHAPES_TEXT = "shapes are missing of"
 _MAX_LISTED_NAMES = 12  # names in one statement
 
 
