@@ -164,13 +164,13 @@ def read_aligned_log(
     edge = alignment.is_near_ends(log, log.one_sided_s, cutoff_hz)
     candidates.append(AlignedLog(log, delay_s, source, log, edge))
 
-    def summed_logarithms_of_residual_spread(aligned: AlignedLog) -> float:
+    def sum_of_ln_robust_residual_widths(aligned: AlignedLog) -> float:
         log = aligned.log
         residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
         residual = low_pass(residual, log.dt, cutoff_hz)[~aligned.edge]
         return float(np.log(width_and_centre_of_narrowest_half(residual)[0] + 1e-12).sum())
 
-    return min(candidates, key=summed_logarithms_of_residual_spread)
+    return min(candidates, key=sum_of_ln_robust_residual_widths)
 
 
 def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:

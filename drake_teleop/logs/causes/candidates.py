@@ -47,7 +47,7 @@ _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERRO
 _MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
 _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD = 0.2
 _MAX_LOG_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
-_MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
+_SCORE_CAP_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +170,10 @@ def is_plausible(state: FittedModel) -> bool:
         return False  # a robot adds no weight
     if "frame" in parts and np.linalg.norm(state.x[parts["frame"]]) > _MAX_POSE_SHIFT_M:
         return False
-    return "cable" not in parts or max_cable_stiffness_n_m(state) < _MAX_CABLE_STIFFNESS_N_M
+    return "cable" not in parts or fitted_max_cable_stiffness_n_m(state) < _MAX_CABLE_STIFFNESS_N_M
 
 
-def max_cable_stiffness_n_m(state: FittedModel) -> float:
+def fitted_max_cable_stiffness_n_m(state: FittedModel) -> float:
     K = state.parameters_of_extension("cable")[0][3:9][SYMMETRIC_MATRIX_INDICES]
     return float(np.abs(np.linalg.eigvalsh(K)).max())
 
@@ -247,7 +247,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, num_extra=1)
     if not abs(value[0]) < limit:  # a factor beside the known ratios is not a cause
-        found = replace(found, score=min(found.score, _MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR))
+        found = replace(found, score=min(found.score, _SCORE_CAP_OF_UNKNOWN_TORQUE_FACTOR))
     yield found
 
 
@@ -278,14 +278,14 @@ def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
     total = float(np.trace(sums[WRENCH_SIGNALS, WRENCH_SIGNALS][:3, :3]))
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
 
-    def force_misfit(Q: Array) -> float:
-        right = np.einsum("dc,cdp->p", Q, cross)
+    def force_square_error(axes: Array) -> float:
+        right = np.einsum("dc,cdp->p", axes, cross)
         found = inverse @ right
         return total - float(right @ found) if found[0] > 0.0 else total
 
     identity, *others = signed_permutations()
-    best = min(others, key=force_misfit)
-    if force_misfit(best) < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * force_misfit(identity):
+    best = min(others, key=force_square_error)
+    if force_square_error(best) < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * force_square_error(identity):
         larger = state.refit(replace(state.model, axes=best), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
             found = _scored_candidate("axes", state, larger, num_extra=3)

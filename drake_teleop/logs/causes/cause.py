@@ -68,7 +68,7 @@ def name_misfit_causes(state: FittedModel, always_fitted: tuple[str, ...] = ()) 
     if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))
     out += [_gain_error_cause(state, c) for c in model.gain_channels]
-    changes = [_offset_or_load_step_cause(state, i) for i in range(len(model.steps))]
+    changes = [_cause_of_ith_offset_or_load_step(state, i) for i in range(len(model.steps))]
     changes += _contact_causes(state)
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
@@ -131,7 +131,7 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
                 f" {_format_vector(x / (angle + 1e-12), 'in S', '.2f')}"
             )
         case "cable":
-            stiffness = candidates.max_cable_stiffness_n_m(state)
+            stiffness = candidates.fitted_max_cable_stiffness_n_m(state)
             name, values = "cable", {"stiffness": stiffness}
             text = (
                 "a force that depends on the position acts on the load (about"
@@ -198,7 +198,7 @@ def _gain_error_cause(state: FittedModel, c: int) -> Finding:
     return Finding("gain", text, values={"channel": channel, "gain": 1.0 + float(value[0])})
 
 
-def _offset_or_load_step_cause(state: FittedModel, i: int) -> Finding:
+def _cause_of_ith_offset_or_load_step(state: FittedModel, i: int) -> Finding:
     step, (x, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     values: dict[str, object] = {"change": x.tolist()}

@@ -20,7 +20,7 @@ from drake_teleop.logs.causes.state import (
     score_statistic,
 )
 
-_MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
+_MIN_SCORE_STATISTIC_OF_STEP = 60.0
 _STEP_TIME_REFINEMENT_ROWS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
 MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
@@ -48,16 +48,16 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
     data, rows = state.data, state.data.rows_per_search_block
     scan = _StepTimeScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
-    gains = np.array([scan.likelihood_gain_of_step_at(int(n)) for n in starts])
+    gains = np.array([scan.score_statistic_of_step_at_row(int(n)) for n in starts])
     for time in state.model.step_times:
         gains[np.abs(data.t[starts] - time) < _MIN_TIME_BETWEEN_STEPS_S] = 0.0
     out: list[float] = []
     for _ in range(_NUM_TRIED_STEP_TIMES):
         j = int(np.argmax(gains))
-        if gains[j] < _MIN_LIKELIHOOD_GAIN_OF_STEP:
+        if gains[j] < _MIN_SCORE_STATISTIC_OF_STEP:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
-        time = float(data.t[max(near, key=scan.likelihood_gain_of_step_at)]) - 0.5 * data.dt
+        time = float(data.t[max(near, key=scan.score_statistic_of_step_at_row)]) - 0.5 * data.dt
         if all(abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in state.model.step_times):
             out.append(time)
         distance = max(2.0 * _MIN_TIME_BETWEEN_STEPS_S, 3.0 * rows * data.dt)
@@ -78,9 +78,9 @@ class _StepTimeScan:
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
 
-    def likelihood_gain_of_step_at(self, n: int) -> float:
-        j = -(-n // self._rows)
-        y = self._y[n : j * self._rows]
+    def score_statistic_of_step_at_row(self, row: int) -> float:
+        j = -(-row // self._rows)
+        y = self._y[row : j * self._rows]
         gram, right = _wrench_normal_equations(self._J, self._residual, y.T @ y)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
@@ -131,7 +131,7 @@ def remove_small_steps(state: FittedModel) -> FittedModel:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
             return state
-        least = min(small, key=lambda i: _squared_step_over_variance(state, i))
+        least = min(small, key=lambda i: _reduced_chi_squared_of_step(state, i))
         state = _refit_without_steps(state, [least], state.contact_spans)
 
 
@@ -144,7 +144,7 @@ def _refit_without_steps(
     return FittedModel.fit_record(state.data, model, x, contact_spans)
 
 
-def _squared_step_over_variance(state: FittedModel, i: int) -> float:
+def _reduced_chi_squared_of_step(state: FittedModel, i: int) -> float:
     x, covariance = state.parameters_of_extension(f"step {i}")
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
@@ -231,7 +231,7 @@ def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
         contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _fill_gaps_and_keep_long_runs(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
+        calm = _fill_single_gaps_keep_long_runs(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
     if not len(inner) or left.sum() > _MAX_UNFITTED_BLOCK_SHARE * blocks.usable.sum():
@@ -249,12 +249,12 @@ def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
     return found if found.residual_ratio < limit else None
 
 
-def _fill_gaps_and_keep_long_runs(flags: NDArray[np.bool_], min_length: int) -> NDArray[np.bool_]:
+def _fill_single_gaps_keep_long_runs(flags: NDArray[np.bool_], min_run: int) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
     for a, b in find_runs_of_true(closed):
-        out[a:b] = b - a >= min_length
+        out[a:b] = b - a >= min_run
     return out
 
 

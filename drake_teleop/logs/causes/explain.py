@@ -87,12 +87,12 @@ def search_causes(
         return found
     repeated = _search_causes_from(_fit_initial_model(means_at(delay_s), plain), delay_s, means_at)
     likelier = repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
-    better = likelier or _is_residual_much_smaller(repeated[0], found[0])
+    better = likelier or _has_much_smaller_residual_than(repeated[0], found[0])
     return repeated if better or residual_is_noise(repeated[0]) else found
 
 
-def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
-    return state.residual_ratio < _MUCH_SMALLER_RESIDUAL * other.residual_ratio
+def _has_much_smaller_residual_than(state: FittedModel, reference: FittedModel) -> bool:
+    return state.residual_ratio < _MUCH_SMALLER_RESIDUAL * reference.residual_ratio
 
 
 def may_be_coloured_noise(state: FittedModel) -> bool:
@@ -124,7 +124,7 @@ def _search_causes_from(
         if winner is None or (
             calmest is not None
             and calmest.name != "contact"
-            and _is_residual_much_smaller(calmest.state, winner.state)
+            and _has_much_smaller_residual_than(calmest.state, winner.state)
         ):
             winner = calmest
         if winner is None:
@@ -174,7 +174,7 @@ def _candidate_with_much_smaller_residual(
     state: FittedModel, found: list[Candidate]
 ) -> Candidate | None:
     small = [x for x in found if x.name in _CAUSES_LIKE_COLOURED_NOISE]
-    small = [x for x in small if _is_residual_much_smaller(x.state, state)]
+    small = [x for x in small if _has_much_smaller_residual_than(x.state, state)]
     least = min([x.state.residual_ratio for x in small], default=0.0)
     near = [x for x in small if x.state.residual_ratio < 2.0 * least]
     return min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name), default=None)

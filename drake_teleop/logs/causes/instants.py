@@ -223,8 +223,8 @@ def delay_of_linear_fit(data: BlockMeans) -> float:
     forces = data.y[rows][:, WRENCH_SIGNALS]
     total = (forces * forces).sum(axis=0)
 
-    def log_residual(shift: float) -> float:
-        x = spline(data.t[rows] + shift)
+    def sum_ln_squared_residuals(shift_s: float) -> float:
+        x = spline(data.t[rows] + shift_s)
         size = np.sqrt((x * x).mean(axis=0))
         x = x[:, size > 1e-9 * size.max()]
         x /= np.sqrt((x * x).mean(axis=0))
@@ -232,5 +232,5 @@ def delay_of_linear_fit(data: BlockMeans) -> float:
         left = total - ((x.T @ forces) * found).sum(axis=0)
         return float(np.log(np.maximum(left, 1e-12 * total + 1e-30)).sum())
 
-    delay, is_inside = search_minimum(log_residual, _DELAY_STEP_S, reach)
+    delay, is_inside = search_minimum(sum_ln_squared_residuals, _DELAY_STEP_S, reach)
     return delay if is_inside else 0.0

@@ -89,11 +89,11 @@ def covariance_of_load_by_gain_errors(state: FittedModel) -> Array:
     shown = values > 1e-9 * values[-1]
     seen, squares = values[shown], (vectors[:, shown].T @ right) ** 2 / values[shown]
 
-    def likelihood_with_gain_std(std: float) -> float:
-        more = std * std * seen
+    def twice_log_likelihood_ratio(gain_std: float) -> float:
+        more = gain_std * gain_std * seen
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
-    likely = np.array([likelihood_with_gain_std(std) for std in _TRIED_GAIN_ERROR_STDS])
+    likely = np.array([twice_log_likelihood_ratio(std) for std in _TRIED_GAIN_ERROR_STDS])
     explaining = squares.sum() > _MIN_SHARE_EXPLAINED_BY_GAINS * state.gain_by_smooth_signals[0]
     plausible = _TRIED_GAIN_ERROR_STDS[int(likely.argmax())] < _MAX_PLAUSIBLE_GAIN_ERROR_STD
     if likely.max() < _MIN_LIKELIHOOD_RISE_BY_GAINS or not explaining or not plausible:
