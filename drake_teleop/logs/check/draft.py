@@ -139,7 +139,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     """Return a log description guessed from names and magnitudes of columns."""
     plain = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
-    found |= _find_wrench_in_arrays(table, plain) | _find_quaternion(table, plain)
+    found |= _find_numbered_or_array_vectors(table, plain) | _find_quaternion(table, plain)
     ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
@@ -196,7 +196,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     return Draft(draft, head, tuple(_other_wrench_findings(table, plain, found)))
 
 
-def _find_wrench_in_arrays(table: Table, plain: _NamesAndUnits) -> _Columns:
+def _find_numbered_or_array_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
     numbered = _find_vectors_in_numbered_columns(plain)
     return numbered | _find_vectors_in_array_columns(table, plain)
 
@@ -212,7 +212,7 @@ def _other_wrench_findings(
         arrays = {name.partition("[")[0] for name in used}
         plain = {x: y for x, y in plain.items() if not {x, x.partition("[")[0]} & (used | arrays)}
         rest = replace(table, columns=ColumnsOnAccess(plain, table.columns.__getitem__))
-        other = _find_vectors(plain) | _find_wrench_in_arrays(rest, plain)
+        other = _find_vectors(plain) | _find_numbered_or_array_vectors(rest, plain)
         if any(_count_scalars_per_row(table, other.get(kind, [])) != 3 for kind in pair):
             return
         used = {x for kind in pair for x in other[kind]}

@@ -12,7 +12,7 @@ from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.logs.read.canonical import Log
 
 _MAX_COMPARED_SAMPLES, _MAX_MISFIT_RATIO_OF_MIRRORED_POSES = 600, 0.25
-_TEXT = (
+_LEFT_HANDED_POSES_MESSAGE = (
     "payload not identifiable: the wrench fits the poses only if they are mirrored, as in a"
     " left-handed world (Unity, Unreal); negate y of the positions and x and z of the quaternions,"
     " and inspect the log again"
@@ -50,4 +50,4 @@ def left_handed_pose_finding(
             valid = (is_mirrored == mirrored) & (phi[0] > 0.0)
             least[mirrored] = min(least[mirrored], unexplained[valid].min(initial=np.inf))
     limit = min(VALID_UNEXPLAINED, _MAX_MISFIT_RATIO_OF_MIRRORED_POSES * least[False])
-    return Finding("left-handed", _TEXT) if least[True] < limit else None
+    return Finding("left-handed", _LEFT_HANDED_POSES_MESSAGE) if least[True] < limit else None

@@ -27,7 +27,7 @@ def high_pass_finding(log: Log, delay_s: float) -> Finding | None:
             basis = np.linalg.qr(np.stack([np.ones(len(t)), t, decay], axis=1))[0]
             passed = _high_passed(V, cutoff, mean_time_step(t))
             for k, columns in enumerate((V, passed)):
-                misfit = _misfit(columns, wrench, basis)
+                misfit = _sum_squared_residuals(columns, wrench, basis)
                 fitting = cutoff if k and misfit < least[1] else fitting
                 least[k] = min(least[k], misfit)
     if not least[1] < _MAX_MISFIT_RATIO_OF_HIGH_PASS * least[0]:
@@ -47,8 +47,8 @@ def _high_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
     return np.asarray(lfilter([0.5 * (1.0 + a), -0.5 * (1.0 + a)], [1.0, -a], x - x[0], axis=0))
 
 
-def _misfit(V: Array, wrench: Array, basis: Array) -> float:
+def _sum_squared_residuals(V: Array, wrench: Array, trend_basis: Array) -> float:
     A, b = V.reshape(len(V), -1), wrench
-    A, b = A - basis @ (basis.T @ A), b - basis @ (basis.T @ b)
+    A, b = A - trend_basis @ (trend_basis.T @ A), b - trend_basis @ (trend_basis.T @ b)
     A, b = A.reshape(-1, V.shape[2]), b.ravel()
     return float(np.sum((b - A @ np.linalg.lstsq(A, b, rcond=1e-9)[0]) ** 2))
