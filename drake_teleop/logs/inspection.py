@@ -191,7 +191,7 @@ def _inspect_described_log(
             if note := tables[stream.source].note:
                 findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)
-        figures, more, rows = _inspect_stream(name, stream, table, source)
+        figures, more, rows = _inspect_stream_and_list_bad_rows(name, stream, table, source)
         summary["streams"][name] = figures
         findings += more
         bad.setdefault(stream.source, []).append(rows)
@@ -213,7 +213,7 @@ def _inspect_described_log(
     return findings
 
 
-def _inspect_stream(
+def _inspect_stream_and_list_bad_rows(
     name: str, stream: Any, table: Table, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [

@@ -26,7 +26,7 @@ from drake_teleop.logs.read.canonical import Log
 TRIED_LAGS_PER_FRAME = 8
 """Evenly spaced lags within one frame that are tried."""
 MAX_LAG_FRAMES = 8
-HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
+TRIED_WRENCH_CONVENTIONS = ("sensor", "weight removed", "base")
 """Wrenches of the load: in S; without its weight; in the axes of the base."""
 STANDARD_NORMAL_QUARTILE = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
@@ -38,7 +38,7 @@ _SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
 _NUM_START_FIT_PARTS, _MIN_HALF_WIDTH_OVER_TYPICAL = 4, 0.3
 _MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
-_MAX_RESIDUAL_STD_OVER_FRAME_NOISE = 1.5
+_STD_CAP_OVER_FRAME_DIFFERENCE_NOISE = 1.5
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class WrenchHypothesis:
     """Hypothetical relation of an episode's reading to the wrench of a load.
 
     Attributes:
-        kind: one of `HYPOTHESIS_KINDS`.
+        kind: one of `TRIED_WRENCH_CONVENTIONS`.
         lag: delay of the motion behind the wrench [frames].
         axes: rotations or mirrorings (3, 3) of the load's force and torque.
         gains: (2,) factors of force and torque.
@@ -99,7 +99,7 @@ def find_simplest_hypothesis_and_residual(
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual, search.unexplained_reading(usual)
     found = [usual]
-    for kind in HYPOTHESIS_KINDS:
+    for kind in TRIED_WRENCH_CONVENTIONS:
         best_lag = search.best_lag(replace(usual, kind=kind))
         for lag in {usual_lag, best_lag, search.lag_of_linear_fit(kind)}:
             found += search.hypotheses_at_lag(kind, lag)
@@ -291,7 +291,7 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * STANDARD_NORMAL_QUARTILE)
     by_spread = np.exp(spread) / STANDARD_NORMAL_QUARTILE
-    deviation = np.minimum(by_spread, _MAX_RESIDUAL_STD_OVER_FRAME_NOISE * noise)
+    deviation = np.minimum(by_spread, _STD_CAP_OVER_FRAME_DIFFERENCE_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -29,7 +29,7 @@ _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_MAX_ORIGIN_CHANGE_PER_UNKNOWN_PARAMETER = 1e-3
+_MAX_JACOBIAN_OF_DETERMINED_ORIGIN = 1e-3
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -288,7 +288,7 @@ def _pose_frame_from_free_fit(free: RigidFit, described: RigidParameters) -> Pos
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_CHANGE_PER_UNKNOWN_PARAMETER
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_JACOBIAN_OF_DETERMINED_ORIGIN
         deviations = np.where(lost, np.inf, deviations)
     moved = free.parameters.p_PoSo_P - described.p_PoSo_P
     turned = Rotation.from_matrix(described.R_PS.T @ free.parameters.R_PS).as_rotvec()
