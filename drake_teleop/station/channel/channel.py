@@ -22,7 +22,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 from drake_teleop.station.stepped_block import SteppedBlock
 
-_CUSTOM_AND_PRESET_NAMES = ("custom", *PRESETS)
+_NETWORK_PRESET_CHOICES = ("custom", *PRESETS)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
 _TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
@@ -33,7 +33,7 @@ _TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence 
 class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
-    network: str = choice("custom", _CUSTOM_AND_PRESET_NAMES, "a preset, or custom for these fields")
+    network: str = choice("custom", _NETWORK_PRESET_CHOICES, "a preset, or custom for these fields")
     backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
     timeout: float | None = quantity(
         None, "s", 1e-3, MAX_TIMEOUT_S,
