@@ -74,7 +74,7 @@ _MASTER_POSE_AND_INVALID_FLAG_SLOTS = _layout.vector(8)
 _SLAVE_POSE_AND_INVALID_FLAG_SLOTS = _layout.vector(8)  # the same of the slave's pose
 _RENDERED_HAND_WRENCH_SLOTS = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH_SLOTS = _layout.vector(6)  # slave's wrench at the last step
-_TIME_SINCE_INVALID_WRENCH_SLOT = _layout.number()  # time since the last invalid wrench [s]
+_TIME_SINCE_LAST_INVALID_WRENCH_SLOT = _layout.number()  # time since the last invalid wrench [s]
 _MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _SILENCE_MONITOR_SIZES)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = map(_layout.vector, [slots.MEMORY_SIZE] * 2)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
@@ -105,7 +105,7 @@ def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array
     ends = np.zeros(_MASTER_AND_SLAVE_STATE_SIZE)
     ends[_MASTER_POSE_AND_INVALID_FLAG_SLOTS][:7] = start
     ends[_SLAVE_POSE_AND_INVALID_FLAG_SLOTS][:7] = start
-    ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = safe_state.STOP_TIME_S
+    ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = safe_state.STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -205,19 +205,19 @@ def step_slave_end(
     load = memory[slots.LOAD_WRENCH]
     if not (are_valid_port_values(wrench_B) and are_valid_port_values(load_B)):
         valid = False
-        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = 0.0
+        ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = 0.0
     elif saturated:
-        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = 0.0
+        ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
         _rotate_and_scale_wrench_to_world_into(wrench_B, frame, wrench)
-        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_INVALID_WRENCH_SLOT], T)
+        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _rotate_and_scale_wrench_to_world_into(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] += T
+        ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
