@@ -18,7 +18,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
-from drake_teleop.robots.compensator import SCALE_NAMES, STALE_AGE_S, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -118,7 +118,7 @@ def run_compensate_command(
         options: scales of a `Compensator`, and options of `open_source`.
     """
     found = Identification.load(load)
-    scales = {name: options.pop(name) for name in SCALE_NAMES if name in options}
+    scales = {name: options.pop(name) for name in SIGMA_GAMMA_NAMES if name in options}
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:

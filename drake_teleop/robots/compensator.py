@@ -36,10 +36,10 @@ RELATIVE_RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
-SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
+SIGMA_GAMMA_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 """Arguments of `Compensator.set_scales`."""
-_MAX_OFFSET_DRIFTS_N_AND_NM = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
-MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_OFFSET_DRIFTS_N_AND_NM, 3)
+_MAX_FORCE_TORQUE_OFFSET_DRIFT = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
+MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_FORCE_TORQUE_OFFSET_DRIFT, 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_CHECK_READINGS, _RATE_CHECK_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_STAMP_S = 1e12  # [s]

@@ -138,19 +138,19 @@ def _make_template_renderer(name: str) -> Callable[[ExportedLoad], str]:
 
 
 _RENAME_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
-_DEFAULTS_OF_SENSOR_FORMATS: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
-_FORMAT_OPTIONS: dict[str, dict[str, Any]] = {
+_SENSOR_FORMAT_PROPERTIES: dict[str, Any] = {"of_sensor": True, "inertia": False, "comment": "#"}
+_FORMAT_PROPERTIES: dict[str, dict[str, Any]] = {
     "ur": {"comment": "#"},
     "franka": {"note": "transformation is the identity: use that of your end effector"},
     "xarm": {"inertia": False, "comment": "#"},
     "kth": {
-        **_DEFAULTS_OF_SENSOR_FORMATS,
+        **_SENSOR_FORMAT_PROPERTIES,
         "offsets": True,
         "note": f"{_RENAME_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
         " compensated force is twice the weight, change the sign of the mass",
     },
-    "ft_tools": _DEFAULTS_OF_SENSOR_FORMATS | {"offsets": True},
-    "ros2-admittance": _DEFAULTS_OF_SENSOR_FORMATS | {"note": _RENAME_FRAME_NOTE},
+    "ft_tools": _SENSOR_FORMAT_PROPERTIES | {"offsets": True},
+    "ros2-admittance": _SENSOR_FORMAT_PROPERTIES | {"note": _RENAME_FRAME_NOTE},
     "bota": {
         "of_sensor": True,
         "offsets": True,
@@ -162,7 +162,7 @@ _FORMAT_OPTIONS: dict[str, dict[str, Any]] = {
 }
 FORMATS = Registry(
     "export format",
-    {name: Format(_make_template_renderer(name), **each) for name, each in _FORMAT_OPTIONS.items()},
+    {key: Format(_make_template_renderer(key), **own) for key, own in _FORMAT_PROPERTIES.items()},
     Format,
 )
 """Export formats by name."""

@@ -165,12 +165,12 @@ class _SampleSeries:
         self.min_offset = min(self.min_offset, reading.arrival - reading.t)
         return True
 
-    def times_and_values(self, width: int, num_invalid: int) -> tuple[Array, Array]:
+    def times_and_values(self, num_columns: int, num_rejected_in_error: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
-            counts = f"{len(self.t)} valid and {num_invalid} invalid readings"
+            counts = f"{len(self.t)} valid and {num_rejected_in_error} invalid readings"
             what, remedy = f"{counts} received (minimum: 2 valid)", "check the source's address"
             raise DrakeTeleopError(what, where="calibrate", remedy=remedy)
-        return np.array(self.t), np.array(self._values).reshape(-1, width)
+        return np.array(self.t), np.array(self._values).reshape(-1, num_columns)
 
 
 def _duration_of_shortest_stream_s(record: dict[str, _SampleSeries]) -> float:

@@ -22,7 +22,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 from drake_teleop.station.stepped_block import SteppedBlock
 
-_NETWORK_CHOICES = ("custom", *PRESETS)
+_NETWORK_PRESET_CHOICES = ("custom", *PRESETS)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
 _TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
@@ -33,7 +33,7 @@ _TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence 
 class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
-    network: str = choice("custom", _NETWORK_CHOICES, "a preset, or custom for these fields")
+    network: str = choice("custom", _NETWORK_PRESET_CHOICES, "a preset, or custom for these fields")
     backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
     timeout: float | None = quantity(
         None, "s", 1e-3, MAX_TIMEOUT_S,
@@ -68,13 +68,13 @@ class Channel(NetworkConfig):
 _SILENCE_MONITOR_SIZES = safe_state.MASTER_MONITOR_SIZE, safe_state.SLAVE_MONITOR_SIZE
 _MASTER_AND_SLAVE_STATE_SIZE = 2 + 2 * (8 + 6 + slots.MEMORY_SIZE) + sum(_SILENCE_MONITOR_SIZES)
 _layout = slots.SlotAllocator(_MASTER_AND_SLAVE_STATE_SIZE)
-_STEP_COUNT = _layout.number()
+_STEP_COUNT_SLOT = _layout.number()
 # Last finite commanded pose (7); 1 if the newest one is not finite.
 _MASTER_POSE_AND_INVALID_FLAG_SLOTS = _layout.vector(8)
 _SLAVE_POSE_AND_INVALID_FLAG_SLOTS = _layout.vector(8)  # the same of the slave's pose
 _RENDERED_HAND_WRENCH_SLOTS = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH_SLOTS = _layout.vector(6)  # slave's wrench at the last step
-_TIME_SINCE_INVALID_WRENCH_SLOT = _layout.number()  # time since the last invalid wrench [s]
+_TIME_SINCE_LAST_INVALID_WRENCH_SLOT = _layout.number()  # time since the last invalid wrench [s]
 _MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = map(_layout.vector, _SILENCE_MONITOR_SIZES)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = map(_layout.vector, [slots.MEMORY_SIZE] * 2)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
@@ -105,7 +105,7 @@ def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array
     ends = np.zeros(_MASTER_AND_SLAVE_STATE_SIZE)
     ends[_MASTER_POSE_AND_INVALID_FLAG_SLOTS][:7] = start
     ends[_SLAVE_POSE_AND_INVALID_FLAG_SLOTS][:7] = start
-    ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = safe_state.STOP_TIME_S
+    ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = safe_state.STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -133,8 +133,8 @@ def step_channel(
         ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
         wrench_received: (7,) written: F_E_B to render, and contact flag of the newest packet.
     """
-    k = int(ends[_STEP_COUNT])
-    ends[_STEP_COUNT] += 1.0
+    k = int(ends[_STEP_COUNT_SLOT])
+    ends[_STEP_COUNT_SLOT] += 1.0
     received, packet = np.zeros(fields.PACKET_SIZE), np.empty(fields.PACKET_SIZE)
     _, fresh = network.receive_packet(backward_parameters, backward, k, received)
     step_master_end(
@@ -170,7 +170,7 @@ def step_master_end(
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
     if are_valid_port_values(hand_B):
-        _transform_master_wrench_to_world_into(hand_B, frame, hand)
+        _rotate_and_scale_wrench_to_world_into(hand_B, frame, hand)
     else:
         valid = False
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
@@ -184,7 +184,7 @@ def step_master_end(
     )  # fmt: skip
     if not valid:
         packet[fields.SENDER_INPUTS_FINITE] = 0.0
-    _transform_world_wrench_to_master_into(held, frame, wrench_received[_RECEIVED_WRENCH])
+    _rotate_and_scale_wrench_to_master_into(held, frame, wrench_received[_RECEIVED_WRENCH])
     wrench_received[_RECEIVED_CONTACT_FLAG] = received[fields.CONTACT_FLAG]
 
 
@@ -205,19 +205,19 @@ def step_slave_end(
     load = memory[slots.LOAD_WRENCH]
     if not (are_valid_port_values(wrench_B) and are_valid_port_values(load_B)):
         valid = False
-        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = 0.0
+        ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = 0.0
     elif saturated:
-        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] = 0.0
+        ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
-        _transform_master_wrench_to_world_into(wrench_B, frame, wrench)
-        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_INVALID_WRENCH_SLOT], T)
+        _rotate_and_scale_wrench_to_world_into(wrench_B, frame, wrench)
+        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
-        _transform_master_wrench_to_world_into(load_B, frame, wrench)
+        _rotate_and_scale_wrench_to_world_into(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_TIME_SINCE_INVALID_WRENCH_SLOT] += T
+        ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
@@ -254,7 +254,7 @@ def _update_pose_and_twist(pose, before, T, dx, twist):
 
 
 @njit(cache=True)
-def _transform_master_wrench_to_world_into(wrench_B, frame, out):
+def _rotate_and_scale_wrench_to_world_into(wrench_B, frame, out):
     R_WB, scales = matrix_at(frame, _R_WB_ROWS.start), frame[_MOTION_SCALES]
     for g in range(2):
         rotated = apply_matrix(R_WB, vector_at(wrench_B, 3 * g))
@@ -263,7 +263,7 @@ def _transform_master_wrench_to_world_into(wrench_B, frame, out):
 
 
 @njit(cache=True)
-def _transform_world_wrench_to_master_into(wrench, frame, out):
+def _rotate_and_scale_wrench_to_master_into(wrench, frame, out):
     R_BW, scales = transposed(matrix_at(frame, _R_WB_ROWS.start)), frame[_MOTION_SCALES]
     for g in range(2):
         rotated = apply_matrix(R_BW, vector_at(wrench, 3 * g))

@@ -58,19 +58,19 @@ FRICTION_TANH_SPEED_RAD_S = 0.01  # rad/s, estimate
 _STOP_STIFFNESSES, _STOP_DAMPINGS = np.repeat([300.0, 5.0], 3), np.repeat([1.5, 0.01], 3)
 
 # Moments of inertia of the point masses of the links.
-_LINK_1_INERTIA = L1**2 * (MASS_A + MASS_C / 4)
-_LINK_2_INERTIA, _LINK_3_INERTIA = L2**2 * MASS_A / 4, L3**2 * MASS_C
+_LINK_1_STEINER_TERM = L1**2 * (MASS_A + MASS_C / 4)
+_LINK_2_STEINER_TERM, _LINK_3_STEINER_TERM = L2**2 * MASS_A / 4, L3**2 * MASS_C
 # Terms of M11 [kg m^2]: constant, times cos 2 q2, times cos 2 q3, 2 _M23_MAX times cos q2 sin q3.
 _inertia_sum = sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
-_constant_terms = _inertia_sum + _LINK_1_INERTIA + _LINK_2_INERTIA + _LINK_3_INERTIA
+_constant_terms = _inertia_sum + _LINK_1_STEINER_TERM + _LINK_2_STEINER_TERM + _LINK_3_STEINER_TERM
 _M11_CONSTANT_TERM_KG_M2 = INERTIA_BASE_YY + 0.5 * _constant_terms
-_cosine_terms = INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + _LINK_1_INERTIA
+_cosine_terms = INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + _LINK_1_STEINER_TERM
 _M11_COS2Q2 = 0.5 * _cosine_terms
 _cosine_terms = INERTIA_A[1] - INERTIA_A[2] + INERTIA_DF[1] - INERTIA_DF[2]
-_M11_COS2Q3 = 0.5 * (_cosine_terms - _LINK_2_INERTIA - _LINK_3_INERTIA)
+_M11_COS2Q3 = 0.5 * (_cosine_terms - _LINK_2_STEINER_TERM - _LINK_3_STEINER_TERM)
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
-_M22_KG_M2 = INERTIA_BE[0] + INERTIA_C[0] + _LINK_1_INERTIA
-_M33_KG_M2 = INERTIA_A[0] + INERTIA_DF[0] + _LINK_2_INERTIA + _LINK_3_INERTIA
+_M22_KG_M2 = INERTIA_BE[0] + INERTIA_C[0] + _LINK_1_STEINER_TERM
+_M33_KG_M2 = INERTIA_A[0] + INERTIA_DF[0] + _LINK_2_STEINER_TERM + _LINK_3_STEINER_TERM
 _REFLECTED_MOTOR_INERTIAS_KG_M2 = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
 _GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
 _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
