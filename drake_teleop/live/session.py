@@ -231,7 +231,7 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        has_new_channel = inputs.channel_choices != self.inputs.channel_choices
+        has_new_channel = inputs.channel_and_method_inputs != self.inputs.channel_and_method_inputs
         wait_s = station.take_over_state(self._station, has_new_channel)
         if wait_s:
             self._channel_filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
