@@ -274,7 +274,7 @@ class Live:
         self._resume_if_device_sends(now)
         if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
-            self._run_and_stop_session_on_failure(self._session.write_log)
+            self._run_and_stop_session_on_failure(self._session.write_record_and_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
         show_now = self._show_now and now >= self._last_frame_at + _MIN_TIME_BETWEEN_PAGE_FRAMES_S
         if now < self._frame_due and not show_now:
