@@ -194,7 +194,7 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
         for i in random.integers(0, len(packet), random.integers(1, 40)):
             packet[i] = random.integers(256)
         cut = bytes(packet[: random.integers(len(packet))] if k % 10 == 0 else packet)
-        link._handle_packet(cut, "peer", 1e-3 * k)
+        link._accept_or_refuse_packet(cut, "peer", 1e-3 * k)
         led = link.hand_inputs(1e-3 * k)
         wrong += not all(np.isfinite(value) for value in led.values())
         state = unpack_state(cut)

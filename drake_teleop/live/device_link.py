@@ -80,10 +80,10 @@ class DeviceLink:
                 packet, peer = self._socket.recvfrom(MAX_PACKET_BYTES + 1)
             except (BlockingIOError, ConnectionError):
                 break
-            self._handle_packet(packet, peer, now)
+            self._accept_or_refuse_packet(packet, peer, now)
         return None if self.is_device_silent(now) else self._state
 
-    def _handle_packet(self, packet: bytes, peer: Any, now: float) -> None:
+    def _accept_or_refuse_packet(self, packet: bytes, peer: Any, now: float) -> None:
         state, silent = unpack_state(packet), self.is_device_silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1

@@ -295,8 +295,8 @@ class ExternalMaster(framework.LeafSystem):
         self.DeclareDiscreteState(np.zeros(_DISPLAY_STATE_SIZE))
         moves, displayed = {self.all_parameters_ticket(), self.time_ticket()}, {self.xd_ticket()}
         for name, size, calc, needed in (
-            ("pose_master", 7, weak_callback(self._calc_pose), moves),
-            ("twist_master", 6, weak_callback(self._calc_twist), moves),
+            ("pose_master", 7, weak_callback(self._calc_master_pose), moves),
+            ("twist_master", 6, weak_callback(self._calc_master_twist), moves),
             ("master_state", 12, weak_callback(self._calc_master_state), moves),
             ("force_to_master", 6, _copy_state(slice(_FAULT_INDEX)), displayed),
             ("fault_at_hand", 1, _copy_state(slice(_FAULT_INDEX, _ALLOWED_SHARE_INDEX)), displayed),
@@ -308,7 +308,7 @@ class ExternalMaster(framework.LeafSystem):
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
         """Interpolate the device's X_BE to `target` (7,) over 2 ms; None: the hand lets go."""
-        now, held, motion = self._current_pose_and_twist(context)[:7], 0.0, np.zeros(6)
+        now, held, motion = self._current_master_pose_and_twist(context)[:7], 0.0, np.zeros(6)
         if target is not None:
             turn = vectors.quaternion_product(
                 tuple(target[:4]), vectors.conjugate_quaternion(tuple(now[:4]))
@@ -322,19 +322,19 @@ class ExternalMaster(framework.LeafSystem):
     ) -> None:
         """Do nothing: a real hand has its own impedance."""
 
-    def _current_pose_and_twist(self, context: Context) -> Array:
+    def _current_master_pose_and_twist(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
         _pose_and_twist_on_path_into(path, context.get_time(), self._pose_and_twist)
         return self._pose_and_twist
 
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._current_pose_and_twist(context)[:7])
+    def _calc_master_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._current_master_pose_and_twist(context)[:7])
 
-    def _calc_twist(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._current_pose_and_twist(context)[7:])
+    def _calc_master_twist(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._current_master_pose_and_twist(context)[7:])
 
     def _calc_master_state(self, context: Context, output: BasicVector) -> None:
-        pose = self._current_pose_and_twist(context)
+        pose = self._current_master_pose_and_twist(context)
         rotation = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
         angles = (rotation.yaw_angle(), rotation.pitch_angle(), rotation.roll_angle())
         output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])

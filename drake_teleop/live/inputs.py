@@ -135,7 +135,7 @@ class Inputs:
         return (*choices, *line)
 
     @property
-    def channel_choices(self) -> tuple[int, ...]:
+    def channel_and_method_inputs(self) -> tuple[int, ...]:
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:

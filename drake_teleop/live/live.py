@@ -111,7 +111,7 @@ class Live:
 
     Attributes:
         refused: number of invalid messages.
-        stopped: failure that stops the simulation, or "".
+        stop_reason: failure that stops the simulation, or "".
         requested_scene: scene requested by a page, or ""; the simulation waits for `change_scene`.
         recorded: folders of completed records.
 
@@ -138,7 +138,7 @@ class Live:
         self.refused, self.requested_scene, self.scene = 0, "", SCENE_NAMES[0]
         self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
         self._driver: int | None = None
-        self._drives, self._paused, self.stopped = 0, False, ""
+        self._drives, self._paused, self.stop_reason = 0, False, ""
         self.recorded: list[str] = []
         self._write_error = ""
         self._idle_since = now
@@ -159,7 +159,7 @@ class Live:
         scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=device)
-        self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
+        self._cockpit, self.stop_reason = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._touched = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()
@@ -176,9 +176,9 @@ class Live:
         self._restart_session(now)
 
     def _restart_session(self, now: float) -> None:
-        self.stopped = ""
+        self.stop_reason = ""
         self._run_and_stop_session_on_failure(self.end_session)
-        failure = self.stopped
+        failure = self.stop_reason
         self._run_and_stop_session_on_failure(lambda: self._start_session(now))
         self._refusal = failure
 
@@ -250,12 +250,12 @@ class Live:
         self._asleep = False
 
     @property
-    def ms(self) -> int:
+    def simulated_ms(self) -> int:
         return self._session.ms
 
     @property
     def is_halted(self) -> bool:
-        return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
+        return self._paused or self._asleep or bool(self.stop_reason or self.requested_scene)
 
     def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
@@ -274,7 +274,7 @@ class Live:
         self._resume_if_device_sends(now)
         if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
-            self._run_and_stop_session_on_failure(self._session.write_log)
+            self._run_and_stop_session_on_failure(self._session.write_record_and_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
         show_now = self._show_now and now >= self._last_frame_at + _MIN_TIME_BETWEEN_PAGE_FRAMES_S
         if now < self._frame_due and not show_now:
@@ -296,7 +296,7 @@ class Live:
         try:
             action()
         except _EXCEPTIONS_THAT_STOP_SESSION as error:
-            self.stopped = to_one_line(str(error))
+            self.stop_reason = to_one_line(str(error))
 
     def _simulate_time_slice(self, now: float) -> None:
         self._requested = self._rates.advance_inputs(self._requested, 1e-3 * self._slice_ms, now)
@@ -311,20 +311,20 @@ class Live:
         except _EXCEPTIONS_THAT_STOP_SESSION as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
-                self.stopped = to_one_line(str(error))
+                self.stop_reason = to_one_line(str(error))
             else:  # there is no such station: keep the present one
                 self._refusal = to_one_line(str(error))
                 removed = {name: getattr(present, name) for name in live_inputs.STATION_SWAP_INPUTS}
                 self._requested = self._requested.with_changes(removed)
-        if not self.stopped:
+        if not self.stop_reason:
             self._run_and_stop_session_on_failure(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.contact_force() > MIN_DISPLAYED_TOUCH_FORCE_N
             self._show_now |= pressed and not self._touched
             self._touched = pressed
-        if self._link is not None and not self.stopped:
+        if self._link is not None and not self.stop_reason:
             self._link.send_wrench(self._session.device_wrench())
         if self._session.ms >= live_inputs.MAX_DURATION_MS:
-            self.stopped = "the limit of ten hours of simulated time is reached"
+            self.stop_reason = "the limit of ten hours of simulated time is reached"
 
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()
@@ -353,14 +353,14 @@ class Live:
             "drive": self._drives,
             "scene": self.requested_scene or self.scene,
             "record": self._folder,
-            "stopped": self.stopped,
+            "stopped": self.stop_reason,
             "inputs": dict(vars(inputs)),
         }
 
     def _session_state_name(self) -> str:
         if self.requested_scene:
             return "preparing"
-        if self.stopped:
+        if self.stop_reason:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 

@@ -54,7 +54,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 _LOOPBACK_ADDRESS = "127.0.0.1"
 _MAX_CONNECTED_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
-_EVENT_LOOP_ITERATIONS_PER_MESSAGE = 3
+_LOOP_ITERATIONS_PER_RECEIVED_MESSAGE = 3
 _MAX_UNSENT_BYTES_OF_PAGE = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
@@ -82,7 +82,7 @@ class LiveDrive:
             make_folder(record)
         self.ended, self.ms = "", 0
         self._views: dict[str, PageScene] = {}
-        self._prepare_scenes(setup, device is not None)
+        self._build_scenes_and_compile(setup, device is not None)
         self._pages: dict[ServerConnection, int] = {}
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
@@ -104,7 +104,7 @@ class LiveDrive:
         self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
         self._threads[-1].start()
 
-    def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
+    def _build_scenes_and_compile(self, scenario: Scenario, device: bool) -> None:
         with show_progress(True) as stage:
             self._load = _identify_load(scenario, stage)
             progress = stage("Prepare the station and its 3D scenes")
@@ -209,7 +209,7 @@ class LiveDrive:
         try:
             await self._simulate_and_send_frames(server)
         finally:
-            self.ended, self.ms = self._live.stopped, self._live.ms
+            self.ended, self.ms = self._live.stop_reason, self._live.simulated_ms
             try:
                 self._live.close()
             finally:
@@ -238,7 +238,7 @@ class LiveDrive:
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.time_to_next_tick(time.perf_counter()))
-        for _ in range(_EVENT_LOOP_ITERATIONS_PER_MESSAGE):
+        for _ in range(_LOOP_ITERATIONS_PER_RECEIVED_MESSAGE):
             await asyncio.sleep(0)
 
     async def _identify_load_and_change_scene(self) -> None:

@@ -231,7 +231,7 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        has_new_channel = inputs.channel_choices != self.inputs.channel_choices
+        has_new_channel = inputs.channel_and_method_inputs != self.inputs.channel_and_method_inputs
         wait_s = station.take_over_state(self._station, has_new_channel)
         if wait_s:
             self._channel_filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
@@ -300,7 +300,7 @@ class Session:
         cross_fade, context = self._station.block_and_context("cross_fade")
         return float(cross_fade.force_above_limit(context))
 
-    def write_log(self) -> None:
+    def write_record_and_log(self) -> None:
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
@@ -323,7 +323,7 @@ class Session:
                 record.close(self.ms, self.inputs)
         finally:
             if record is None or self.ms:
-                self.write_log()
+                self.write_record_and_log()
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,10 @@ PARAMETER_NAMES = (
 PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 """Unit of each parameter."""
 
-MAX_IDENTIFIED_STD_SHARE = 0.05
+MAX_IDENTIFIED_SCALED_STD = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
-_MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _G_M_S2 = 0.5, 0.03, 9.81
+_MAX_WEAKLY_IDENTIFIED_SCALED_STD, _MIN_LOAD_SIZE_M, _G_M_S2 = 0.5, 0.03, 9.81
 _OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 # Names in the file that are computed from the fields.
 _DERIVED_FILE_FIELDS = ("mass", "com", "inertia_com", "physically_consistent")
@@ -109,7 +109,7 @@ class Identification:
         "prior": `prior_dominated`.
         """
         share = self.standard_deviations / natural_scales(self.phi)
-        weakly = np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not")
+        weakly = np.where(share <= _MAX_WEAKLY_IDENTIFIED_SCALED_STD, "weakly", "not")
         rest = np.where(self.prior_dominated, "prior", weakly)
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
@@ -199,7 +199,7 @@ def com_standard_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    return standard_deviations <= MAX_IDENTIFIED_STD_SHARE * natural_scales(phi)
+    return standard_deviations <= MAX_IDENTIFIED_SCALED_STD * natural_scales(phi)
 
 
 def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:

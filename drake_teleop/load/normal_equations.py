@@ -48,7 +48,7 @@ _SAME_POSE_DISTANCE_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 _MAX_ROUNDING_OVER_WRENCH = 1e-6
 # Indices of wrench, specific force and products w_i w_j in z.
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
-_OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+_OMEGA_PRODUCTS_IN_Z = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +136,8 @@ class SecondMoments:
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
-        products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
-        jacobians = omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19)
+        products = self.mean_products[0, _OMEGA_PRODUCTS_IN_Z]
+        jacobians = omega_product_jacobians(_OMEGA_PRODUCTS_IN_Z, 19)
         for std, J in zip(noise.motion[1], jacobians, strict=True):
             Q += std**2 * J.T @ products @ J
         return Q
@@ -232,7 +232,7 @@ class SecondMoments:
         # An unfinished last block would have the weight of a full one.
         blocks = self._blocks[: last + (filled == length)]
         while len(blocks) > _MIN_DOF_OF_VARIANCE:
-            rows = _regressors_of_blocks(blocks)
+            rows = _regressor_sums_of_blocks(blocks)
             square_sums = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
             estimated, counted, absorbed = self._unbiased_residual_variances(
@@ -273,7 +273,7 @@ class SecondMoments:
         s = blocks[:, _SPECIFIC_FORCE_COLUMNS] / count[:, None]
         first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_DISTANCE_M_S2).argmax(axis=1)
         groups = (np.unique(first)[:, None] == first).astype(float)
-        sums = groups @ (blocks[:, _WRENCH_COLUMNS] - _regressors_of_blocks(blocks) @ theta)
+        sums = groups @ (blocks[:, _WRENCH_COLUMNS] - _regressor_sums_of_blocks(blocks) @ theta)
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
         left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.num_samples - len(groups))
         within = np.maximum(squares - between, repeats * min_variance) / max(repeats, 1.0)
@@ -412,7 +412,7 @@ def _pseudo_inverse(
     return root @ root.T, undetermined, float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
 
 
-def _regressors_of_blocks(blocks: Array) -> Array:
+def _regressor_sums_of_blocks(blocks: Array) -> Array:
     return np.asarray(np.einsum("cjk,bk->bcj", regressor_coefficients(), blocks))
 
 

@@ -32,9 +32,9 @@ SAMPLE_WRENCH_AND_MOTION = slice(0, 15)
 SATURATION_FLAG_INDEX = 15  #: above 0.5 the wrench is not valid
 #: From this value of the saturation flag on, the reading was lost or impossible: the sample is an
 #: old one. The excess counts the samples with remaining effects.
-LOST_SAMPLE_FLAG = 2.0
+MIN_LOST_SAMPLE_FLAG_VALUE = 2.0
 FIRST_JOINT_INDEX = 16
-SAMPLE_JOINT_POSITION = slice(FIRST_JOINT_INDEX, None)
+SAMPLE_JOINT_POSITIONS = slice(FIRST_JOINT_INDEX, None)
 SAMPLE_TIME_INDEX = -1  #: [s], only in the output of the wrist sensor
 
 

@@ -17,7 +17,7 @@ from drake_teleop.live.experiment.design import (
     Experiment,
 )
 from drake_teleop.live.experiment.guided import (
-    PARTICIPANT_INPUTS,
+    HAND_MOTION_INPUTS,
     GuidedExperiment,
     parse_experiment_message,
 )
@@ -202,7 +202,7 @@ def test_10000_random_messages_change_only_permitted_inputs():
     for found in filter(None, heard):
         assert set(found) <= {"set", "drive", "go", "answer"}
         assert found.get("answer", 1) in (1, 2) and set(found.get("set", {})) <= set(
-            PARTICIPANT_INPUTS
+            HAND_MOTION_INPUTS
         )
     for bad in (
         b"{}",

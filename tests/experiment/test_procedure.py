@@ -40,7 +40,7 @@ SHORT = dataclasses.replace(
 
 def run_participant(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
     """Run a participant whose answers depend on the level, or until a number of trials."""
-    while procedure.phase != "end" and procedure.trial_number < most:
+    while procedure.phase != "end" and procedure.num_completed_trials < most:
         if procedure.phase == "interval":
             force = 5.0 if isinstance(procedure.task, ContactDetection) else 50.0
             result = IntervalResult(procedure.current_level, force, done=True, time_s=1.0)
@@ -77,7 +77,7 @@ def test_participant_continues_with_the_same_levels(tmp_path):
     first.advance_phase()
     first.finish_interval(IntervalResult(first.current_level))
     again = Procedure(SMALL, 3, cut)
-    assert (again.phase, again.trial_number) == ("consent", 17)
+    assert (again.phase, again.num_completed_trials) == ("consent", 17)
     run_participant(again, rng, 2.0)
     assert cut.participant_file(3).read_bytes() == whole.participant_file(3).read_bytes()
     assert len(cut.read_rows(3)) == len(plan_trials(SMALL, 3))
@@ -89,10 +89,10 @@ def run_numbered(folder: str) -> None:
         procedure = Procedure(SHORT, 1, store)
         while procedure.phase != "end":
             if procedure.phase == "answer":
-                right = procedure.trial_number % 4 != 2
+                right = procedure.num_completed_trials % 4 != 2
                 signal = procedure.trial.signal_interval
                 procedure.store_answer(signal if right else 3 - signal, 0.5)
-                print(procedure.trial_number, flush=True)
+                print(procedure.num_completed_trials, flush=True)
             elif procedure.phase == "interval":
                 procedure.finish_interval(
                     IntervalResult(procedure.current_level, force_N=5.0, done=True, time_s=1.0)
@@ -123,12 +123,12 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
 
 def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_path):
     procedure = Procedure(SMALL, 1, TrialStore(tmp_path))
-    before = procedure.trial_number
+    before = procedure.num_completed_trials
     procedure.advance_phase(), procedure.advance_phase(), procedure.advance_phase()
     assert procedure.phase == "interval"
     procedure.store_answer(1, 0.1)  # not in the phase of an answer
     procedure.finish_interval(IntervalResult(valid=False))
-    assert (procedure.phase, procedure.is_repeated, procedure.trial_number) == (
+    assert (procedure.phase, procedure.is_repeated, procedure.num_completed_trials) == (
         "ready",
         True,
         before,
@@ -151,7 +151,7 @@ def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
         other = dataclasses.replace(SMALL, conditions=conditions)
         procedure = Procedure(other, 1, TrialStore(tmp_path / str(names)))
         seen = []
-        while procedure.phase != "end" and procedure.trial_number < 12:
+        while procedure.phase != "end" and procedure.num_completed_trials < 12:
             seen.append(procedure.page_state())
             if procedure.phase == "interval":
                 procedure.finish_interval(IntervalResult(procedure.current_level))

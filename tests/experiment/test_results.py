@@ -49,7 +49,10 @@ def test_intervals_have_different_random_numbers():
         with_interval_seed(
             Scenario(),
             SimpleNamespace(
-                trial_number=trial, interval=k, participant=person, experiment=Experiment(seed=seed)
+                num_completed_trials=trial,
+                interval=k,
+                participant=person,
+                experiment=Experiment(seed=seed),
             ),
         ).simulation.seed
         for trial in range(4)
@@ -74,7 +77,7 @@ def test_simulated_insertion_averages_the_contact_force_over_20_ms_as_for_people
         monkeypatch.setattr(simulated, name, lambda *_, value=value, **__: value)
     apparatus = make_apparatus(PegInSlot(), Condition(name="a"), base, None)
     procedure = SimpleNamespace(
-        trial_number=0, interval=1, participant=1, experiment=Experiment(seed=0)
+        num_completed_trials=0, interval=1, participant=1, experiment=Experiment(seed=0)
     )
     inserted = simulated._simulate_peg_insertion(apparatus, procedure)
     assert inserted.force_N == pytest.approx((19 * 3.0 + math.hypot(3.0, 90.0)) / 20)

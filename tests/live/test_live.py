@@ -272,7 +272,7 @@ def test_failed_reset_is_reported_and_the_next_one_restarts(
 def test_simulation_waits_without_a_page(scenario, load, clock, tmp_path):
     live = make(scenario, load, clock)
     frames = pass_time(live, clock, 0.5)
-    assert live.ms == 0 and frames[-1]["state"] == "waiting"
+    assert live.simulated_ms == 0 and frames[-1]["state"] == "waiting"
 
 
 def test_short_delays_are_caught_up_and_long_ones_given_up():

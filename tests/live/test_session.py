@@ -68,7 +68,7 @@ def driven(scenario, load, tmp_path_factory):
         session.advance()
         if session.ms % 50 == 0:
             session.new_rows()
-            session.write_log()
+            session.write_record_and_log()
     session.close()
     return folder, SimulationResult.read_parquet(folder / "log.parquet")
 

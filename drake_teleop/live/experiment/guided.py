@@ -38,7 +38,7 @@ _FRAME_KEYS_SHOWN_TO_PARTICIPANT = (
 _HIDDEN_FRAME_KEY_PLACEHOLDERS = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
 
 #: Names of the inputs that move the hand.
-PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
+HAND_MOTION_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 class GuidedExperiment:
@@ -74,7 +74,7 @@ class GuidedExperiment:
         self._stimulus = self._apparatus.stimulus_scales(
             procedure.current_level, procedure.expected_contact_force
         )
-        name = f"{procedure.trial_number:04}-{procedure.interval}"
+        name = f"{procedure.num_completed_trials:04}-{procedure.interval}"
         self._live = Live(
             with_interval_seed(self._apparatus.scenario, procedure),
             self._apparatus.load,
@@ -148,13 +148,13 @@ class GuidedExperiment:
         if procedure.phase == INTERVAL_PHASE:
             moves = {kind: message[kind] for kind in message.keys() & {"set", "rates"}}
             self._live.handle_message(client, json.dumps(moves), now)
-        before = procedure.phase, procedure.trial_number
+        before = procedure.phase, procedure.num_completed_trials
         if "answer" in message:
             with self._catch_write_error():
                 procedure.store_answer(message["answer"], now - self._phase_start)
         elif "go" in message:
             procedure.advance_phase()
-        if (procedure.phase, procedure.trial_number) == before:
+        if (procedure.phase, procedure.num_completed_trials) == before:
             return
         self._prepare_interval_if_changed(now)
         self._phase_start = now
@@ -167,12 +167,12 @@ class GuidedExperiment:
         return max(0.0, self._frame_due - now)
 
     @property
-    def stopped(self) -> str:
-        return self._live.stopped
+    def stop_reason(self) -> str:
+        return self._live.stop_reason
 
     @property
-    def ms(self) -> int:
-        return self._live.ms
+    def simulated_ms(self) -> int:
+        return self._live.simulated_ms
 
     @property
     def _is_interval_running(self) -> bool:
@@ -198,7 +198,7 @@ class GuidedExperiment:
         task, live = self._procedure.task, self._live
         slot = isinstance(task, PegInSlot)
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
-        if live.ms < 1e3 * length and not (slot and self._rows.done_at):
+        if live.simulated_ms < 1e3 * length and not (slot and self._rows.done_at):
             return
         live.frame()
         level = self._procedure.current_level
@@ -211,9 +211,9 @@ class GuidedExperiment:
         inner = self._live.frame()
         rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._is_interval_running else [0.0, 0.0]
         task = self._procedure.task
-        length = task.timeout if isinstance(task, PegInSlot) else task.interval
-        left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
-        inputs = vars(Inputs()) | {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
+        end = task.timeout if isinstance(task, PegInSlot) else task.interval
+        left = max(0.0, 1.0 - 1e-3 * self.simulated_ms / end) if self._is_interval_running else 0.0
+        inputs = vars(Inputs()) | {name: inner["inputs"][name] for name in HAND_MOTION_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _FRAME_KEYS_SHOWN_TO_PARTICIPANT if name in inner},
@@ -240,7 +240,7 @@ def parse_experiment_message(text: Any) -> dict[str, Any] | None:
     found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:
         found[kind] = {
-            name: value for name, value in message[kind].items() if name in PARTICIPANT_INPUTS
+            name: value for name, value in message[kind].items() if name in HAND_MOTION_INPUTS
         }
     return found or None
 
@@ -257,7 +257,7 @@ class ExperimentDrive(LiveDrive):
         self._stations = make_apparatuses(procedure.experiment, scenarios)
         super().__init__(scenarios[0], None, port, device)
 
-    def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
+    def _build_scenes_and_compile(self, scenario: Scenario, device: bool) -> None:
         for task in range(len(self._procedure.experiment.tasks)):
             setup = self._stations[task, 0].scenario
             self._views[str(task)] = PageScene(str(task), setup, forces=False)
@@ -286,7 +286,7 @@ def serve_experiment(
     if browser:
         webbrowser.open(live.url)
     reason = live.announce_and_wait(f"participant {who}")
-    done, trials = procedure.trial_number, len(procedure.trials)
+    done, trials = procedure.num_completed_trials, len(procedure.trials)
     what = f"participant {who} has done {done} of {trials} trials"
     if live.ended:
         what = f"the simulation has stopped: {live.ended}; {what}"

@@ -93,12 +93,12 @@ class Procedure:
         self._prepare_trial()
 
     @property
-    def trial_number(self) -> int:
+    def num_completed_trials(self) -> int:
         return len(self._rows)
 
     @property
     def trial(self) -> PlannedTrial:
-        return self.trials[min(self.trial_number, len(self.trials) - 1)]
+        return self.trials[min(self.num_completed_trials, len(self.trials) - 1)]
 
     @property
     def task(self) -> Task:
@@ -127,7 +127,7 @@ class Procedure:
 
     def advance_phase(self) -> None:
         if self.phase == CONSENT_PHASE:
-            self.phase = END_PHASE if self.trial_number >= len(self.trials) else TASK_PHASE
+            self.phase = END_PHASE if self.num_completed_trials >= len(self.trials) else TASK_PHASE
         elif self.phase in (TASK_PHASE, BREAK_PHASE):
             self.phase = READY_PHASE
         elif self.phase == READY_PHASE:
@@ -165,7 +165,7 @@ class Procedure:
     def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
         trial, results = self.trial, self._results
         row = TrialRow(
-            trial=self.trial_number,
+            trial=self.num_completed_trials,
             task=type(self.task).__name__,
             condition=self.experiment.conditions[trial.condition].name,
             practice=int(trial.practice),
@@ -195,22 +195,22 @@ class Procedure:
             self._psi[trial.task, trial.condition].update_posterior(row.level, bool(row.correct))
 
     def _start_next_trial(self) -> None:
-        before = self.trials[self.trial_number - 1]
-        if self.trial_number == len(self.trials):
+        before = self.trials[self.num_completed_trials - 1]
+        if self.num_completed_trials == len(self.trials):
             self.phase = END_PHASE
             return
         self._prepare_trial()
         practised = before.practice and not self.trial.practice
         if self.trial.task != before.task:
             self.phase = TASK_PHASE
-        elif practised or self.trial_number % self.experiment.break_after == 0:
+        elif practised or self.num_completed_trials % self.experiment.break_after == 0:
             self.phase = BREAK_PHASE
         else:
             self.phase = READY_PHASE
 
     def page_state(self) -> dict[str, Any]:
         # FEEDBACK_PHASE belongs to the finished trial.
-        number = self.trial_number - (self.phase == FEEDBACK_PHASE)
+        number = self.num_completed_trials - (self.phase == FEEDBACK_PHASE)
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,

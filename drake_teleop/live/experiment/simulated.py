@@ -52,7 +52,7 @@ def make_apparatuses(
 
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
-    number = 2 * procedure.trial_number + procedure.interval
+    number = 2 * procedure.num_completed_trials + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
 
@@ -79,11 +79,11 @@ def simulate_participant(
         elif procedure.phase == GAP_PHASE:
             procedure.start_second_interval()
         elif procedure.phase == ANSWER_PHASE:
-            key = [experiment.seed, procedure.participant, procedure.trial_number, 3]
+            key = [experiment.seed, procedure.participant, procedure.num_completed_trials, 3]
             rng = np.random.default_rng(key)
             answer = answer_by_larger_response(experiment.simulated, responses, rng)
             procedure.store_answer(answer, 0.5)
-            progress(procedure.trial_number, len(procedure.trials))
+            progress(procedure.num_completed_trials, len(procedure.trials))
         else:
             procedure.advance_phase()
 

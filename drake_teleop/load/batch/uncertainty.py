@@ -97,7 +97,7 @@ class BaseParameters:
         for c in self.weak_directions:
             if (
                 np.count_nonzero(c.coefficients) == 1
-                or c.relative_std > identification.MAX_IDENTIFIED_STD_SHARE
+                or c.relative_std > identification.MAX_IDENTIFIED_SCALED_STD
             ):
                 percent = 100.0 * c.relative_std
                 share = f"{percent:.0f} % of" if percent < 100.0 else "more than"

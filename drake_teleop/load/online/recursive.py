@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
 from drake_teleop.load.batch.uncertainty import is_prior_dominated
 from drake_teleop.load.identification import (
-    MAX_IDENTIFIED_STD_SHARE,
+    MAX_IDENTIFIED_SCALED_STD,
     Identification,
     is_precise_enough,
 )
@@ -200,7 +200,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_STD_SHARE),
+            identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_SCALED_STD),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -210,7 +210,7 @@ class RecursiveEstimator(ABC):
         )
 
     def _are_identified(self, deviations: Array, theta: Array, max_std: float) -> NDArray[np.bool_]:
-        scaled = deviations * (MAX_IDENTIFIED_STD_SHARE / max_std)
+        scaled = deviations * (MAX_IDENTIFIED_SCALED_STD / max_std)
         from_data = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return from_data & is_precise_enough(scaled, theta[6:])
 

@@ -26,7 +26,7 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 # Relative increase of diagonal elements against rounding.
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `normal_equations`.
-_WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
+_WRENCH_START_IN_Z, _OMEGA_PRODUCTS_IN_Z = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _Z_INDICES_IN_BATCH_ORDER = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_COMPENSATED_INFORMATION_EXCESS = 4.0
@@ -57,7 +57,7 @@ def write_products_vector(wrench, motion, z):
     z[0], z[1:4], z[4:7], z[_WRENCH_START_IN_Z:] = 1.0, motion[:3], motion[6:], wrench
     for i in range(3):
         for j in range(i + 1):
-            z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
+            z[_OMEGA_PRODUCTS_IN_Z[i, j]] = omega[i] * omega[j]
 
 
 @njit(cache=True)
@@ -108,8 +108,8 @@ def noise_products(Z, noise_std, motion_std, Q):
         # The derivative of w_i w_k by w_k is w_i, or 2 w_i for i = k.
         for i in range(3):
             for j in range(3):
-                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCT_INDICES[i, j]]
-                row, column = _OMEGA_PRODUCT_INDICES[i, k], _OMEGA_PRODUCT_INDICES[j, k]
+                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCTS_IN_Z[i, j]]
+                row, column = _OMEGA_PRODUCTS_IN_Z[i, k], _OMEGA_PRODUCTS_IN_Z[j, k]
                 Q[row, column] += motion_std[3 + k] ** 2 * both
 
 
@@ -303,12 +303,12 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     @property
     def noise_scale(self) -> float:
         """Ratio of observed to specified noise variances."""
-        return self._normal_equations(self._theta, self._memory)[2]
+        return self._gram_noise_part_and_scale(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         """Return the covariance (16, 16); poorly excited directions keep the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
-        G, N, scale = self._normal_equations(theta, memory)
+        G, N, scale = self._gram_noise_part_and_scale(theta, memory)
         root = np.linalg.inv(_regularized_cholesky(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
@@ -321,7 +321,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
         return self._limit_variances_to_prior(factor @ factor.T + unknown @ unknown.T)
 
-    def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
+    def _gram_noise_part_and_scale(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0

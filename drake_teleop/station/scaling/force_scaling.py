@@ -146,7 +146,7 @@ def find_sample_fault(sample, estimate, time, sample_limits):
     """
     if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= sample_limits[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.LOST_SAMPLE_FLAG
+    reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.MIN_LOST_SAMPLE_FLAG_VALUE
     reading = reading and are_valid_port_values(sample[regressor.SAMPLE_MOTION])
     for i in range(6):
         reading = reading and abs(sample[i]) <= sample_limits[i]

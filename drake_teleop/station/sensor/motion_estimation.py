@@ -237,7 +237,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     """
     constants, n = constants[0], sample.shape[0] - regressor.FIRST_JOINT_INDEX
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
-    angles, gravity = sample[regressor.SAMPLE_JOINT_POSITION], motion[:3]
+    angles, gravity = sample[regressor.SAMPLE_JOINT_POSITIONS], motion[:3]
     _equalize_signal_delays(constants, memory, n, reading, sample)
     if arm.shape[0] == 0:
         copy_into(motion, 3, angles, 0, 3)
@@ -263,7 +263,7 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX
     if not are_values_plausible(chain, truth):  # keeps it out of the filters
-        sample[flag] = regressor.LOST_SAMPLE_FLAG + NUM_FLAGGED_SAMPLES_AFTER_LOSS
+        sample[flag] = regressor.MIN_LOST_SAMPLE_FLAG_VALUE + NUM_FLAGGED_SAMPLES_AFTER_LOSS
         return
     lost = sample[flag] - 1.0
     if ideal:
@@ -274,13 +274,13 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
         reading = np.empty(truth.shape[0] - 2)
         read_sensor_into(chain, chain_memory, noise, truth, reading)
         estimate_sample_into(estimator, estimator_memory, arm, reading, sample)
-    if lost >= regressor.LOST_SAMPLE_FLAG:
+    if lost >= regressor.MIN_LOST_SAMPLE_FLAG_VALUE:
         sample[flag] = lost
 
 
 @njit(cache=True)
 def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
-    sections, angles = constants.angle_low_passes[:], sample[regressor.SAMPLE_JOINT_POSITION]
+    sections, angles = constants.angle_low_passes[:], sample[regressor.SAMPLE_JOINT_POSITIONS]
     filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * num_joints][5 * num_joints :]
     copy_into(angles, 0, reading, READ_ANGLES.start, num_joints)
     if memory[0] == 0.0:

@@ -464,7 +464,7 @@ def sample_at_rest(arm: serial_arm.ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
     true_sample_into(arm.table, arm.phi_load, q, still, still, np.zeros(6), sample)
-    sample[regressor.SAMPLE_JOINT_POSITION] = q
+    sample[regressor.SAMPLE_JOINT_POSITIONS] = q
     return sample
 
 
