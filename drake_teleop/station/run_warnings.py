@@ -171,7 +171,7 @@ def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario)
             "move more slowly, or use another passivity method",
         )
     yield from _check_speed_limit_of_energy_reserve(result, scenario)
-    window += oscillation.MAX_COMMAND_REVERSAL_LAG_S
+    window += oscillation.MAX_REVERSAL_RESPONSE_S
     oscillating = flag_pose_oscillation(t, sent, received, window)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     advice = "use another passivity method or network"
