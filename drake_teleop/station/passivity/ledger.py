@@ -36,7 +36,7 @@ _UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_PER_S = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
 _WITHHELD_WRENCH_RECOVERY_S = 0.1
-_MAX_HAND_ACCELERATION_M_PER_S2 = 5.0  # m/s^2
+_HAND_ACCELERATION_BOUND_M_PER_S2 = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED_M_PER_S = 0.02  # m/s
 _WORK_AND_RETREAT_FADE_AT_REST_S = 0.1
 _HAND_DEADBAND_WIDTH_ENCODER_STEPS = 1.1
@@ -351,7 +351,7 @@ def _limit_group_wrench_to_stored_energy(g, dx, T, p, memory, wrench):
         displacement = dot_of_group(wrench, memory[shared.FILTERED_OWN_VELOCITY], g) / size * T
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
-            cost += size * _MAX_HAND_ACCELERATION_M_PER_S2 * shared.ANGLE_PER_LENGTH[g] * T * T
+            cost += size * _HAND_ACCELERATION_BOUND_M_PER_S2 * shared.ANGLE_PER_LENGTH[g] * T * T
     unused = _UNUSED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     most = min(T * _MAX_LEDGER_DRAIN_PER_S, 1.0) * max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)

@@ -252,7 +252,7 @@ def _update_contact_fit_and_rendered_force(received, in_contact, dx, wrench, T, 
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _update_max_displayed_stiffness(received, T, p, memory)
-    max_change = _update_max_force_change_by_slip(wrench, size, T, p, memory)
+    max_change = _estimate_max_force_change_by_slip(wrench, size, T, p, memory)
     inward, rate = -work_along(normal, dx), min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
@@ -310,7 +310,7 @@ def _is_wall_removed(dx, memory):
 
 
 @njit(cache=True)
-def _update_max_force_change_by_slip(wrench, normal_force, T, p, memory):
+def _estimate_max_force_change_by_slip(wrench, normal_force, T, p, memory):
     mean_wrench = memory[MEAN_CONTACT_WRENCH]
     mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - normal_force**2, 0.0))
