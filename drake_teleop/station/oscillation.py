@@ -17,7 +17,7 @@ Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].
 _MIN_SWING_M, _MIN_SWING_RAD = 5e-4, np.deg2rad(0.5)
-MAX_REVERSAL_LAG_S = 0.25
+COMMAND_REVERSAL_WINDOW_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
 MAX_FORCE_RIPPLE_RMS_AT_REST_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
@@ -52,7 +52,7 @@ def reversal_indices(x: Array, min_swing: float) -> NDArray[np.intp]:
 
 
 def flag_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, window: float = MAX_REVERSAL_LAG_S
+    t: Array, command: Array, actual: Array, swing: float, window: float = COMMAND_REVERSAL_WINDOW_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
@@ -74,7 +74,7 @@ def flag_unexplained_oscillation(
 
 
 def flag_pose_oscillation(
-    t: Array, command: Array, actual: Array, window: float = MAX_REVERSAL_LAG_S
+    t: Array, command: Array, actual: Array, window: float = COMMAND_REVERSAL_WINDOW_S
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
 

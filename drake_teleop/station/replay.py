@@ -48,7 +48,7 @@ _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
 _WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
 _STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
 _HAND_GRIP_P_E_M = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_ARM_WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
+_SLAVE_WRIST_P_S_M = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
 _WRIST_ARROW_OFFSET_W_M = np.array([0.07, -0.09, 0.0])
 _TIP_ARROW_OFFSET_W_M = np.array([-0.06, 0.0, 0.0])
@@ -241,7 +241,7 @@ class ReplayScene:
     def _show_force_arrows(self, replay_time: float, signals: Signals, sample: int) -> None:
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _ARM_WRIST_P_S + _WRIST_ARROW_OFFSET_W_M,
+            "wrist": X_WS @ _SLAVE_WRIST_P_S_M + _WRIST_ARROW_OFFSET_W_M,
             "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W_M,
         }
         if self._device is not None:
@@ -259,10 +259,10 @@ class ReplayScene:
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
-        X_WF = joint.frame_on_parent().CalcPoseInWorld(self.context)
-        X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+        X_WJp = joint.frame_on_parent().CalcPoseInWorld(self.context)
+        X_BodyJc = joint.frame_on_child().GetFixedPoseInBodyFrame()
         q, first = self.plant.GetPositions(self.context), joint.position_start()
-        moved = surroundings.joint_positions_of_pose(joint, X_WF.inverse() @ X_WBody @ X_BM)
+        moved = surroundings.joint_positions_of_pose(joint, X_WJp.inverse() @ X_WBody @ X_BodyJc)
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 

@@ -57,7 +57,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_faults(result),
         _check_reached_limits(result, scenario, arm),
         _check_channel_silence_and_lag(result, scenario),
-        _check_joint_motion(result, scenario, arm),
+        _check_joint_tracking(result, scenario, arm),
         _check_hand_oscillation(result),
         _check_contact_chatter(result),
         _check_rendered_force_oscillation(result),
@@ -171,7 +171,7 @@ def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario)
             "move more slowly, or use another passivity method",
         )
     yield from _check_speed_limit_of_energy_reserve(result, scenario)
-    window += oscillation.MAX_REVERSAL_LAG_S
+    window += oscillation.COMMAND_REVERSAL_WINDOW_S
     oscillating = flag_pose_oscillation(t, sent, received, window)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     advice = "use another passivity method or network"
@@ -228,7 +228,7 @@ def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joint_motion(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
+def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]

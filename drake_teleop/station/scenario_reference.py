@@ -93,17 +93,17 @@ def _yaml_of_nested_block(entry: FieldInfo) -> list[str]:
         return _yaml_of_field(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.list_depth:
-        return _prefix_lines("# ", _yaml_of_field(entry, blocks))
-    return [line for block in blocks for line in _prefix_lines("# ", _yaml_of_field(entry, block))]
+        return _prefix_all("# ", _yaml_of_field(entry, blocks))
+    return [line for block in blocks for line in _prefix_all("# ", _yaml_of_field(entry, block))]
 
 
 def _yaml_of_field(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.list_depth:
         head = f"{entry.name}:{_yaml_tag(entry, value)}  # {entry.meaning}"
-        return [head, *_prefix_lines("  ", _yaml_of_block(value))]
+        return [head, *_prefix_all("  ", _yaml_of_block(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_yaml_tag(entry, item)}", *_prefix_lines(" " * 4, _yaml_of_block(item))]
+        lines += [f"  -{_yaml_tag(entry, item)}", *_prefix_all(" " * 4, _yaml_of_block(item))]
     return lines
 
 
@@ -111,5 +111,5 @@ def _yaml_tag(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 
-def _prefix_lines(prefix: str, lines: list[str]) -> list[str]:
+def _prefix_all(prefix: str, lines: list[str]) -> list[str]:
     return [prefix + line for line in lines]

@@ -53,7 +53,7 @@ from drake_teleop.station.passivity.packet import (
     move_pose_into,
     pose_difference_into,
 )
-from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange_tank_energy
+from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _update_tank_and_send_energy
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
@@ -350,7 +350,7 @@ def test_tank_with_fastest_sending_is_not_overdrawn():
         memory, packet = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
         full = memory[STORED_ENERGY].copy()
         assert np.all(full > 0.0)
-        _exchange_tank_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
+        _update_tank_and_send_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
         reserve = 0.01 * np.array(config.capacity)
         np.testing.assert_allclose(memory[STORED_ENERGY], reserve, rtol=1e-9)
         np.testing.assert_allclose(memory[STORED_ENERGY] + memory[SENT_ENERGY], full, rtol=1e-12)
@@ -371,7 +371,7 @@ def test_full_tank_discards_the_rest():
     p = method_parameters(PassivityConfig(method="two_layer", two_layer=config))
     memory, received = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
     received[CUMULATIVE_ENERGY] = 0.1
-    _exchange_tank_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
+    _update_tank_and_send_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
     np.testing.assert_allclose(memory[STORED_ENERGY], config.capacity)
     lost = np.add(config.initial, 0.1) - config.capacity
     np.testing.assert_allclose(memory[DISSIPATED_ENERGY], lost)
@@ -383,5 +383,5 @@ def test_overdrawn_tank_keeps_its_deficit():
     memory, received = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
     memory[STORED_ENERGY] = -1e-3
     received[CUMULATIVE_ENERGY] = 4e-4
-    _exchange_tank_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
+    _update_tank_and_send_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
     np.testing.assert_allclose(memory[STORED_ENERGY], -6e-4, rtol=1e-12)

@@ -143,9 +143,9 @@ class HapticDevice:
         """Return the joints' mass matrix (6, 6), including the hand."""
         J, M, device = self.jacobian(q), np.empty((6, 6)), self.parameters
         if self.is_phantom:
-            phantom.mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
+            phantom.joint_mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
         else:
-            task_space.mass_matrix_into(J, device, M)
+            task_space.joint_mass_matrix_into(J, device, M)
         return M
 
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:

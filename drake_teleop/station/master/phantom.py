@@ -109,7 +109,7 @@ def jacobian_into(q, J):
 
 
 @njit(cache=True)
-def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
+def joint_mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J (6, 6) is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
     for i in range(3):
@@ -191,7 +191,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
-    mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
+    joint_mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
     gravity_compensation_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]

@@ -36,7 +36,7 @@ def jacobian_into(q, J):
 
 
 @njit(cache=True)
-def mass_matrix_into(J, device, M):
+def joint_mass_matrix_into(J, device, M):
     M[:, :] = 0.0
     inertia = device.inertia + device.hand_inertia
     for i in range(3):

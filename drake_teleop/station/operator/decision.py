@@ -122,7 +122,7 @@ _STEPS_PER_EYE_FIXATION = 50  # steps of a fixation, 0.25 s
 _STATION_RESPONSE_TIME_S = 0.05  # end of a move to its effect, without network, estimate
 _APPROACH_UPDATE_PERIOD_S = 0.3  # s, update interval of the careful approach, estimate
 # Largest perceived depth without contact; beyond, the operator gives up; estimate.
-_MAX_APPROACH_DEPTH_M = 0.03
+_GIVE_UP_DEPTH_M = 0.03
 _MIN_TRUST_IN_FELT_CONTACT = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_ASSUMED_STIFFNESS, _MIN_ASSUMED_STIFFNESS, _MAX_ASSUMED_STIFFNESS = 2000.0, 200.0, 50000.0
@@ -298,7 +298,7 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING
         _enter_phase(state, memory, phase, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _MAX_APPROACH_DEPTH_M:
+    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_DEPTH_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed

@@ -26,7 +26,7 @@ _MIN_FRICTION_RELAXATION_S, _FRICTION_SLIP_SPEED = 0.1, 1e-3
 _FRICTION_TORQUE_RELAXATION_S, _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS = 0.6, 30.0
 _ROTATION_FRICTION_STIFFNESS_FACTOR, _MAX_FRICTION_COEFFICIENT = 4.0, 1.0
 _MIN_WRENCH_METRIC_WEIGHT = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
-_MAX_PREDICTED_FORCE_RISE_N = 3.0
+_MAX_FORCE_ABOVE_TWICE_RECEIVED_N = 3.0
 _MAX_REMEMBERED_WALL_FORCE_N = 10.0
 _MAX_SAME_WALL_DISTANCE_M, _MIN_SAME_WALL_COSINE = 5e-3, 0.7
 _MAX_FORGET_WALL_DEPTH_M, _FORGET_WALL_FORCE_N, _MIN_FORGET_WALL_DEPTH_M = 3e-3, 1.0, 1e-3
@@ -36,7 +36,7 @@ _UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_PER_S = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
 _WITHHELD_WRENCH_RECOVERY_S = 0.1
-_MAX_HAND_ACCELERATION_M_PER_S2 = 5.0  # m/s^2
+_HAND_ACCELERATION_BOUND_M_PER_S2 = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED_M_PER_S = 0.02  # m/s
 _WORK_AND_RETREAT_FADE_AT_REST_S = 0.1
 _HAND_DEADBAND_WIDTH_ENCODER_STEPS = 1.1
@@ -251,7 +251,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     force = size
     if size > 0.0:
         change = k * penetration + damper * (hand_speed - speed)
-        force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTED_FORCE_RISE_N)
+        force = min(max(size - change, 0.0), 2.0 * size + _MAX_FORCE_ABOVE_TWICE_RECEIVED_N)
     # A hand that was let go moves out of a soft wall without end, so its force fades.
     retreat = max(memory[_HAND_RETREAT_DISTANCE] + work_along(normal, dx), 0.0)
     if abs(hand_speed) < _FULL_DRAG_HAND_SPEED_M_PER_S:
@@ -351,7 +351,7 @@ def _limit_group_wrench_to_stored_energy(g, dx, T, p, memory, wrench):
         displacement = dot_of_group(wrench, memory[shared.FILTERED_OWN_VELOCITY], g) / size * T
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
-            cost += size * _MAX_HAND_ACCELERATION_M_PER_S2 * shared.ANGLE_PER_LENGTH[g] * T * T
+            cost += size * _HAND_ACCELERATION_BOUND_M_PER_S2 * shared.ANGLE_PER_LENGTH[g] * T * T
     unused = _UNUSED_MASTER_RESERVE_SHARE * p[shared.MASTER_RESERVE][g]
     most = min(T * _MAX_LEDGER_DRAIN_PER_S, 1.0) * max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
     share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)

@@ -25,7 +25,7 @@ _MAX_SLAVE_REST_SPEED_M_PER_S = 0.05  # m/s
 _ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 5.0, 50.0  # 1/s
 _LONGEST_DELAY_DECAY_TIME_CONSTANT_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
-_HAND_PRESSING_SPEED = 0.06  # m/s
+_ASSUMED_PRESS_SPEED = 0.06  # m/s
 _MIN_FIT_SAMPLE_LENGTH_M, _MIN_FAST_FIT_SAMPLE_LENGTH_M = 2e-4, 2e-3
 _MIN_FIT_SPAN_M, _MAX_FIT_SPAN_M = 1e-3, 1e-2
 _MIN_SPEED_FOR_FAST_FIT_M_PER_S = 0.15  # m/s
@@ -39,7 +39,7 @@ _COMMAND_FILTER_S, _MAX_COMMAND_ACCELERATION, _STOPPING_SPEED_FACTOR = 0.01, 30.
 _MAX_SILENCE_WITH_FEEDFORWARD_S = 0.02
 _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS, _MAX_SILENCE_FOR_GAIN_S = 0.5, 0.06
 _MOTOR_ENERGY_PREDICTION_HORIZON_S = 4e-3
-_MAX_WALL_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
+_MAX_SLAVE_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
 _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
@@ -218,7 +218,7 @@ def _servo_lag_s(p):
 @njit(cache=True)
 def _update_max_displayed_stiffness(received, T, p, memory):
     normal, fill_level = memory[CONTACT_DIRECTION], 0.0
-    depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
+    depth, base = _ASSUMED_PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
     for g in range(2):
         travel = ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth
         reserve = p[MASTER_RESERVE][g]
@@ -252,7 +252,7 @@ def _update_contact_fit_and_rendered_force(received, in_contact, dx, wrench, T, 
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _update_max_displayed_stiffness(received, T, p, memory)
-    max_change = _update_max_force_change_by_slip(wrench, size, T, p, memory)
+    max_change = _estimate_max_force_change_by_slip(wrench, size, T, p, memory)
     inward, rate = -work_along(normal, dx), min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
@@ -310,7 +310,7 @@ def _is_wall_removed(dx, memory):
 
 
 @njit(cache=True)
-def _update_max_force_change_by_slip(wrench, normal_force, T, p, memory):
+def _estimate_max_force_change_by_slip(wrench, normal_force, T, p, memory):
     mean_wrench = memory[MEAN_CONTACT_WRENCH]
     mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - normal_force**2, 0.0))
@@ -388,7 +388,7 @@ def _limit_group_motor_wrench_to_energy(g, damping, twist, p, memory):
     changed = False
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
-        free = _MAX_WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
+        free = _MAX_SLAVE_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
         spring = (1.0 + memory[_STIFFNESS_GAIN_MINUS_ONE]) * free * free
         spring /= 2.0 * max(memory[_CONTACT_STIFFNESS], 1.0)
         available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_ENERGY_IN_CONTACT][g])

@@ -57,7 +57,7 @@ SLAVE_MASS = _parameter_layout.vector(2)  #: mass of the slave at its tool [kg, 
 SLAVE_PER_MASTER_MOTION = _parameter_layout.vector(2)
 #: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion
 #: [m/s, rad/s].
-RETREAT_SPEED = _parameter_layout.vector(2)
+FORCE_FADE_HAND_SPEED = _parameter_layout.vector(2)
 _METHOD_PARAMETER_SLICE = _parameter_layout.rest()
 
 

@@ -194,7 +194,7 @@ def method_parameters(
     p[slots.SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_MASS_AND_INERTIA, power_scale)
     p[slots.SLAVE_PER_MASTER_MOTION] = motion_scale
     fades = config.method != "none"
-    p[slots.RETREAT_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf
+    p[slots.FORCE_FADE_HAND_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf
     own = config.method_config()
     if own is not None:
         own.pack_into(p)
@@ -235,7 +235,7 @@ def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
 
 
 @njit(cache=True)
-def _set_packet_number_and_health(healthy, memory, packet):
+def _number_packet_or_repeat_last_healthy(healthy, memory, packet):
     if healthy:
         packet[fields.SENDER_INPUTS_FINITE] = 1.0
         copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, fields.PACKET_SIZE)
@@ -275,7 +275,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         fade_retreat_wrench(twist, T, p, memory, wrench)
-    _set_packet_number_and_health(healthy, memory, packet)
+    _number_packet_or_repeat_last_healthy(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -299,7 +299,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _call_slave(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _set_packet_number_and_health(healthy, memory, packet)
+    _number_packet_or_repeat_last_healthy(healthy, memory, packet)
 
 
 @njit(cache=True)

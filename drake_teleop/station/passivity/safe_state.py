@@ -134,7 +134,7 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
 def fade_retreat_wrench(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow.
 
-    It falls to 0 for hand speeds along it from `RETREAT_SPEED` to twice this, but not below
+    It falls to 0 for hand speeds along it from `FORCE_FADE_HAND_SPEED` to twice this, but not below
     `SLAVE_MASS` times the hand's deceleration. `memory` stores it.
     """
     velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
@@ -145,7 +145,7 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
         if size > 0.0:
             along = dot_of_group(wrench, velocity, g) / size
             slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
-            fading = 2.0 - along / p[slots.RETREAT_SPEED][g]
+            fading = 2.0 - along / p[slots.FORCE_FADE_HAND_SPEED][g]
             share = max(fading, p[slots.SLAVE_MASS][g] * slowing / size, 0.0)
             fields.scale_group(wrench, g, min(share, 1.0))
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)

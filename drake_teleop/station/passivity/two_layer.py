@@ -61,7 +61,7 @@ def initialize(p, memory):
 
 
 @njit(cache=True)
-def _exchange_tank_energy(received, dx, T, p, memory, packet):
+def _update_tank_and_send_energy(received, dx, T, p, memory, packet):
     ledger, sent_so_far = memory[slots.STORED_ENERGY], memory[slots.SENT_ENERGY]
     held, capacity = memory[slots.LAST_PORT_WRENCH], p[_TANK_CAPACITY]
     for g in range(2):
@@ -91,7 +91,7 @@ def _limit_wrench_to_tank_energy(wrench, dx, g, acceleration, T, memory):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    _exchange_tank_energy(received, dx, T, p, memory, packet)
+    _update_tank_and_send_energy(received, dx, T, p, memory, packet)
     ledger, requested = memory[slots.STORED_ENERGY], received[fields.WRENCH]
     for g in range(2):
         damping = p[_DAMPING_PER_MISSING_ENERGY][g] * max(p[_TARGET_TANK_LEVEL][g] - ledger[g], 0.0)
@@ -109,7 +109,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     spring, brake = memory[_SERVO_SPRING_WRENCH], memory[_SERVO_DAMPER_WRENCH]
-    _exchange_tank_energy(received, dx, T, p, memory, packet)
+    _update_tank_and_send_energy(received, dx, T, p, memory, packet)
     target = memory[slots.COMMAND_POSE]
     if fields.has_packet_arrived(received):
         target = received[fields.POSE]
