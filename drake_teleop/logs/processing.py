@@ -541,7 +541,7 @@ def _read_and_eliminate_log(
     parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
 
-    def low_pass_wrench(wrench: Array) -> Array:
+    def low_pass_outside_gaps(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
     def contact_and_scaled(
@@ -557,7 +557,7 @@ def _read_and_eliminate_log(
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
-    offsets, fraction = choose_offsets(low_pass_wrench(residual))
+    offsets, fraction = choose_offsets(low_pass_outside_gaps(residual))
     gravity_only = None
     removed = removed or "weight" in log.estimated
     sigmas = {name: scales[name] for name in scales if name not in ("gamma", "gravity")}
@@ -571,9 +571,9 @@ def _read_and_eliminate_log(
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
-        weightless = low_pass_wrench(weightless)
+        weightless = low_pass_outside_gaps(weightless)
         gravity_only = weightless - choose_offsets(weightless)[0]
-    contact, scaled = map(low_pass_wrench, contact_and_scaled(offsets, log.motion))
+    contact, scaled = map(low_pass_outside_gaps, contact_and_scaled(offsets, log.motion))
     causal_wrench = None
     if causal is not None and aligned.log_with_differentiated_motion is not None:
         causal_offsets = identification.offsets
@@ -598,8 +598,8 @@ def _read_and_eliminate_log(
         tare_fraction=fraction,
         delay_s=aligned.delay_s,
         delay_source=aligned.delay_source,
-        measured=low_pass_wrench(measured),
-        non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
+        measured=low_pass_outside_gaps(measured),
+        non_contact=low_pass_outside_gaps(non_contact_wrench(*log.motion, phi)),
         contact=contact,
         scaled=scaled,
         gravity_only=gravity_only,

@@ -190,7 +190,7 @@ class FitWindow:
         n = self.grid.transform_length
         return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
 
-    def select_rows(self, rows: slice) -> FitWindow:
+    def select_and_taper_rows(self, rows: slice) -> FitWindow:
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
