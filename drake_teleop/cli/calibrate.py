@@ -16,7 +16,7 @@ from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.files import make_folder, write_json, write_picture
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.load import tolerance as tolerances
-from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
+from drake_teleop.robots.calibration import DEFAULT_TOLERANCES_TEXT, RecordEvaluation, calibrate
 from drake_teleop.robots.connections import open_source_and_recorder
 
 _BAR_CHARACTERS, _BAR_DECADES = 24, 3.0  # of a bar; of half-width over tolerance
@@ -26,7 +26,7 @@ def calibrate_command(
     source: str,
     out: Path,
     *,
-    until: str = DEFAULT_TOLERANCE,
+    until: str = DEFAULT_TOLERANCES_TEXT,
     sensor_range: tuple[float, float] | None = None,
     seconds: float = 120.0,
     cutoff_hz: float | None = 30.0,

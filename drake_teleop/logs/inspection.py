@@ -21,7 +21,7 @@ from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.explained_log import ask_about_correction
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise_deviations
-from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream_table
+from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description, load_description
@@ -187,7 +187,7 @@ def _inspect_described_log(
     bad: dict[Path, list[NDArray[np.intp]]] = {}
     for name, stream in description.streams.items():
         if stream.source not in tables:
-            tables[stream.source] = read_stream_table(stream)
+            tables[stream.source] = read_bag_topic_or_table(stream)
             if note := tables[stream.source].note:
                 findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)

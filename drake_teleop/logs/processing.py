@@ -69,11 +69,11 @@ from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_NOTHING_IDENTIFIED_FINDINGS = ("left-handed", "high-pass")
+_FINDINGS_PREVENTING_IDENTIFICATION = ("left-handed", "high-pass")
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
-_MAX_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
+_MAX_TELEOP_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
 
 
 @dataclass(frozen=True, repr=False)
@@ -187,13 +187,13 @@ def identify_log(
         why, too_still = _explain_residual(raw, fitted, frame_findings)
     if why is not None:
         fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
-    errors = _errors_beside_the_load(raw, fitted, frame_findings, why, too_still, check)
+    errors = _findings_that_invalidate_load(raw, fitted, frame_findings, why, too_still, check)
     errors = errors if mirrored is None else (mirrored,)
     causes: tuple[Finding, ...] = ()
     result, note = fitted.fit.identification, fitted.fit.note
     accepted = None if errors else why
     if errors:
-        useless = too_still or errors[0].name in _NOTHING_IDENTIFIED_FINDINGS
+        useless = too_still or errors[0].name in _FINDINGS_PREVENTING_IDENTIFICATION
         result = result.with_nothing_identified() if useless else result.with_unidentified_load()
     if accepted is not None:
         result, causes, note = _apply_explanation(result, raw, accepted, frame_findings, note)
@@ -235,7 +235,7 @@ def _read_and_fit_load(
     fitted, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
-    return log, fitted or _fit_load_to_motion(log, method, cutoff_hz, delay), frame_findings
+    return log, fitted or _fit_load_to_filtered_log(log, method, cutoff_hz, delay), frame_findings
 
 
 def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
@@ -283,16 +283,16 @@ def _correct_delay(
         return fitted, frame_findings
     delay_s = fitted.delay_s + why.delay_s
     if why.is_acceleration_missing:  # an acceleration resembles a delay
-        source, fitted = "undetermined", _fit_load_to_motion(log, method, cutoff_hz, 0.0)
+        source, fitted = "undetermined", _fit_load_to_filtered_log(log, method, cutoff_hz, 0.0)
     elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S and motion is None:
-        fitted = _fit_load_to_motion(log, method, cutoff_hz, delay_s)
+        fitted = _fit_load_to_filtered_log(log, method, cutoff_hz, delay_s)
     elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S:
         again, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay_s)
         fitted = again or fitted
     return replace(fitted, delay_source=source, motion=motion), frame_findings
 
 
-def _errors_beside_the_load(
+def _findings_that_invalidate_load(
     raw: Log,
     fitted: LoadFitOfLog,
     frame_findings: tuple[Finding, ...],
@@ -349,7 +349,7 @@ def _check_path_and_cutoff(path: Any, cutoff_hz: Any) -> None:
         raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where="cutoff_hz", remedy=remedy)
 
 
-def _fit_load_to_motion(
+def _fit_load_to_filtered_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> LoadFitOfLog:
     delay_s, source = choose_delay(log, cutoff_hz, delay)
@@ -388,7 +388,7 @@ def check_log(path: Path, checks: ConventionCheckResult | None = None) -> Conven
                 read_log(path)
                 return replace(checks, findings=(Finding("payload", str(error)),))
         return checks
-    if any(x.name in _NOTHING_IDENTIFIED_FINDINGS for x in identified.findings):
+    if any(x.name in _FINDINGS_PREVENTING_IDENTIFICATION for x in identified.findings):
         return replace(checks, findings=identified.findings)
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
@@ -541,7 +541,7 @@ def _read_and_eliminate_log(
     parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
 
-    def low_pass_wrench(wrench: Array) -> Array:
+    def low_pass_outside_gaps(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
     def contact_and_scaled(
@@ -557,7 +557,7 @@ def _read_and_eliminate_log(
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
-    offsets, fraction = choose_offsets(low_pass_wrench(residual))
+    offsets, fraction = choose_offsets(low_pass_outside_gaps(residual))
     gravity_only = None
     removed = removed or "weight" in log.estimated
     sigmas = {name: scales[name] for name in scales if name not in ("gamma", "gravity")}
@@ -571,9 +571,9 @@ def _read_and_eliminate_log(
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
-        weightless = low_pass_wrench(weightless)
+        weightless = low_pass_outside_gaps(weightless)
         gravity_only = weightless - choose_offsets(weightless)[0]
-    contact, scaled = map(low_pass_wrench, contact_and_scaled(offsets, log.motion))
+    contact, scaled = map(low_pass_outside_gaps, contact_and_scaled(offsets, log.motion))
     causal_wrench = None
     if causal is not None and aligned.log_with_differentiated_motion is not None:
         causal_offsets = identification.offsets
@@ -598,8 +598,8 @@ def _read_and_eliminate_log(
         tare_fraction=fraction,
         delay_s=aligned.delay_s,
         delay_source=aligned.delay_source,
-        measured=low_pass_wrench(measured),
-        non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
+        measured=low_pass_outside_gaps(measured),
+        non_contact=low_pass_outside_gaps(non_contact_wrench(*log.motion, phi)),
         contact=contact,
         scaled=scaled,
         gravity_only=gravity_only,
@@ -677,8 +677,8 @@ def _resolve_force_scales(
     given: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
     for name, value in given.items():
-        if value is not None and not 0.0 <= to_float(name, value) <= _MAX_FORCE_SCALE:
-            what = f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}"
+        if value is not None and not 0.0 <= to_float(name, value) <= _MAX_TELEOP_FORCE_SCALE:
+            what = f"{value:g} is outside 0 to {_MAX_TELEOP_FORCE_SCALE:g}"
             raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
     sigma, kept, gamma, *separate = given.values()
     if kept is not None and not has_gripper:

@@ -27,13 +27,13 @@ TRUE_INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -
 """Mass [kg], centre of mass [m] and inertia [kg m^2] of the gripper in S, similar to a Robotiq
 2F-85."""
 FINGERTIP_POSITION_S = np.array([0.0, 0.0, 0.17])
-TRUE_OFFSETS = np.array(
+TRUE_RECORD_OFFSETS = np.array(
     [[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]]
 )
 """(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
 WRENCH_NOISE_STD = np.repeat([0.08, 0.003], 3)
 POSE_DELAY_S = 0.013
-CLOCK_START_S = 48213.4
+POSE_CLOCK_OFFSET_S = 48213.4
 """Time of the controller's clock at the sensor's time 0 [s]."""
 
 WRENCH_HZ, POSE_HZ = 500.0, 125.0
@@ -109,12 +109,12 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     files = []
     with output_folder(out):
         for row, (name, (pushes, what)) in enumerate(records.items()):
-            text = _DESCRIPTION_TEMPLATE.format(name=name, what=what, offset=-CLOCK_START_S)
+            text = _DESCRIPTION_TEMPLATE.format(name=name, what=what, offset=-POSE_CLOCK_OFFSET_S)
             write_text(out / f"{name}.yaml", text)
             _write_record(out, name, row, pushes, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
-        offsets = {"offsets": TRUE_OFFSETS[0], "offsets_touched": TRUE_OFFSETS[1]}
+        offsets = {"offsets": TRUE_RECORD_OFFSETS[0], "offsets_touched": TRUE_RECORD_OFFSETS[1]}
         contacts = [_summarize_true_contact(touch) for touch in FINGERTIP_PUSHES]
         truth = {**load, "phi": TRUE_PHI, **offsets, "delay_s": POSE_DELAY_S, "contacts": contacts}
         write_json(out / "truth.json", truth)
@@ -123,7 +123,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
         summary |= {"wrench_hz": WRENCH_HZ, "pose_hz": POSE_HZ}
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print_summary(out)
+        _print_files_and_next_commands(out)
     return summary
 
 
@@ -134,7 +134,7 @@ def _summarize_true_contact(touch: FingertipPush) -> dict[str, Any]:
     return {"start_s": touch.start_s, "stop_s": touch.stop_s, "peak_N": peak, "push": push}
 
 
-def _print_summary(out: Path) -> None:
+def _print_files_and_next_commands(out: Path) -> None:
     from rich.console import Console
 
     load = "out/load/identification.json"
@@ -202,7 +202,7 @@ def _write_record(
 
     t, motion_at = _jittered_time_stamps(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
-    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_OFFSETS[row]
+    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_RECORD_OFFSETS[row]
     for touch in pushes:
         wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
@@ -211,7 +211,7 @@ def _write_record(
     t = _jittered_time_stamps(POSE_HZ, random)
     _, _, _, R_WS, p_WS = motion_at(t - POSE_DELAY_S)
     turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
-    columns = [t + CLOCK_START_S, 1e3 * p_WS, turn]
+    columns = [t + POSE_CLOCK_OFFSET_S, 1e3 * p_WS, turn]
     _write_columns(out / f"{name}_pose.csv", "uptime x y z rx ry rz", columns)
 
 
@@ -269,7 +269,7 @@ def sample_episode(
         push *= random.uniform(5, 15) / np.linalg.norm(push)
         touch = FingertipPush(start, start + random.uniform(0.4, 0.9), tuple(push))
         contact -= touch.wrench_S(t, R_WS)
-    offsets = TRUE_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
+    offsets = TRUE_RECORD_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
     wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     *_, R_late, p_late = motion_at(t - lag_frames / fps)

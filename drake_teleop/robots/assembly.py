@@ -305,7 +305,7 @@ class _ClockOffsetEstimator:
     def __init__(self) -> None:
         self.offset, self._now = math.inf, 0.0
 
-    def update(self, t: float, now: float) -> None:
+    def update_offset(self, t: float, now: float) -> None:
         if math.isfinite(t):
             ahead, faded = now - t, self.offset + MAX_CLOCK_DRIFT * (now - self._now)
             known = abs(ahead - self.offset) <= MIN_CLOCK_JUMP_S
@@ -356,10 +356,10 @@ class ReadingAssembler(Source):
     def readings_completed_by(self, sample: Reading) -> list[Reading]:
         """Add a wrench or motion; return readings of the wrenches whose motion is complete."""
         if sample.stream == WRENCH:
-            self._clocks[0].update(sample.t, sample.arrival)
+            self._clocks[0].update_offset(sample.t, sample.arrival)
             self._pending.append(sample)
         elif sample.stream == self._streams.motion_stream:
-            self._clocks[1].update(sample.t, sample.arrival)
+            self._clocks[1].update_offset(sample.t, sample.arrival)
             shift = -self.delay_s
             if self._streams.two_clocks:
                 shift += self._clocks[1].offset - self._clocks[0].offset

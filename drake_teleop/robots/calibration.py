@@ -191,7 +191,7 @@ def _information_of_advised_motions(
             yield words.format(axis=axis), share * (rows.T @ rows)
 
 
-DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
+DEFAULT_TOLERANCES_TEXT = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
 _STREAM_READ_TIMEOUT_S = 0.05
 

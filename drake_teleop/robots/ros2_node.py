@@ -14,7 +14,7 @@ from typing import Any
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.load.identification import Identification
-from drake_teleop.robots.calibration import DEFAULT_TOLERANCE
+from drake_teleop.robots.calibration import DEFAULT_TOLERANCES_TEXT
 from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, Compensator
 from drake_teleop.robots.ros2 import (
@@ -54,7 +54,7 @@ class ServedCompensator:
         for name in SIGMA_GAMMA_NAMES:
             node.declare_parameter(name, float(scales[name]))
         node.declare_parameter("load", str(load))
-        node.declare_parameter("until", DEFAULT_TOLERANCE)
+        node.declare_parameter("until", DEFAULT_TOLERANCES_TEXT)
         node.declare_parameter("seconds", 120.0)
         node.add_on_set_parameters_callback(self._check_scale_parameters)
         node.add_post_set_parameters_callback(lambda _: self._apply_scale_parameters())

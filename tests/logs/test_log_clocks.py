@@ -24,7 +24,7 @@ from drake_teleop.logs.read.clocks import (
     Clock,
     find_gaps_in_times,
     read_clock,
-    spread_shared_stamps,
+    smooth_duplicate_stamps,
 )
 from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.reading import read_log
@@ -123,7 +123,7 @@ def test_spread_restores_times_of_bursts(
         first = burst * int(share * 300)
         kept[first : first + 5 * burst] = False
     stamps = start + true[burst - 1 :: burst].repeat(burst)[kept]
-    found = spread_shared_stamps(stamps) - start
+    found = smooth_duplicate_stamps(stamps) - start
     assert (np.diff(found) > 0).all()
     # Constant delay of half a burst; the remainder is one burst among 50 of a window.
     late = (burst - 1) / 2 / rate
@@ -132,7 +132,7 @@ def test_spread_restores_times_of_bursts(
 
 def test_burst_between_gaps_is_spread_about_its_stamp() -> None:
     stamps = np.concatenate([np.arange(20) * 0.1, [5.0], 8.0 + np.arange(20) * 0.1]).repeat(4)
-    found = spread_shared_stamps(stamps)
+    found = smooth_duplicate_stamps(stamps)
     np.testing.assert_allclose(found[80:84], 5.0 + 0.025 * np.array([-1.5, -0.5, 0.5, 1.5]))
     assert (np.diff(found) > 0).all()
 
@@ -153,7 +153,7 @@ def test_spread_restores_coarse_stamps(
     step = resolution / rate
     uneven = np.sort(true + rng.uniform(-jitter, jitter, len(true)) / rate)
     stamps = np.floor(uneven / step) * step
-    found = spread_shared_stamps(stamps)
+    found = smooth_duplicate_stamps(stamps)
     assert (np.diff(found) > 0).all()
     # Rounding down causes a constant delay; the remaining error is halved.
     error, raw = found - true, stamps - true

@@ -28,8 +28,8 @@ from drake_teleop.logs.read.canonical import POSITION_COLUMNS, QUATERNION_COLUMN
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS as CANONICAL
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.sample import CLOCK_START_S, sample_log_command
 from drake_teleop.logs.sample import FINGERTIP_PUSHES as TOUCHES_OF_SAMPLE
+from drake_teleop.logs.sample import POSE_CLOCK_OFFSET_S, sample_log_command
 from drake_teleop.logs.sample import WRENCH_NOISE_STD as SAMPLE_NOISE
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
@@ -131,7 +131,7 @@ def held_sample(
     frames = np.arange(begin, stop, 1.0 / rate)
     w, p = (
         table[np.searchsorted(t, frames, side="right") - 1, 1:]
-        for t, table in ((wrench[:, 0] / 1e3, wrench), (pose[:, 0] - CLOCK_START_S, pose))
+        for t, table in ((wrench[:, 0] / 1e3, wrench), (pose[:, 0] - POSE_CLOCK_OFFSET_S, pose))
     )
     units = np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
     quaternion = Rotation.from_rotvec(p[:, 3:], degrees=True).as_quat()[:, [3, 0, 1, 2]]

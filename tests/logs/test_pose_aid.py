@@ -13,7 +13,10 @@ from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, 
 from scipy.interpolate import BSpline
 
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.imu_rows import _fit_imu_gain_bias_and_shift, correct_imu_data
+from drake_teleop.logs.pose_motion.imu_rows import (
+    _fit_imu_gain_errors_bias_and_shift,
+    correct_imu_data,
+)
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FitWindow,
@@ -82,7 +85,7 @@ def test_gains_of_an_imu_have_a_prior_of_10_percent(size):
     prior = np.column_stack([np.eye(9) / 0.1, np.zeros((9, 5))])
     stacked = np.concatenate([stacked.real, stacked.imag, prior])
     expected = np.linalg.lstsq(stacked[:, :13], stacked[:, 13], rcond=None)[0]
-    D, b, shift = _fit_imu_gain_bias_and_shift(y, X, one, change, weight)
+    D, b, shift = _fit_imu_gain_errors_bias_and_shift(y, X, one, change, weight)
     np.testing.assert_allclose([*D.ravel(), *b, shift], expected, atol=1e-10)
 
 

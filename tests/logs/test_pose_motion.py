@@ -73,7 +73,7 @@ from drake_teleop.logs.pose_motion.splines import (
     SPLINE_DEGREE,
     PoseSplines,
     _place_knots,
-    _remove_knots_without_poses,
+    _remove_knots_with_too_few_poses,
 )
 from drake_teleop.logs.read.canonical import Log
 
@@ -149,7 +149,7 @@ def test_400_ms_beside_gaps_of_the_poses_and_lost_samples_have_no_weight(delay, 
 def test_knots_are_thinned_where_poses_are_too_few():
     """Gaps of all lengths, as on a busy computer, would make the spline undetermined."""
     t = np.cumsum(np.random.default_rng(1).exponential(0.0125, 200))
-    knots = _remove_knots_without_poses(_place_knots(t, 0.0125), t)
+    knots = _remove_knots_with_too_few_poses(_place_knots(t, 0.0125), t)
     assert (
         np.diff(np.searchsorted(t, knots[SPLINE_DEGREE:-SPLINE_DEGREE])).min() >= 2
         and len(knots) > 80

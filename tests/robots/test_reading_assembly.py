@@ -145,7 +145,7 @@ def test_motion_on_another_clock_is_synchronised() -> None:
 def test_offset_of_a_slow_clock_increases() -> None:
     rng, clock = np.random.default_rng(0), _ClockOffsetEstimator()
     for now in np.arange(0.0, 100.0, 0.01):
-        clock.update(now * (1.0 - 5e-4), now + 0.01 * rng.random())
+        clock.update_offset(now * (1.0 - 5e-4), now + 0.01 * rng.random())
     assert clock.offset == pytest.approx(0.05, abs=2e-3)
 
 

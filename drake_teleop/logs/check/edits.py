@@ -16,9 +16,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES, right_angled_rotations
 from drake_teleop.logs.causes.cause import Finding
-from drake_teleop.logs.read.bags import read_stream_table
+from drake_teleop.logs.read.bags import read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_num_episodes
+from drake_teleop.logs.read.clocks import smooth_duplicate_stamps, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_described_log
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
@@ -186,7 +186,7 @@ class LogTables:
         steps: dict[Path, list[int]] = {}
         for stream in description.streams.values():
             if stream.source not in tables:
-                tables[stream.source] = read_stream_table(stream)
+                tables[stream.source] = read_bag_topic_or_table(stream)
             steps.setdefault(stream.source, []).append(self._thinning_stride(stream))
         for name, stream in description.streams.items():
             whole = tables[stream.source]
@@ -249,7 +249,7 @@ class LogTables:
         t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
-        return (spread_shared_stamps(t) if shared else t), rows
+        return (smooth_duplicate_stamps(t) if shared else t), rows
 
     def _add_thinned_columns(self, name: str, stream: Any, thinned: Table, block_rows: int) -> None:
         table, rows = self._table_of_stream(stream), None

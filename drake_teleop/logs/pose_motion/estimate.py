@@ -222,7 +222,7 @@ def _fit_pose_splines_and_delay(
     slower = min(poses.rate, grid.stride / grid.dt)
     top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)
-    part = whole.select_rows(_slice_of_largest_force_variance(grid))
+    part = whole.select_and_taper_rows(_slice_of_largest_force_variance(grid))
     margin = 2 * spectra.DELAY_SEARCH_HALF_RANGE_S
     near = (poses.t >= part.grid.t[0] - margin) & (poses.t <= part.grid.t[-1] + margin)
     near_poses = Poses(poses.t[near], poses.position[near], poses.quaternion[near])

@@ -29,7 +29,7 @@ class _ImuSensorModel:
     time_shift_s: float
     noise_power: float
 
-    def motion_of_data(self, y: Array) -> Array:
+    def correct_bias_and_gain(self, y: Array) -> Array:
         return np.linalg.solve(np.eye(3) + self.gain_errors, (y - self.bias).T).T
 
 
@@ -50,7 +50,7 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     t = rows.t + found[max(found)].time_shift_s  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
-        found[which].motion_of_data(y[inside]) if which in found and y is not None else None
+        found[which].correct_bias_and_gain(y[inside]) if which in found and y is not None else None
         for which, y in enumerate((rows.specific_force, rows.angular_velocity))
     )
     own = tuple(found[which].noise_power if which in found else 0.0 for which in range(2))
@@ -99,7 +99,7 @@ def _fit_sensor_model(
         if step == 0:
             power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
         weight = 1.0 / np.sqrt(energy * (noise + power))
-        D, b, shift = _fit_imu_gain_bias_and_shift(Y - X, X, one, change, weight)
+        D, b, shift = _fit_imu_gain_errors_bias_and_shift(Y - X, X, one, change, weight)
         residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
         power = _estimate_imu_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
         tau += shift
@@ -111,7 +111,7 @@ def _fit_sensor_model(
     return _ImuSensorModel(D, b, tau, power)
 
 
-def _fit_imu_gain_bias_and_shift(
+def _fit_imu_gain_errors_bias_and_shift(
     y: ComplexArray, X: ComplexArray, one: ComplexArray, X_rate: ComplexArray, weight: Array
 ) -> tuple[Array, Array, float]:
     K = len(y)

@@ -71,7 +71,7 @@ def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -
     With the coefficients `load` (6, 16) only the offsets are fitted.
     """
     zz, zf = (Z[..., :NUM_MOTION_SIGNALS, x] for x in (slice(NUM_MOTION_SIGNALS), WRENCH_COLUMNS))
-    ff, floor = _wrench_power_sums(Z), min_noise_power(Z, levels)
+    ff, floor = _wrench_channel_powers(Z), min_noise_power(Z, levels)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -100,7 +100,7 @@ def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -
     return LinearFit(C, covariance, power, levels.negative_log_likelihoods(power))
 
 
-def _wrench_power_sums(Z: Array) -> Array:
+def _wrench_channel_powers(Z: Array) -> Array:
     return np.diagonal(Z[..., WRENCH_COLUMNS, WRENCH_COLUMNS], axis1=-2, axis2=-1)
 
 
@@ -120,7 +120,7 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
     """Return a lower limit (..., 1, 6) of noise power: rounding of the wrench's numbers."""
-    power = _wrench_power_sums(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
+    power = _wrench_channel_powers(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
     both = power.reshape(*power.shape[:-1], 2, 3).sum(axis=-1).repeat(3, axis=-1)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
@@ -237,7 +237,7 @@ def _knot_spacings_allowed_by_pose_rate(cache: SplineCache) -> list[float]:
     return usable or [TRIED_KNOT_SPACINGS_S[0]]
 
 
-_MAX_CLOCK_RATE_ITERATIONS, _MIN_CLOCK_RATE_LIKELIHOOD_GAIN = 3, 25.0
+_MAX_CLOCK_RATE_ITERATIONS, _MIN_CLOCK_RATE_CHI_SQUARED = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
 _MAX_DELAY_CHANGE_BY_CLOCK_DRIFT_S = 0.2
 
@@ -250,9 +250,9 @@ def estimate_clock_rate_error(
     grid, least = window.grid, fit_coefficients(now).cost
     start = least
     for _ in range(_MAX_CLOCK_RATE_ITERATIONS):
-        step, gain = _clock_rate_change_and_likelihood_gain(now)
+        step, chi_squared = _clock_rate_change_and_chi_squared(now)
         trial = best + step
-        if gain < _MIN_CLOCK_RATE_LIKELIHOOD_GAIN and best == 0.0:
+        if chi_squared < _MIN_CLOCK_RATE_CHI_SQUARED and best == 0.0:
             return 0.0
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_DELAY_CHANGE_BY_CLOCK_DRIFT_S:
             break
@@ -262,7 +262,7 @@ def estimate_clock_rate_error(
         if not cost < least:
             break
         least, best = cost, trial
-    return best if 2.0 * (start - least) > _MIN_CLOCK_RATE_LIKELIHOOD_GAIN else 0.0
+    return best if 2.0 * (start - least) > _MIN_CLOCK_RATE_CHI_SQUARED else 0.0
 
 
 def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay: float) -> Poses:
@@ -271,7 +271,7 @@ def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay:
     return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 
 
-def _clock_rate_change_and_likelihood_gain(spectra: Spectra) -> tuple[float, float]:
+def _clock_rate_change_and_chi_squared(spectra: Spectra) -> tuple[float, float]:
     window, fit = spectra.window, fit_coefficients(spectra)
     grid, bands = window.grid, window.bands
     change = np.gradient(spectra.motion_signals, grid.dt, axis=0)

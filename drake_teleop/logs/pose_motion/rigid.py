@@ -94,13 +94,13 @@ def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None)
     """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without a weight [m, m c] (4,)."""
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
-    def coefficients_of(phi: Array) -> Array:
+    def wrench_coefficients(phi: Array) -> Array:
         theta = np.concatenate([np.zeros(6), phi])
         return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
 
-    C = coefficients_of(phi)
+    C = wrench_coefficients(phi)
     if removed_weight is not None:
-        weight = coefficients_of(np.concatenate([removed_weight, np.zeros(6)]))
+        weight = wrench_coefficients(np.concatenate([removed_weight, np.zeros(6)]))
         C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 
@@ -170,7 +170,7 @@ def _solve_rigid_fit(
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
         B, Le = _residual_and_derivative(state)
         gram, right = _normal_equations(B, Le, clean, W)
-        inverse, undetermined = _invert_gram_of_free_parameters(gram, record.is_free)
+        inverse, undetermined = _invert_gram_and_flag_undetermined(gram, record.is_free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_MAX_GAUSS_NEWTON_STEP / np.maximum(np.abs(step), 1e-300))))
@@ -250,7 +250,7 @@ def _normal_equations(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, A
     return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
 
 
-def _invert_gram_of_free_parameters(
+def _invert_gram_and_flag_undetermined(
     gram: Array, free: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_]]:
     diagonal = np.diag(gram)

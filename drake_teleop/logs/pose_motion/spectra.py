@@ -190,7 +190,7 @@ class FitWindow:
         n = self.grid.transform_length
         return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
 
-    def select_rows(self, rows: slice) -> FitWindow:
+    def select_and_taper_rows(self, rows: slice) -> FitWindow:
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
@@ -342,7 +342,7 @@ def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, fl
         left = splines.imu_rows.pose_noise_shares_left_by_imu(bands.frequency)
         position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
-    shapes = _signal_covariances_by_pose_noise(spectra.motion_signals, weight)
+    shapes = _signal_covariances_by_unit_pose_noise(spectra.motion_signals, weight)
     powers = position_power * w2**2, rotation_power, rotation_power * w2, rotation_power * w2**2
     Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
     signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
@@ -352,14 +352,14 @@ def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, fl
     return Q
 
 
-def _signal_covariances_by_pose_noise(zeta: Array, weight: Array) -> tuple[Array, ...]:
+def _signal_covariances_by_unit_pose_noise(signals: Array, weight: Array) -> tuple[Array, ...]:
     place, still, cross, products, alpha = np.zeros((5, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
     place[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
-    mean = weight @ zeta
+    mean = weight @ signals
     for left in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
         for right in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
             # Mean of (x x d)(y x d)^T for a rotation d of unit covariance.
-            both = (weight[:, None] * zeta[:, left]).T @ zeta[:, right]
+            both = (weight[:, None] * signals[:, left]).T @ signals[:, right]
             still[left, right] = np.trace(both) * np.eye(3) - both.T
     for where in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
         cross[where, _ALPHA_COLUMNS] = -cross_matrix(mean[where])

@@ -96,7 +96,7 @@ class PoseSplines:
         try:
             self._spline = self._fit_spline(t, knots)
         except np.linalg.LinAlgError:  # too few poses per knot between gaps
-            self._spline = self._fit_spline(t, _remove_knots_without_poses(knots, t))
+            self._spline = self._fit_spline(t, _remove_knots_with_too_few_poses(knots, t))
 
     def _fit_spline(self, t: Array, knots: Array) -> BSpline:
         poses, imu_rows = self.poses, self.imu_rows
@@ -270,7 +270,7 @@ def _place_knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
     return np.concatenate([start, inner, stop])
 
 
-def _remove_knots_without_poses(knots: Array, t: Array) -> Array:
+def _remove_knots_with_too_few_poses(knots: Array, t: Array) -> Array:
     inner, kept, last = knots[SPLINE_DEGREE + 1 : -SPLINE_DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
         if min(before - last, len(t) - before) >= MIN_POSES_PER_KNOT:

@@ -32,7 +32,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
     with h5py.File(path, "r") as file:
 
         def add_dataset(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and _is_numeric_table(item, transpose):
+            if isinstance(item, h5py.Dataset) and _is_numeric_non_image_array(item, transpose):
                 if item.external is not None or item.is_virtual:
                     raise ValueError(f"the array {name} is in another file, which is not read")
                 array = np.asarray(item[()])
@@ -50,11 +50,11 @@ def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     return {
         name.replace("/", "."): np.asarray(item[rows])
         for name, item in arrays.items()
-        if _is_numeric_table(item, False)
+        if _is_numeric_non_image_array(item, False)
     }
 
 
-def _is_numeric_table(item: Any, transpose: bool) -> bool:
+def _is_numeric_non_image_array(item: Any, transpose: bool) -> bool:
     shape = item.shape[::-1] if transpose else item.shape
     if item.dtype.kind not in "fiu" or not 1 <= len(shape) <= 3:
         return False

@@ -203,10 +203,10 @@ def estimate_auto_gravity(description: Description, source: str, read: ReadLog) 
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
 
-    def block_means_at_delay(delay_s: float) -> BlockMeans:
+    def block_means_without_delay(delay_s: float) -> BlockMeans:
         return block_means_of_log(remove_delay(log, delay_s))
 
-    explanation = explain_misfit(block_means_of_log(log), block_means_at_delay, ("gravity",))
+    explanation = explain_misfit(block_means_of_log(log), block_means_without_delay, ("gravity",))
     if explanation.theta[6] > 0.0:
         change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change

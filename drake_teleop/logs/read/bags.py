@@ -112,7 +112,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
     return Table(path / topic.lstrip("/"), columns, absent_groups=absent)
 
 
-def read_stream_table(stream: Wrench | Imu | Pose | Static) -> Table:
+def read_bag_topic_or_table(stream: Wrench | Imu | Pose | Static) -> Table:
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):

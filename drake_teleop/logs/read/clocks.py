@@ -56,7 +56,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         notes.append(f"{total - len(rows)} rows without a time stamp are removed")
     _check_stamps_go_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
-        same = _find_repeated_rows(rows, t, table, columns, where)
+        same = _find_duplicate_rows(rows, t, table, columns, where)
         rows = rows[~same]
         if same.any():
             text = f"{same.sum()} rows that repeat the previous row and its time stamp are removed"
@@ -64,7 +64,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
     if shared:
-        even = spread_shared_stamps(t)
+        even = smooth_duplicate_stamps(t)
         if (np.diff(even) <= 0).any():
             row = table.line_in_file(rows[int(np.argmax(np.diff(even) <= 0))])
             what = f"the time stamps do not increase around row {row} of {table.path.name}"
@@ -151,7 +151,7 @@ def _apply_clock_scale_and_offset(t: Array, time: Time) -> Array:
     return t[:1] + time.scale * (t - t[:1]) + time.offset
 
 
-def spread_shared_stamps(t: Array) -> Array:
+def smooth_duplicate_stamps(t: Array) -> Array:
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
     per_stamp = len(t) / len(distinct)
@@ -191,7 +191,7 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     return line + smooth
 
 
-def _find_repeated_rows(
+def _find_duplicate_rows(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.bool_]:
     values = [table.numbers_with_nan(column, where) for column in columns]

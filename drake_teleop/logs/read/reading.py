@@ -20,7 +20,7 @@ from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.read import alignment, auto_frames, streams, table_files
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angular_motion, resample
 from drake_teleop.logs.read.auto_frames import restore_removed_weight
-from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
+from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
@@ -144,7 +144,7 @@ class _LogReader:
 
     def _table_of_stream(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self.tables:
-            self.tables[stream.source] = read_stream_table(stream)
+            self.tables[stream.source] = read_bag_topic_or_table(stream)
         table = self.tables[stream.source]
         if table.note and table.note not in self.notes:
             self.notes.append(table.note)

@@ -43,12 +43,12 @@ _ROWS_FOR_TYPE_INFERENCE = 1000  # rows from which column types are inferred
 _UTF_16_BYTE_ORDER_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
-_QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
+_QUOTED_DECIMAL_COMMA_CELL = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
 _THOUSANDS_COMMA_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
 _DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 _MIN_WRENCH_COLUMNS = 6
-_MIN_SIMILAR_SHEET = 0.5  # rows of a second log in an Excel file, over those of the first
+_MIN_SHEET_ROW_RATIO = 0.5  # rows of a second log in an Excel file, over those of the first
 _TIME_CELL_PATTERN = re.compile(r"\d[\dT:./ +-]*Z?")  # of dates and times of day
 _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are read on access
 
@@ -153,14 +153,14 @@ def _normalize_line_ends_and_decimal_commas(
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _INSPECTED_HEAD_BYTES))
         tail = file.read() if isinstance(source, Path) else source
-    returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
+    returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_DECIMAL_COMMA_CELL.findall(head)
     # "1,500" can be 1500.
     commas = [found for found in commas if not _THOUSANDS_COMMA_PATTERN.fullmatch(b",".join(found))]
     if not (returns or commas or _length_without_blank_end(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
     text = _LONE_CR_PATTERN.sub(b"\n", text) if returns else text
-    text = _QUOTED_NUMBER_PATTERN.sub(rb"\1.\2", text) if commas else text
+    text = _QUOTED_DECIMAL_COMMA_CELL.sub(rb"\1.\2", text) if commas else text
     return text[: _length_without_blank_end(text)]
 
 
@@ -293,7 +293,7 @@ def _read_excel(path: Path) -> Table:
             full = cells.select(pl.all().sum() > 0.5 * rows[name]).row(0)
             wide += [name] if rows[name] and sum(full) >= _MIN_WRENCH_COLUMNS else []
     best = max(wide or rows, key=lambda name: rows[name])
-    if similar := [x for x in wide if x != best and rows[x] >= _MIN_SIMILAR_SHEET * rows[best]]:
+    if similar := [x for x in wide if x != best and rows[x] >= _MIN_SHEET_ROW_RATIO * rows[best]]:
         what = (
             f"the sheets {best!r} and {', '.join(map(repr, similar))} have tables of similar size"
         )
