@@ -39,7 +39,7 @@ _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
 _MIN_GRADIENT_TO_ERROR_RATIO_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
-_MAX_POSE_ERROR_AT_SINGULARITY_M = 5e-6
+_MIN_OUT_OF_REACH_ERROR_M = 5e-6
 # The same for `find_posture`, which stops the search earlier [m].
 _MAX_SEARCH_ERROR_AT_SINGULARITY_M = 1e-3
 # Position error above which a pose is out of reach for an arm with fewer than 6 joints, which
@@ -207,7 +207,7 @@ def follow_pose(
     _gram_matrix_of_size_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, missed, expected_gain = np.inf, 0.0, 0.0
-    limit = _MAX_POSITION_ERROR_WITH_FEW_JOINTS_M if n < 6 else _MAX_POSE_ERROR_AT_SINGULARITY_M
+    limit = _MAX_POSITION_ERROR_WITH_FEW_JOINTS_M if n < 6 else _MIN_OUT_OF_REACH_ERROR_M
     while True:
         anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
