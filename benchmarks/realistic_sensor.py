@@ -46,9 +46,9 @@ from drake_teleop.station.sensor.motion_estimation import (
     initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
+    DISABLED_PART_VALUES,
     NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
-    SENSOR_PARTS,
     WristSensorConfig,
     initialize_sensor_chain,
     read_sensor_into,
@@ -237,7 +237,9 @@ def same_samples(trajectory: FourierTrajectory, motion: Array) -> float:
 
 def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, float]]:
     """Return figures of each source of error alone; `all` is their sum, with two loads."""
-    nothing = without_parts(JR3, *(k for k in SENSOR_PARTS if k not in ("place", "saturation")))
+    nothing = without_parts(
+        JR3, *(k for k in DISABLED_PART_VALUES if k not in ("place", "saturation"))
+    )
     wrench, motion_noise = (
         ("force_noise", "torque_noise"),
         (
@@ -256,9 +258,12 @@ def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, floa
         "noise of the wrench": {name: getattr(JR3, name) for name in wrench},
         "noise of the accelerations": {name: getattr(JR3, name) for name in motion_noise},
         "walks and drift": {
-            k: getattr(JR3, k) for k in (*SENSOR_PARTS["random_walk"], *SENSOR_PARTS["drift"])
+            k: getattr(JR3, k)
+            for k in (*DISABLED_PART_VALUES["random_walk"], *DISABLED_PART_VALUES["drift"])
         },
-        "quantisation, encoders too": {k: getattr(JR3, k) for k in SENSOR_PARTS["quantisation"]},
+        "quantisation, encoders too": {
+            k: getattr(JR3, k) for k in DISABLED_PART_VALUES["quantisation"]
+        },
         "bandwidth": {"low_pass": JR3.low_pass},
         "cross-talk 1 %": {"cross_talk": 0.01},
         "gains 1 %": {"gain_error": 0.01},

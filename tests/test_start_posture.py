@@ -273,9 +273,8 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     plan.posture_shapes.move_to(plan.place.q)
     # The base link has a plate on the plane; all moving links are above it.
     assert plan.base_plane_height == pytest.approx(0.0, abs=1e-9)
-    assert (
-        plan.posture_shapes.points_on_bodies(plan.posture_shapes.moving_bodies())[:, 2].min() > 0.02
-    )
+    shapes = plan.posture_shapes
+    assert shapes.points_on_bodies_W(shapes.moving_slave_bodies())[:, 2].min() > 0.02
     assert start_overlap_texts(slave_of(plan, path), plan.wall)[0] == ()
     assert plan.wall.position[2] < plan.lowest_tool_point_W[2] - 0.01
 

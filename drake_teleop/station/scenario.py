@@ -32,7 +32,7 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfi
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.joint_control import POSITION_INTERFACES, JointControlConfig
+from drake_teleop.station.slave.joint_control import POSITION_INTERFACE_PRESETS, JointControlConfig
 from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
@@ -233,7 +233,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     if master.get("figures") is not None:  # changes the data sheet
         defaults.master.figures = copy.deepcopy(FIGURES.get(str(master.get("model"))))
     if control.get("interface") is not None:
-        interface = POSITION_INTERFACES.get(str(control.get("servo")))
+        interface = POSITION_INTERFACE_PRESETS.get(str(control.get("servo")))
         defaults.joint_control.interface = copy.deepcopy(interface)
     scenario = settings_without_range_check(Scenario, data, where, defaults)
     scenario.check(where)

@@ -233,7 +233,7 @@ def _add_slave_blocks(
         export_outputs(builder, estimator, "load_state")
 
     if slave.can_touch:
-        _add_tool_contact(builder, slave)
+        _add_contact_and_moving_body_poses(builder, slave)
     return slave, sample, held
 
 
@@ -258,7 +258,7 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
         raise DrakeTeleopError(what, where="slave.friction", remedy=remedy)
 
 
-def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant) -> None:
+def _add_contact_and_moving_body_poses(builder: DiagramBuilder, slave: SlavePlant) -> None:
     plant, ports = slave.plant, slave.ports
     block: LeafSystem = ToolContact(slave.arm, slave.contact)
     if slave.contact.drake_contact_reason:

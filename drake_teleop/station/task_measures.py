@@ -63,7 +63,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     figures = measures_of_success | {
         "success": float(success),
         "detection_time_s": detection_delay(t[span], touching, noticed),
-        "false_notices": float(_count_false_detections(touching, noticed)),
+        "false_notices": float(_count_notices_before_contact(touching, noticed)),
     }
     return {name: figures[name] for name in TASK_MEASURE_NAMES}
 
@@ -124,7 +124,7 @@ def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.b
     return float(t[contact + int(np.argmax(after))] - t[contact]) if after.any() else math.nan
 
 
-def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
+def _count_notices_before_contact(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
     before = int(np.argmax(touching)) if touching.any() else len(touching)
     return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
 

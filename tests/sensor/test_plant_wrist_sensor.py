@@ -34,7 +34,11 @@ from drake_teleop import AddWristSensor
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import MIN_LOST_SAMPLE_FLAG_VALUE, non_contact_wrench
 from drake_teleop.station.sensor.presets import PRESETS
-from drake_teleop.station.sensor.sensor_chain import SENSOR_PARTS, WristSensorConfig, without_parts
+from drake_teleop.station.sensor.sensor_chain import (
+    DISABLED_PART_VALUES,
+    WristSensorConfig,
+    without_parts,
+)
 
 ARM = Path(__file__).parents[2] / "docs" / "gallery" / "arm.urdf"
 TOOL = SpatialInertia.MakeFromCentralInertia(
@@ -329,7 +333,7 @@ def test_saturation_is_flagged_and_limited():
 
 def test_latencies_of_all_paths_meet_in_one_instant():
     """V phi equals the wrench in motion, although the accelerations are 3 samples late."""
-    config = without_parts(WristSensorConfig(), *SENSOR_PARTS)
+    config = without_parts(WristSensorConfig(), *DISABLED_PART_VALUES)
     config.acceleration_latency = 3e-3
     run = moving(config=config)
     run.simulator.AdvanceTo(0.0405)
@@ -394,7 +398,7 @@ def test_input_not_finite_gives_no_sample():
     context = run.sensor.GetMyMutableContextFromRoot(run.simulator.get_mutable_context())
     values = run.sensor.AllocateDiscreteVariables()
     values.SetFrom(context.get_discrete_state())
-    run.sensor._update_sample(context, values)
+    run.sensor._take_sample_if_due(context, values)
     context.SetDiscreteState(values)
     assert reading(run, "status")[0] > MIN_LOST_SAMPLE_FLAG_VALUE
     np.testing.assert_array_equal(reading(run, "measured_wrench_S"), before)

@@ -22,10 +22,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import Scenario, replace, settings_without_range_check
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
+    DISABLED_PART_VALUES,
     NOISE_BLOCK_SIZE,
     PRESET_NAMES,
     SAMPLES_PER_NOISE_BLOCK,
-    SENSOR_PARTS,
     WristSensorConfig,
     are_values_plausible,
     calibration_matrices,
@@ -41,7 +41,7 @@ allan_deviation, predicted_allan_deviation, rest_record, spectral_density = (
 )
 
 RATE, PERIOD, JOINTS = 8000.0, 125e-6, 3
-BARE = without_parts(WristSensorConfig(), *SENSOR_PARTS)
+BARE = without_parts(WristSensorConfig(), *DISABLED_PART_VALUES)
 QUIET = ("noise", "random_walk")
 RECORDS = Path(__file__).parents[2] / ".." / "shared" / "data"
 ATI_AT_REST = RECORDS / "ntnu_fts_imu_contact"
@@ -90,7 +90,7 @@ def test_sensor_without_parts_reads_the_truth(config):
 
 def test_every_field_that_can_be_off_belongs_to_a_part():
     fields = {field.name for field in dataclasses.fields(WristSensorConfig)}
-    in_parts = [name for values in SENSOR_PARTS.values() for name in values]
+    in_parts = [name for values in DISABLED_PART_VALUES.values() for name in values]
     ranges = {name for name in fields if name.endswith("_range")}
     assert len(in_parts) == len(set(in_parts))
     assert fields - set(in_parts) - ranges == {"preset", "ideal", "unit", "bandwidth_hz"}
@@ -527,12 +527,12 @@ def section(title):
 
 def test_docs_list_every_part_with_its_fields():
     rows = re.findall(r"^\| (\w+) \| (`.*?) \|", section("The parts"), re.MULTILINE)
-    assert [name for name, _ in rows] == list(SENSOR_PARTS)
+    assert [name for name, _ in rows] == list(DISABLED_PART_VALUES)
     fields = {field.name for field in dataclasses.fields(WristSensorConfig)}
     for name, text in rows:
         named = re.findall(r"`(\w+)`", text)
         assert set(named) <= fields
-        assert set(SENSOR_PARTS[name]) <= set(named) or "…" in text
+        assert set(DISABLED_PART_VALUES[name]) <= set(named) or "…" in text
 
 
 def test_figures_in_docs_equal_the_presets():

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import Scenario, ScenarioFromData, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
 from drake_teleop.station.slave.joint_control import (
-    POSITION_INTERFACES,
+    POSITION_INTERFACE_PRESETS,
     JointControl,
     PositionInterface,
     servo_impedance,
@@ -21,7 +21,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 HOME = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 PERIOD = 5e-4
-UR = POSITION_INTERFACES["ur_servoj"]
+UR = POSITION_INTERFACE_PRESETS["ur_servoj"]
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_speed_and_acceleration_stay_within_the_limits(arm):
 
 def test_distant_target_is_reached_without_overshoot(arm):
     """A linear law would overshoot with a fast interface of weak motors."""
-    franka = POSITION_INTERFACES["franka_position"]
+    franka = POSITION_INTERFACE_PRESETS["franka_position"]
     states, _ = follow(arm, franka, lambda t: HOME + 0.3, 1600)
     moved = states[:, :6] - HOME
     assert np.abs(moved[-1] - 0.3).max() < 1e-4
@@ -135,13 +135,15 @@ def test_invalid_interface_raises_one_error(changes, where):
 def test_another_servo_has_its_own_interface():
     named = ScenarioFromData({"joint_control": {"servo": "franka_position"}}, "x")
     other = replace(named, joint_control__servo="ur_servoj").joint_control
-    assert other.position_interface == POSITION_INTERFACES["ur_servoj"]
+    assert other.position_interface == POSITION_INTERFACE_PRESETS["ur_servoj"]
 
 
 def test_scenario_overrides_single_interface_fields():
     data = {"joint_control": {"servo": "franka_position", "interface": {"dead_time": 0.01}}}
     found = ScenarioFromData(data, "x").joint_control.position_interface
-    assert found == dataclasses.replace(POSITION_INTERFACES["franka_position"], dead_time=0.01)
+    assert found == dataclasses.replace(
+        POSITION_INTERFACE_PRESETS["franka_position"], dead_time=0.01
+    )
     scenario = replace(Scenario(), joint_control__interface=UR)
     with pytest.raises(DrakeTeleopError, match="remove this field"):
         scenario.check()

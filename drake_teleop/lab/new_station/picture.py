@@ -63,9 +63,9 @@ def draw_start_posture(plan: StationPlan, title: str) -> Figure:
 
 
 def _arm_triangles_and_colours(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
-    anchored, rank = shapes.anchored_bodies(), 0
+    anchored, rank = shapes.anchored_slave_bodies(), 0
     triangles, colours = [], []
-    for body in sorted(shapes.moving_bodies() | anchored, key=int):
+    for body in sorted(shapes.moving_slave_bodies() | anchored, key=int):
         hulls = shapes.hull_points_W(body, visual=True)
         if body in shapes.tool_bodies:
             colour = _TOOL_COLOUR

@@ -273,7 +273,7 @@ def _with_largest_fitting_wall(
     for wall in walls:
         shapes.plant.SetFreeBodyPose(shapes.context, wall, RigidTransform(p_WB))
     depths = {wall.index(): 0.0 for wall in walls}
-    lowest = shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf)
+    lowest = shapes.points_on_bodies_W(shapes.moving_slave_bodies())[:, 2].min(initial=np.inf)
     cost, overlaps = max(region.plane_height - lowest, 0.0), False
     for first, second, distance in shapes.overlaps():
         pair = {first.index(), second.index()}
@@ -297,7 +297,7 @@ def _with_largest_fitting_wall(
 
 def lowest_tool_point(shapes: PostureShapes) -> Array:
     """Return the tool's lowest point p_W (3,) [m]; of a tool without shapes, its centre of mass."""
-    points = shapes.points_on_bodies(shapes.tool_bodies)
+    points = shapes.points_on_bodies_W(shapes.tool_bodies)
     if not len(points):
         phi = shapes.arm.phi_load
         points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
@@ -309,7 +309,7 @@ def coordinates_along_axis(
     shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str
 ) -> Array:
     """Return the coordinate (k,) along an axis of S, from So [m], of each point of the bodies."""
-    points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
+    points = shapes.X_WS.inverse() @ shapes.points_on_bodies_W(bodies).T
     along: Array = TOOL_AXES[axis].matrix()[:, 2] @ points
     return along
 

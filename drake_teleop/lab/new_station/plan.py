@@ -197,7 +197,7 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
     Without such shapes it is 0, or the first joint's height if that is lower. Below a hanging arm
     it is 0, or the lowest height of the sensor if that is lower.
     """
-    heights = shapes.points_on_bodies(shapes.anchored_bodies())[:, 2]
+    heights = shapes.points_on_bodies_W(shapes.anchored_slave_bodies())[:, 2]
     is_known = len(heights) > 0 and not shapes.has_sticks
     plane = heights.min() if is_known else min(shapes.arm.table[0, 11], 0.0)
     sensor_heights = random_postures(shapes.arm).p_WS[:, 2]

@@ -128,11 +128,11 @@ class WristSensorConfig:
 
     def noise_std(self) -> Array:
         """Return standard deviations (12,) of white noise in raw samples, ordered as `ranges`."""
-        return np.repeat([getattr(self, name) for name in SENSOR_PARTS["noise"]], 3)
+        return np.repeat([getattr(self, name) for name in DISABLED_PART_VALUES["noise"]], 3)
 
     def random_walk(self) -> Array:
         """Return standard deviations (12,) of random walks after 1 s, ordered as `ranges`."""
-        return np.repeat([getattr(self, name) for name in SENSOR_PARTS["random_walk"]], 3)
+        return np.repeat([getattr(self, name) for name in DISABLED_PART_VALUES["random_walk"]], 3)
 
     def ranges(self) -> Array:
         """Return ranges (12,) of force, torque, specific force, angular acceleration [SI units]."""
@@ -200,7 +200,7 @@ _CALIBRATION_ERROR_FIELDS = (
 )
 _NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
-SENSOR_PARTS: dict[str, dict[str, Any]] = {
+DISABLED_PART_VALUES: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION_ERROR_FIELDS, 0.0),
     "place": {"p_SoAo_S": [0.0] * 3, "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
     "low_pass": {"low_pass": "none"},
@@ -215,12 +215,12 @@ SENSOR_PARTS: dict[str, dict[str, Any]] = {
 
 
 def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
-    """Return a copy of the configuration without some parts of the sensor (keys of `SENSOR_PARTS`).
+    """Return a copy of the configuration without `parts`, which are keys of `DISABLED_PART_VALUES`.
 
     >>> without_parts(WristSensorConfig(), "noise", "offset").force_noise
     0.0
     """
-    changes = {name: value for part in parts for name, value in SENSOR_PARTS[part].items()}
+    changes = {name: value for part in parts for name, value in DISABLED_PART_VALUES[part].items()}
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 
@@ -279,7 +279,7 @@ _LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_
 _RANDOM_WALK_MEMORY_START = 1
 FILTER_MEMORY_START = _RANDOM_WALK_MEMORY_START + _NUM_NOISY_CHANNELS
 _DELAY_LINE_MEMORY_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_NOISY_CHANNELS
-_DELAY_LINE_ROW_SIZE = _NUM_NOISY_CHANNELS + 2
+_DELAYED_ANGLES_START = _NUM_NOISY_CHANNELS + 2
 
 
 def initialize_sensor_chain(
@@ -317,7 +317,7 @@ def initialize_sensor_chain(
         overload_limits=_OVERLOAD_LIMIT_IN_RANGES * ranges[:6],
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    memory = np.zeros(_DELAY_LINE_MEMORY_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
+    memory = np.zeros(_DELAY_LINE_MEMORY_START + rows * (_DELAYED_ANGLES_START + num_joints))
     return constants, memory
 
 
@@ -354,7 +354,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
-    line = memory[_DELAY_LINE_MEMORY_START:].reshape((-1, _DELAY_LINE_ROW_SIZE + angles.shape[0]))
+    line = memory[_DELAY_LINE_MEMORY_START:].reshape((-1, _DELAYED_ANGLES_START + angles.shape[0]))
     shift_delay_line(line)
     row, channels = line[0], line[0, :_NUM_NOISY_CHANNELS]
     walks = memory[_RANDOM_WALK_MEMORY_START:FILTER_MEMORY_START]
@@ -381,7 +381,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row[_NUM_NOISY_CHANNELS + 1] = _quantize_and_saturate_channels(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum, turned = constants.encoder_quantum, row[_DELAY_LINE_ROW_SIZE:]
+    quantum, turned = constants.encoder_quantum, row[_DELAYED_ANGLES_START:]
     for i in range(angles.shape[0]):
         turned[i] = quantum * np.rint(angles[i] / quantum) if quantum > 0.0 else angles[i]
 
@@ -394,7 +394,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     copy_into(reading, READ_ACCELERATION.start, acceleration, 6, 6)
     reading[READ_SATURATED] = max(force[_NUM_NOISY_CHANNELS], acceleration[_NUM_NOISY_CHANNELS + 1])
     encoders = line[int(late[2])]
-    copy_into(reading, READ_ANGLES.start, encoders, _DELAY_LINE_ROW_SIZE, angles.shape[0])
+    copy_into(reading, READ_ANGLES.start, encoders, _DELAYED_ANGLES_START, angles.shape[0])
 
 
 @njit(cache=True)

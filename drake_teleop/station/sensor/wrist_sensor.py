@@ -87,7 +87,7 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, out):
 
 
 @njit(cache=True)
-def _interpolate_state(step_s, fraction, x, xdot, end, end_dot, out):
+def _quintic_state_into(step_s, fraction, x, xdot, end, end_dot, out):
     half, h, u = x.shape[0] // 2, step_s, fraction
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
@@ -208,7 +208,7 @@ def take_due_samples(
         h = until - start[0]
         while (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period < until:
             u = (count * period - start[0]) / h
-            _interpolate_state(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
+            _quintic_state_into(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
                 interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])

@@ -79,10 +79,10 @@ def ArmModelFromPlant(
         rotation = R_MP.inverse() @ X_MpF.rotation() @ R
         table[row, ROTATION_COLUMN:TRANSLATION_COLUMN] = rotation.matrix().ravel()
         table[row, TRANSLATION_COLUMN:PHI_COLUMN] = R_MP.inverse() @ X_MpF.translation()
-        M_M = plant.CalcSpatialInertia(context, frame_M, bodies_of_rows[row])
-        M_L = M_M.ReExpress(R.inverse())
-        about_Lo = M_L.CalcRotationalInertia().CopyToFullMatrix3()[np.triu_indices(3)]
-        table[row, PHI_COLUMN:ROTOR_COLUMN] = [M_L.get_mass(), *M_L.CalcComMoment(), *about_Lo]
+        M_LMo_M = plant.CalcSpatialInertia(context, frame_M, bodies_of_rows[row])
+        M_LLo_L = M_LMo_M.ReExpress(R.inverse())
+        I_LLo_L = M_LLo_L.CalcRotationalInertia().CopyToFullMatrix3()[np.triu_indices(3)]
+        table[row, PHI_COLUMN:ROTOR_COLUMN] = M_LLo_L.get_mass(), *M_LLo_L.CalcComMoment(), *I_LLo_L
         frame_P, R_MP = frame_M, R
     limits = np.array([_joint_limits(joint) for joint in joints]).T.copy()
     lower, upper, speed, acceleration = limits

@@ -71,7 +71,7 @@ class PositionInterface:
 
 
 #: Interfaces by name; docs/station.md lists the sources.
-POSITION_INTERFACES: dict[str, PositionInterface] = {
+POSITION_INTERFACE_PRESETS: dict[str, PositionInterface] = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
         command_hz=1000.0,
@@ -94,7 +94,7 @@ class JointControlConfig:
     velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity loop bandwidth (E)")
     servo: str = choice(
         COMPUTED_TORQUE_SERVO_NAME,
-        (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACES, "position"),
+        (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACE_PRESETS, "position"),
         "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
         " position for the fields of `interface`",
     )
@@ -106,7 +106,7 @@ class JointControlConfig:
     def position_interface(self) -> PositionInterface | None:
         if self.servo == COMPUTED_TORQUE_SERVO_NAME:
             return None
-        return self.interface or POSITION_INTERFACES.get(self.servo, PositionInterface())
+        return self.interface or POSITION_INTERFACE_PRESETS.get(self.servo, PositionInterface())
 
     @property
     def tracking_delay_s(self) -> float:

@@ -39,13 +39,13 @@ _INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
 _MIN_GRADIENT_TO_ERROR_RATIO_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
-_MAX_POSE_ERROR_AT_SINGULARITY_M = 5e-6
+_MIN_OUT_OF_REACH_ERROR_M = 5e-6
 # The same for `find_posture`, which stops the search earlier [m].
-_MAX_SEARCH_ERROR_AT_SINGULARITY_M = 1e-3
+_MIN_OUT_OF_REACH_SEARCH_ERROR_M = 1e-3
 # Position error above which a pose is out of reach for an arm with fewer than 6 joints, which
 # always misses a part of the orientation [m]. 1 mm is visible at the tool, and about the
 # repeatability of small arms.
-_MAX_POSITION_ERROR_WITH_FEW_JOINTS_M = 1e-3
+_MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
@@ -207,7 +207,7 @@ def follow_pose(
     _gram_matrix_of_size_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, missed, expected_gain = np.inf, 0.0, 0.0
-    limit = _MAX_POSITION_ERROR_WITH_FEW_JOINTS_M if n < 6 else _MAX_POSE_ERROR_AT_SINGULARITY_M
+    limit = _MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M if n < 6 else _MIN_OUT_OF_REACH_ERROR_M
     while True:
         anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
@@ -310,7 +310,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
             if (
-                squared < _MAX_SEARCH_ERROR_AT_SINGULARITY_M**2
+                squared < _MIN_OUT_OF_REACH_SEARCH_ERROR_M**2
                 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M
             ):
                 status = _classify_wrist_or_shoulder_singularity(L, J)

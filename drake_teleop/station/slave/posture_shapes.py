@@ -65,7 +65,7 @@ class PostureShapes:
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
         beyond = bodies_carried_by(self.plant, self._parsed.sensor_frame.body())
         self.tool_bodies = {body.index() for body in beyond}
-        links = [self.plant.get_body(k) for k in self.moving_bodies() - self.tool_bodies]
+        links = [self.plant.get_body(k) for k in self.moving_slave_bodies() - self.tool_bodies]
         shapes = self.plant.GetCollisionGeometriesForBody, self.plant.GetVisualGeometriesForBody
         self.has_sticks = sticks and not any(find(link) for find in shapes for link in links)
         if self.has_sticks:
@@ -110,11 +110,11 @@ class PostureShapes:
 
         Pairs that nearly always overlap are left out.
         """
-        body, found = self.plant.get_body, self._body_pair_distances()
+        body, found = self.plant.get_body, self._overlap_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
         return [(body(first), body(second), found[first, second]) for first, second in pairs]
 
-    def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
+    def points_on_bodies_W(self, bodies: Collection[BodyIndex]) -> Array:
         hulls = [hull for body in bodies for hull in self.hull_points_W(body)]
         return np.vstack([np.zeros((0, 3)), *hulls])
 
@@ -126,15 +126,15 @@ class PostureShapes:
         X_WB = self.plant.EvalBodyPoseInWorld(self.context, body)
         return [(X_WB @ points.T).T for points in hulls]
 
-    def anchored_bodies(self) -> set[BodyIndex]:
+    def anchored_slave_bodies(self) -> set[BodyIndex]:
         fixed = self.plant.GetBodiesWeldedTo(self.plant.world_body())
         return {body.index() for body in fixed} - self.surroundings
 
-    def moving_bodies(self) -> set[BodyIndex]:
+    def moving_slave_bodies(self) -> set[BodyIndex]:
         every = set(map(BodyIndex, range(self.plant.num_bodies())))
-        return every - self.surroundings - self.anchored_bodies()
+        return every - self.surroundings - self.anchored_slave_bodies()
 
-    def _body_pair_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
+    def _overlap_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
         query = self._scene_graph.get_query_output_port().Eval(scene)
         found: dict[tuple[BodyIndex, BodyIndex], float] = {}
@@ -176,7 +176,7 @@ class PostureShapes:
         limits = joint_sampling_range(self.arm)
         for left in range(_NUM_SAMPLED_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
-            counts.update(p for p in self._body_pair_distances() if not self.surroundings & set(p))
+            counts.update(p for p in self._overlap_distances() if not self.surroundings & set(p))
             if max(counts.values(), default=0) + left <= least:
                 return set()
         return {pair for pair, count in counts.items() if count >= least}
@@ -196,11 +196,11 @@ def start_overlap_texts(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
-    return _cached_overlap_texts(HashableByValue((slave, parts), slave.model_files()))
+    return _warnings_and_assumptions(HashableByValue((slave, parts), slave.model_files()))
 
 
 @lru_cache(maxsize=4)
-def _cached_overlap_texts(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _warnings_and_assumptions(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)

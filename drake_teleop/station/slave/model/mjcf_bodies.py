@@ -236,7 +236,7 @@ class MjcfWriter:
     def write(self, world: Body, moving: list[Joint]) -> str:
         """Return the MJCF text of a world body; the joints `moving` get motors."""
         top = SubElement(self._root, "worldbody")
-        self._write_body_content(top, world)
+        self._write_joints_geoms_and_children(top, world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
         for each in self._mjcf.elements_in("contact"):
@@ -248,7 +248,7 @@ class MjcfWriter:
             SubElement(actuators, "motor", name=joint.name, joint=joint.name)
         return tostring(self._root, encoding="unicode")
 
-    def _write_body_content(self, element: Element, body: Body) -> None:
+    def _write_joints_geoms_and_children(self, element: Element, body: Body) -> None:
         for joint in body.joints:
             self._write_joint(element, joint)
         for geom in body.geoms if self._purpose.plant_has_shapes else ():
@@ -263,7 +263,7 @@ class MjcfWriter:
                 SubElement(inner, "inertial", {"pos": _format_numbers(centre), **values})
             if self._purpose.is_tool and body.name == "world":
                 SubElement(inner, "freejoint")
-            self._write_body_content(inner, child)
+            self._write_joints_geoms_and_children(inner, child)
 
     def _write_joint(self, element: Element, joint: Joint) -> None:
         if joint.kind == "free":

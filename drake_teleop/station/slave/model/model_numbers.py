@@ -119,8 +119,8 @@ MAX_MODEL_VALUE_SI = 1e6  # largest length, mass or inertia, SI units; limits ma
 _NUMBER_LIST_ATTRIBUTES = {"xyz", "rpy", "rgba", "size", "scale"}
 _NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", "emissive")
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
-_QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
-_QUANTITY_TAGS |= {"radius", "radii", "length", "scale", "drake:rotor_inertia", "drake:gear_ratio"}
+_DIMENSION_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
+_DIMENSION_TAGS |= {"radius", "radii", "length", "scale", "drake:rotor_inertia", "drake:gear_ratio"}
 
 
 def parse_number(text: str | None) -> float:
@@ -146,7 +146,7 @@ def replace_commas_by_blanks(root: Element) -> None:
 def check_lengths_and_inertias(element: Element, where: str, model: ModelRepair) -> None:
     """Report lengths and inertias in an element that are not finite or above 1e6 (SI) as faults."""
     for inner in element.iter():
-        if inner.tag not in _QUANTITY_TAGS:
+        if inner.tag not in _DIMENSION_TAGS:
             continue
         if inner.tag == "origin":
             for name, text in inner.attrib.items():

@@ -27,8 +27,8 @@ _MAX_MODEL_FILES, _MAX_MODEL_BYTES, _MAX_TEXT_FILE_BYTES = 2000, 500_000_000, 50
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
 _XML_SUFFIXES = (".urdf", ".sdf", ".xml")
-_BINARY_SUFFIXES = {".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2"}
-_BINARY_SUFFIXES |= {".dae"}
+_MESH_AND_IMAGE_SUFFIXES = {".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg"}
+_MESH_AND_IMAGE_SUFFIXES |= {".ktx2", ".dae"}
 PACKAGE_FOLDER_SETTINGS = "--package-path, or package_paths in slave or master.leader"
 """Places where users name the folders of packages, for messages."""
 MESHES_NOT_FOUND_FAULT = f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
@@ -164,7 +164,7 @@ class ModelFiles:
             tops = [path if path.is_dir() else path.parent]
         folders = {top / base for top in tops for base in self._bases}
         try:
-            for address in _mesh_addresses(path) if with_meshes else self._addresses_in_file(path):
+            for address in _all_addresses(path) if with_meshes else self._addresses_in_file(path):
                 if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     limit = f"(at most {_MAX_PATH_LENGTH})"  # Drake aborts on it
                     what = f"references a file by an address of {len(address)} characters {limit}"
@@ -187,7 +187,7 @@ class ModelFiles:
                 yield from (e.get("file", "") for e in root.iter("include"))
                 return
             meshes = path != self._model.resolve() or kind == ".xml"
-            yield from _addresses_in_xml(root, meshes=meshes)
+            yield from _addresses_in_xml(root, with_meshes=meshes)
         elif kind in (".yaml", ".yml"):
             yield from addresses_in_directives(read_yaml(path, tagged=True))
         elif kind in (".gltf", ".glb"):
@@ -228,7 +228,7 @@ def _existing_raw_and_normalized_paths(path: Path | None) -> list[Path]:
 
 
 def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
-    is_text = files == 1 and path.suffix.lower() not in _BINARY_SUFFIXES
+    is_text = files == 1 and path.suffix.lower() not in _MESH_AND_IMAGE_SUFFIXES
     most = _MAX_TEXT_FILE_BYTES if is_text else _MAX_MODEL_BYTES
     if files > _MAX_MODEL_FILES or size > most:
         what = f"{_MAX_MODEL_FILES} files" if files > _MAX_MODEL_FILES else f"{most // 10**6} MB"
@@ -257,16 +257,16 @@ def read_xml(path: Path) -> Element:
         raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
-def _mesh_addresses(path: Path) -> Iterator[str]:
-    for address in _addresses_in_xml(read_xml(path), meshes=True):
+def _all_addresses(path: Path) -> Iterator[str]:
+    for address in _addresses_in_xml(read_xml(path), with_meshes=True):
         yield from {address, re.split(r"[/\\]", address)[-1]}  # the name alone: strippath of MJCF
 
 
-def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
+def _addresses_in_xml(root: Element, *, with_meshes: bool) -> Iterator[str]:
     for element in root.iter():
         if element.tag in ("plugin", "script"):
             continue
-        if element.tag != "mesh" or meshes:
+        if element.tag != "mesh" or with_meshes:
             yield from (x for n, x in element.items() if _FILE_ATTRIBUTE_REGEX.match(n) and x)
             texts = (e.text for e in element if _FILE_ELEMENT_TAG_PATTERN.match(e.tag))
             yield from (text.strip() for text in texts if text and text.strip())

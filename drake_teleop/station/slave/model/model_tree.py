@@ -52,7 +52,7 @@ def reduce_to_chain(
         return None
     joints = _weld_floating_base(scope, joints, model)
     root, chain = joint_link(joints[0], "parent") if joints else sensor_link, set(joints)
-    num_joints_to_link = _remove_unconnected_links(scope, root, chain, model)
+    num_joints_to_link = _remove_unconnected_and_count_joints(scope, root, chain, model)
     names = {joint.get("name") for joint in joints} | model.purpose.held_positions.keys()
     for joint in joints:
         for element in (joint, *joint.findall("axis")):
@@ -121,7 +121,7 @@ def _weld_floating_base(scope: Element, chain: list[Element], model: ModelRepair
     return chain[first + 1 :]
 
 
-def _remove_unconnected_links(
+def _remove_unconnected_and_count_joints(
     scope: Element, root: str, chain: set[Element], model: ModelRepair
 ) -> dict[str, int]:
     links = {link.get("name", ""): link for link in scope.findall("link")}
