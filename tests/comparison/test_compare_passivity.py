@@ -172,7 +172,9 @@ def test_longest_round_trip_is_below_the_first_unstable_one():
 
 
 def test_missing_scenario_is_an_error_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "_run_longest_round_trip_study", lambda *_: pytest.fail("the work begins"))
+    monkeypatch.setattr(
+        study, "_run_longest_round_trip_study", lambda *_: pytest.fail("the work begins")
+    )
     with pytest.raises(DrakeTeleopError, match="there is no scenario 'nope'"):
         study.compare_command(tmp_path / "out", scenario="nope", quiet=True)
     assert not (tmp_path / "out").exists()
