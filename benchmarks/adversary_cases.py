@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.lab.comparison.one_dof import PERIOD_S, REFERENCE
+from drake_teleop.lab.comparison.one_dof import PERIOD_S, REFERENCE_ONE_DOF
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import NetworkConfig
 
@@ -195,13 +195,13 @@ def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def prepared(case: dict[str, Any], imperfect: bool) -> dict[str, Any]:
     """Return the arguments of `run_one_dof` except for the method."""
-    model = REFERENCE
+    model = REFERENCE_ONE_DOF
     if imperfect:
         # The mass is up to 20 % less than configured. It is not in `DRAWS`, so that cases keep
         # their names.
         mass = 1.0 - 0.2 * np.random.default_rng([case["seed"], 1]).random()
         model = dataclasses.replace(
-            REFERENCE,
+            REFERENCE_ONE_DOF,
             configured_mass_ratio=1.0 / mass,
             master_resolution=case["resolution"],
             slave_resolution=case["resolution"] / 3,

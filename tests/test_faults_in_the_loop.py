@@ -48,7 +48,8 @@ def two_layer():
 
 ONE, SHORT, LONG = 5e-4, 0.02, 0.25  # s
 NONE, STALE, READING, LOAD, WRENCH, HAND = (
-    Fault.NONE, Fault.STALE, Fault.READING, Fault.LOAD, Fault.WRENCH, Fault.HAND,
+    Fault.NONE, Fault.OLD_SAMPLE, Fault.BAD_READING, Fault.INVALID_LOAD,
+    Fault.HAND_WRENCH, Fault.HAND_JOINTS,
 )  # fmt: skip
 CASES = [
     # station, kind, place, length, number, size: reported cause at the slave, at the hand

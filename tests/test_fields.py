@@ -46,14 +46,22 @@ def test_every_field_has_a_meaning(root: type) -> None:
 def test_a_quantity_has_unit_and_range() -> None:
     duration = named(Simulation, "duration")
     assert (duration.kind, duration.list_depth, duration.optional) == ("number", 0, False)
-    assert (duration.unit, duration.default, duration.range) == ("s", 1.0, "0.001 to 36000 s")
-    assert named(ForceScalingConfig, "sigma").range == "0 to 100"  # no unit
-    assert named(Simulation, "integrator").range.startswith("runge_kutta3, ")
+    assert (duration.unit, duration.default, duration.limits_or_choices) == (
+        "s",
+        1.0,
+        "0.001 to 36000 s",
+    )
+    assert named(ForceScalingConfig, "sigma").limits_or_choices == "0 to 100"  # no unit
+    assert named(Simulation, "integrator").limits_or_choices.startswith("runge_kutta3, ")
 
 
 def test_lists_blocks_and_optional_fields() -> None:
     intent, task = named(OperatorConfig, "intent"), named(OperatorConfig, "task")
-    assert (intent.kind, intent.list_depth, intent.range) == ("block", 1, "MinimumJerk or Sine")
+    assert (intent.kind, intent.list_depth, intent.limits_or_choices) == (
+        "block",
+        1,
+        "MinimumJerk or Sine",
+    )
     assert (task.blocks, task.list_depth, task.optional, task.default) == (
         TASK_CLASSES,
         0,

@@ -63,7 +63,7 @@ def reproduce(out: Path, **options: Any) -> int:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO_TYPE, required=False)
+@click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE, required=False)
 @option.path("--inputs", metavar="DIR")
 @option.output_folder("run")
 @option.seed()
@@ -92,7 +92,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO_TYPE, default="contact_transition")
+@click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE, default="contact_transition")
 @option.path("--record", metavar="DIR")
 @option.integer("--port", limits=(0, 65535), default=0, show_default="any free port")
 @click.option("--no-browser", is_flag=True)
@@ -148,7 +148,7 @@ def drive(
 
 
 @cli.command("scenario")
-@click.argument("name", type=option.SCENARIO_TYPE, required=False)
+@click.argument("name", type=option.SCENARIO_NAME_OR_PATH_TYPE, required=False)
 def print_scenario(name: str | None) -> None:
     """Print a scenario with every field, as a template.
 
@@ -177,7 +177,7 @@ def parts() -> None:
 
 
 @cli.command()
-@click.argument("folder", type=option.PATH_TYPE)
+@click.argument("folder", type=option.UTF8_PATH_TYPE)
 @click.option("--scenario", metavar="SCENARIO")
 @option.output_folder("replay")
 @option.quiet
@@ -196,7 +196,7 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH_TYPE)
+@click.argument("log", type=option.UTF8_PATH_TYPE)
 @option.gripper_file
 @click.option(
     "--method",
@@ -223,12 +223,12 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH_TYPE)
+@click.argument("log", type=option.UTF8_PATH_TYPE)
 @option.load_file(required=True)
 @option.gripper_file
 @option.sigma
 @click.option("--sigma-object", type=option.SCALE_TYPE)
-@option.sigma_weight_and_inertia
+@option.sigma_weight_and_sigma_inertia
 @option.gamma
 @option.number("--eta", limits=(0, 1))
 @option.choice("--offsets", ["record", "load"], "record")
@@ -267,7 +267,7 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH_TYPE)
+@click.argument("log", type=option.UTF8_PATH_TYPE)
 @option.load_file()
 @option.free_motion_log
 @option.choice("--statistic", ["level", "cusum", "glr"], "level")
@@ -291,8 +291,8 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH_TYPE)
-@click.argument("others", type=option.PATH_TYPE, nargs=-1)
+@click.argument("log", type=option.UTF8_PATH_TYPE)
+@click.argument("others", type=option.UTF8_PATH_TYPE, nargs=-1)
 @option.output_folder("inspect")
 @option.quiet
 def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None:
@@ -308,7 +308,7 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 
 
 @cli.command()
-@click.argument("path", type=option.PATH_TYPE)
+@click.argument("path", type=option.UTF8_PATH_TYPE)
 @option.load_file()
 @click.option("--identify", is_flag=True)
 @option.path("--description", metavar="FILE")
@@ -337,7 +337,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @option.load_file(required=True)
 @click.option("--out", "sink", default="-", show_default=False, metavar="SINK")
 @option.sigma
-@option.sigma_weight_and_inertia
+@option.sigma_weight_and_sigma_inertia
 @option.gamma
 @option.rate_hz()
 @click.option("--predicted", is_flag=True)
@@ -376,7 +376,7 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @click.argument("sink")
 @option.load_file(required=True)
 @option.sigma
-@option.sigma_weight_and_inertia
+@option.sigma_weight_and_sigma_inertia
 @option.gamma
 @option.rate_hz(required=True)
 @click.option("--watch", is_flag=True)
@@ -445,7 +445,7 @@ _EXPORT_FORMAT_OPTION_TYPE = option.RegisteredName(
 
 
 @cli.command()
-@click.argument("identification", type=option.PATH_TYPE)
+@click.argument("identification", type=option.UTF8_PATH_TYPE)
 @click.option("--to", required=True, type=_EXPORT_FORMAT_OPTION_TYPE)
 @option.sensor_pose
 @option.choice("--sign", ["-1", "1"], "-1")
@@ -506,7 +506,7 @@ def sample_log(out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO_TYPE)
+@click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE)
 @option.choice("--direction", ["x", "y", "z"], "z")
 @option.output_folder("analyze")
 @option.quiet
@@ -552,7 +552,7 @@ def compare_passivity(
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO_TYPE)
+@click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE)
 @click.option("--hands", type=option.NAMES_TYPE)
 @click.option("--walls", type=option.POSITIVE_NUMBERS_TYPE)
 @click.option("--network")
@@ -586,7 +586,7 @@ def tune(
 
 
 @cli.command()
-@click.argument("study", type=option.STUDY_TYPE)
+@click.argument("study", type=option.STUDY_NAME_OR_PATH_TYPE)
 @option.jobs
 @option.dask_cluster
 @click.option("--shard", metavar="K/N")
@@ -631,7 +631,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO_TYPE, default="identification")
+@click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE, default="identification")
 @option.path("--model")
 @option.sensor_frame()
 @option.package_paths
@@ -675,7 +675,7 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("folder", type=option.PATH_TYPE)
+@click.argument("folder", type=option.UTF8_PATH_TYPE)
 @option.path("--arm", required=True)
 @option.sensor_frame(required=True)
 @option.package_paths

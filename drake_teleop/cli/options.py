@@ -48,10 +48,10 @@ class ShippedOrPath(Utf8Path):
         return fitting + super().shell_complete(ctx, param, incomplete)
 
 
-PATH_TYPE = Utf8Path(path_type=Path)
-SCENARIO_TYPE = ShippedOrPath(scenarios_dir(), str)
-STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
-path = partial(click.option, type=PATH_TYPE)
+UTF8_PATH_TYPE = Utf8Path(path_type=Path)
+SCENARIO_NAME_OR_PATH_TYPE = ShippedOrPath(scenarios_dir(), str)
+STUDY_NAME_OR_PATH_TYPE = ShippedOrPath(studies_dir(), Path)
+path = partial(click.option, type=UTF8_PATH_TYPE)
 
 
 HELP_SETTINGS = dict(help_option_names=["-h", "--help"], max_content_width=100, show_default=True)
@@ -192,7 +192,7 @@ def output_folder(command: str) -> Callable[[Any], Any]:
     """Return a decorator for `--out DIR`; new folders that remain empty are removed at the end."""
     return click.option(
         "--out",
-        type=PATH_TYPE,
+        type=UTF8_PATH_TYPE,
         default=Path("out") / command,
         metavar="DIR",
         callback=_schedule_empty_folder_removal,
@@ -267,7 +267,7 @@ skip_run_count_question = click.option(
 )
 
 
-def sigma_weight_and_inertia(command: Any) -> Any:
+def sigma_weight_and_sigma_inertia(command: Any) -> Any:
     for part in ("inertia", "weight"):
         command = click.option(f"--sigma-{part}", type=SCALE_TYPE)(command)
     return command

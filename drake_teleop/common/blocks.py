@@ -45,23 +45,23 @@ class Fault(IntEnum):
     """Faults that suppress the force at the operator's hand; of several the lowest code counts."""
 
     NONE = 0
-    STALE = 1
-    READING = 2
-    JOINTS = 3
-    LOAD = 4
-    WRENCH = 5
-    HAND = 6
+    OLD_SAMPLE = 1
+    BAD_READING = 2
+    SLAVE_JOINTS = 3
+    INVALID_LOAD = 4
+    HAND_WRENCH = 5
+    HAND_JOINTS = 6
     RESUMING = 7
 
 
 _PORT_VALUE_OUT_OF_RANGE_TEXT = f"not finite or above {LARGEST_PORT_VALUE:g} in SI units"
 FAULT_WARNINGS = {
-    Fault.STALE: "the wrist sensor's last sample is more than 50 ms and two periods from now",
-    Fault.READING: "the wrist sensor gives no reading, or one beyond its valid range",
-    Fault.JOINTS: f"the slave's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
-    Fault.LOAD: f"the load estimate is {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
-    Fault.WRENCH: f"the wrench for the hand is {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
-    Fault.HAND: f"the hand's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.OLD_SAMPLE: "the wrist sensor's last sample is more than 50 ms and two periods from now",
+    Fault.BAD_READING: "the wrist sensor gives no reading, or one beyond its valid range",
+    Fault.SLAVE_JOINTS: f"the slave's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.INVALID_LOAD: f"the load estimate is {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.HAND_WRENCH: f"the wrench for the hand is {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
+    Fault.HAND_JOINTS: f"the hand's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
     Fault.RESUMING: "the force at the hand increases again after a fault",
 }
 """Warning text of each fault."""

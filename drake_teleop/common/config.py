@@ -70,9 +70,9 @@ def with_absolute_paths(config: Any, folder: Path) -> Any:
     A path that equals the field's default is a shipped model: it remains unless it is in `folder`.
     """
 
-    def resolve(value: Any, entry: dataclasses.Field[Any]) -> Any:
+    def resolve_paths(value: Any, entry: dataclasses.Field[Any]) -> Any:
         if isinstance(value, list):
-            return [resolve(item, entry) for item in value]
+            return [resolve_paths(item, entry) for item in value]
         if dataclasses.is_dataclass(value):
             return with_absolute_paths(value, folder)
         if not entry.metadata.get("is_path") or not value:
@@ -83,7 +83,7 @@ def with_absolute_paths(config: Any, folder: Path) -> Any:
     changes = {}
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
-        if (resolved := resolve(value, entry)) != value:
+        if (resolved := resolve_paths(value, entry)) != value:
             changes[entry.name] = resolved
     return dataclasses.replace(config, **changes) if changes else config
 
@@ -141,12 +141,12 @@ def check_all_field_values(config: Any, where: str) -> None:
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_location(where, field.name)
         _check_field_value(field, kinds[field.name], value, place)
-        for item_place, item in _locations_and_items(value, place):
+        for item_place, item in _locations_and_list_items(value, place):
             if dataclasses.is_dataclass(item):
                 check_all_field_values(item, item_place)
 
 
-def _locations_and_items(value: Any, where: str) -> list[tuple[str, Any]]:
+def _locations_and_list_items(value: Any, where: str) -> list[tuple[str, Any]]:
     if isinstance(value, list):
         return [(f"{where}[{index}]", item) for index, item in enumerate(value)]
     return [(where, value)]
@@ -277,11 +277,11 @@ def _is_value_of_type(kind: type, value: Any, *, from_file: bool) -> bool:
     if isinstance(value, bool) and kind is not bool:
         return False
     required = {int: numbers.Integral, float: numbers.Real}.get(kind, kind)
-    numeric_text = kind is float and from_file and _is_numeric_text(value)
+    numeric_text = kind is float and from_file and _is_convertible_to_float(value)
     return isinstance(value, required) or numeric_text
 
 
-def _is_numeric_text(value: Any) -> bool:
+def _is_convertible_to_float(value: Any) -> bool:
     try:
         float(value)
     except (TypeError, ValueError, OverflowError):
@@ -327,7 +327,7 @@ class FieldInfo:
     is_mapping: bool = False
 
     @property
-    def range(self) -> str:
+    def limits_or_choices(self) -> str:
         if self.unit:
             unit = "" if self.unit == "1" else f" {self.unit}"
             return f"{_format_limit(self.low)} to {_format_limit(self.high)}{unit}"
@@ -337,7 +337,7 @@ class FieldInfo:
 
     @property
     def docstring_entry(self) -> str:
-        metadata = [self.range] if self.range else []
+        metadata = [self.limits_or_choices] if self.limits_or_choices else []
         if self.default is None or self.kind != "block":
             metadata.append(f"default {_format_value(self.default)}")
         return f"{self.name}: {self.meaning}" + (f" ({'; '.join(metadata)})" if metadata else "")
@@ -365,7 +365,7 @@ def _lines_of_non_default_fields(config: Any) -> Iterator[str]:
         value = getattr(config, entry.name)
         if value == _default_value(entry):
             continue
-        blocks = _locations_and_items(value, entry.name)
+        blocks = _locations_and_list_items(value, entry.name)
         if not blocks or not dataclasses.is_dataclass(blocks[0][1]):
             yield f"{entry.name}: {_format_value(value)}"
             continue

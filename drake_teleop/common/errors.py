@@ -100,13 +100,13 @@ def field_location(where: str, name: Any) -> str:
 
 
 # stderr is global: two threads would restore it in the wrong order.
-_STDERR_LOCK = RLock()
+_STDERR_REDIRECTION_LOCK = RLock()
 
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
     """Discard stderr in this context, also that of C and Rust code."""
-    with _STDERR_LOCK:
+    with _STDERR_REDIRECTION_LOCK:
         try:
             sys.stderr.flush()
             saved = os.dup(2)

@@ -108,7 +108,7 @@ def to_float(name: str, value: Any) -> float:
         raise DrakeTeleopError(what, where=name) from None
 
 
-def check_nonzero_load(name: str, phi: Array) -> Array:
+def check_load_not_all_zero(name: str, phi: Array) -> Array:
     if not phi.any():
         what = "all ten parameters are zero: the load is not identified"
         remedy = "identify it first: identify_load for a scenario, identify_log for a log"

@@ -17,7 +17,7 @@ NUM_COLUMNS_OF_ROTATION_FORM = {
 }
 """Number of columns of each form."""
 
-EULER_AXES = tuple(
+EULER_AXIS_SEQUENCES = tuple(
     axes
     for letters in ("xyz", "XYZ")
     for axes in map("".join, product(letters, repeat=3))
@@ -30,7 +30,7 @@ def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Arr
     """Return rotation matrices (N, 3, 3) of `columns` (N, k) in a `form`, without normalization.
 
     The forms are in `NUM_COLUMNS_OF_ROTATION_FORM`: matrices row by row, angles in rad. `axes` is
-    one of `EULER_AXES`.
+    one of `EULER_AXIS_SEQUENCES`.
     """
     if form == "euler":
         from scipy.spatial.transform import Rotation

@@ -136,11 +136,11 @@ def read_json(path: str | Path) -> Any:
             found[name] = value
         return found
 
-    def parse_integer(digits: str) -> float:
+    def integer_or_float(digits: str) -> float:
         return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)
 
     try:
-        return json.loads(text, object_pairs_hook=check_unique_fields, parse_int=parse_integer)
+        return json.loads(text, object_pairs_hook=check_unique_fields, parse_int=integer_or_float)
     except json.JSONDecodeError as error:
         what = f"is not JSON (line {error.lineno}: {error.msg})"
         raise DrakeTeleopError(what, where=where) from None

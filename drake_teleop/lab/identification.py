@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
-from drake_teleop.common.numeric import Array, check_nonzero_load, one_blas_thread
+from drake_teleop.common.numeric import Array, check_load_not_all_zero, one_blas_thread
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.excitation.check import check_trajectory
 from drake_teleop.lab.excitation.excite import criterion_values, excite
@@ -160,7 +160,7 @@ def identify_load(
     with one_blas_thread():
         batch = identify_by_batch(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     estimate = result["load_estimate"][-1]
-    check_nonzero_load("load_estimate", estimate[6:])
+    check_load_not_all_zero("load_estimate", estimate[6:])
     method = METHODS[scenario.load_estimator.method].method
     return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
 

@@ -17,7 +17,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common import files, vectors
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, check_nonzero_load, contact_spans
+from drake_teleop.common.numeric import Array, check_load_not_all_zero, contact_spans
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identification import (
     identify_load,
@@ -250,7 +250,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     """Return the content of summary.json without the scenario's name."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
-    check_nonzero_load("load_estimate", estimate[6:])
+    check_load_not_all_zero("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
     measured = wrench - estimate[:6]
     calculated = contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])

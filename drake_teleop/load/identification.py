@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import write_json
-from drake_teleop.common.numeric import Array, check_nonzero_load, finite_array
+from drake_teleop.common.numeric import Array, check_load_not_all_zero, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
 
 VERDICT_NAMES = ("identified", "weakly", "not", "prior")
@@ -73,7 +73,7 @@ class Identification:
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
     def __post_init__(self) -> None:
-        check_nonzero_load("phi", finite_array("phi", self.phi, 10))
+        check_load_not_all_zero("phi", finite_array("phi", self.phi, 10))
         finite_array("offsets", self.offsets, 6)
 
     @property
@@ -240,7 +240,7 @@ def _parse_file_field(where: str, name: str, value: Any) -> Any:
         if name in _LIMITED_FILE_FIELDS and np.abs(array).max() > _MAX_FILE_VALUE:
             raise _file_error(f"has an absolute value above {_MAX_FILE_VALUE:g}", where)
         # The natural scale is proportional to the mass.
-        if name == "phi" and check_nonzero_load(where, array)[0] == 0.0:
+        if name == "phi" and check_load_not_all_zero(where, array)[0] == 0.0:
             raise _file_error("has the mass 0", where)
         return array if array.shape else (int if name == "samples" else float)(array)
     if name == "covariance":

@@ -57,7 +57,7 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
 
 def allowed_values(entry: FieldInfo) -> str:
-    words = entry.range if entry.unit or entry.choices else entry.kind
+    words = entry.limits_or_choices if entry.unit or entry.choices else entry.kind
     if entry.list_depth:
         words = f"{entry.length or 'any number'} of {words}"
     if entry.is_mapping:

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
-from drake_teleop.common.numeric import Array, check_nonzero_load, finite_array
+from drake_teleop.common.numeric import Array, check_load_not_all_zero, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
@@ -282,7 +282,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     if estimate is not None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
-            check_nonzero_load("load_estimate", estimate[6:])
+            check_load_not_all_zero("load_estimate", estimate[6:])
     scales = set(scenario.force_scaling.scales())
     if len(scales) > 1 and not _has_load_estimate(scenario, estimate):
         what = "sigma and gamma differ, which requires a load estimate, but there is none"

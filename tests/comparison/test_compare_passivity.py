@@ -35,7 +35,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study,
-        "_INJECTED_ENERGY_STUDY_CASES",
+        "_SIGMA_ROUND_TRIP_WALL_CASES",
         tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))),
     )
     # Use the load of the shipped scenario, which other tests have identified.
@@ -172,7 +172,9 @@ def test_longest_round_trip_is_below_the_first_unstable_one():
 
 
 def test_missing_scenario_is_an_error_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "_run_round_trip_study", lambda *_: pytest.fail("the work begins"))
+    monkeypatch.setattr(
+        study, "_run_longest_round_trip_study", lambda *_: pytest.fail("the work begins")
+    )
     with pytest.raises(DrakeTeleopError, match="there is no scenario 'nope'"):
         study.compare_command(tmp_path / "out", scenario="nope", quiet=True)
     assert not (tmp_path / "out").exists()

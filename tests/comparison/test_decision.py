@@ -13,8 +13,8 @@ from drake_teleop.lab.comparison.one_dof import AT_SLAVE
 from drake_teleop.lab.comparison.report import (
     decision_table,
     draw_decision_table,
+    draw_energy_traces,
     draw_force_traces,
-    draw_injected_energy,
 )
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -111,7 +111,7 @@ def test_impulses_count_from_the_delay_of_one_way(monkeypatch):
     assert found.leaked == pytest.approx(0.1 * AT_SLAVE)
 
 
-@pytest.mark.parametrize("draw", [draw_force_traces, draw_injected_energy])
+@pytest.mark.parametrize("draw", [draw_force_traces, draw_energy_traces])
 def test_title_of_a_figure_with_one_network_fits(draw):
     figure = draw({"methods": ["none"], "networks": ["lan"]}, {})
     figure.draw_without_rendering()

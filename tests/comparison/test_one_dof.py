@@ -19,7 +19,7 @@ from drake_teleop.lab.comparison.one_dof import (
     AT_HAND,
     AT_SLAVE,
     PERIOD_S,
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     OneDof,
     Task,
     measures_of_run,
@@ -155,15 +155,15 @@ def test_default_hand_and_servo_are_those_of_the_station():
         return -np.angle(slow) / 1e-3, brentq(excess, 1.0, 100.0)
 
     assert late_and_half_power(model) == pytest.approx((13.3e-3, 14.4), rel=0.01)
-    assert late_and_half_power(REFERENCE) == pytest.approx((17.1e-3, 12.0), rel=0.01)
-    stiffness = [axis.servo_stiffness for axis in (model, REFERENCE)]
+    assert late_and_half_power(REFERENCE_ONE_DOF) == pytest.approx((17.1e-3, 12.0), rel=0.01)
+    stiffness = [axis.servo_stiffness for axis in (model, REFERENCE_ONE_DOF)]
     assert stiffness == pytest.approx([502e3, 207e3], rel=0.01)
-    assert REFERENCE.servo_damping**2 == pytest.approx(
-        4 * REFERENCE.slave_mass * REFERENCE.servo_stiffness, rel=1e-12
+    assert REFERENCE_ONE_DOF.servo_damping**2 == pytest.approx(
+        4 * REFERENCE_ONE_DOF.slave_mass * REFERENCE_ONE_DOF.servo_stiffness, rel=1e-12
     )
 
 
-@pytest.mark.parametrize(("model", "longest"), [(OneDof(), 0.028), (REFERENCE, 0.008)])
+@pytest.mark.parametrize(("model", "longest"), [(OneDof(), 0.028), (REFERENCE_ONE_DOF, 0.008)])
 def test_longest_round_trip_without_a_method(model, longest):
     none, found = PassivityConfig(), {}
     for round_trip in (0.002, longest, longest + 0.002, 0.05):
@@ -174,7 +174,7 @@ def test_longest_round_trip_without_a_method(model, longest):
     assert found[0.05].least_energy < -1.0
 
 
-@pytest.mark.parametrize("model", [OneDof(), REFERENCE])
+@pytest.mark.parametrize("model", [OneDof(), REFERENCE_ONE_DOF])
 def test_simulation_and_linear_analysis_agree(model):
     shared = {
         entry.name: getattr(model, entry.name) for entry in dataclasses.fields(AxisParameters)
@@ -209,7 +209,11 @@ def test_energy_balances_agree_with_spring_and_inertia():
         release_end=1.5,
         end=2.0,
     )
-    model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operator_intent(task), 10
+    model, intent, ahead = (
+        dataclasses.replace(REFERENCE_ONE_DOF, gamma=0.8),
+        operator_intent(task),
+        10,
+    )
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
     spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave_position, 0.0) ** 2
@@ -255,7 +259,7 @@ def test_changing_hand_wall_and_imperfections():
     lost = np.zeros(steps, np.int64)
     lost[800:] = -1
     model = dataclasses.replace(
-        REFERENCE,
+        REFERENCE_ONE_DOF,
         slave_friction=30.0,
         wall_damping=300.0,
         motor_lag=3e-3,

@@ -53,7 +53,7 @@ def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
         ("force_to_master", [0, 0, -peak, 0, 0, 0], strongest),
         ("hand_wrench_E", [0, 60, 0, 0, 0, 0], "the simulated hand pulls with its largest force"),
         ("ports", [0, 0, 0, 0, 0, 0.06, 0, 0], "the network delivers no packets"),
-        ("fault", float(Fault.WRENCH), FAULT_WARNINGS[Fault.WRENCH]),
+        ("fault", float(Fault.HAND_WRENCH), FAULT_WARNINGS[Fault.HAND_WRENCH]),
     ):
         found = {key: values.copy() for key, values in rows.items()}
         found.setdefault(name, np.zeros((len(rows["t"]), np.size(change))))[1] = change

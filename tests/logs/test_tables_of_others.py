@@ -16,7 +16,7 @@ from planted import PHI, good
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.rotations import EULER_AXES, rotation_matrices
+from drake_teleop.common.rotations import EULER_AXIS_SEQUENCES, rotation_matrices
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.check.edits import (
     edit_with_opposite_wrench_sign,
@@ -115,7 +115,7 @@ def test_euler_angles_give_the_orientation_of_the_quaternion(
     np.testing.assert_allclose(read_log(path).R_WS, expected.R_WS, atol=1e-9)
 
 
-@given(st.sampled_from(EULER_AXES), st.tuples(*[st.floats(-1.4, 1.4)] * 3))
+@given(st.sampled_from(EULER_AXIS_SEQUENCES), st.tuples(*[st.floats(-1.4, 1.4)] * 3))
 def test_euler_matrices_are_products_of_rotations_about_the_axes(
     axes: str, angles: tuple[float, float, float]
 ) -> None:

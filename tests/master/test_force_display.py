@@ -105,7 +105,7 @@ def test_fault_has_its_own_port_and_a_combined_one():
     context = block.CreateDefaultContext()
     start = initial_display_state(POSTURES[1], DEVICE.parameters)
     block.GetInputPort("for_display").FixValue(context, start)
-    for wrench, fault in ((np.ones(6), Fault.NONE), (np.full(6, np.nan), Fault.WRENCH)):
+    for wrench, fault in ((np.ones(6), Fault.NONE), (np.full(6, np.nan), Fault.HAND_WRENCH)):
         block.GetInputPort("wrench_command").FixValue(context, wrench)
         assert block.GetOutputPort("fault_at_hand").Eval(context) == [fault]
         both = block.GetOutputPort("displayed_and_fault").Eval(context)
@@ -155,7 +155,7 @@ def test_wrench_fades_and_returns_without_a_step(part):
     growth = np.diff(force[159:])
     assert 0.0 < growth.max() <= 37.5 * PERIOD / RESUME_TIME_S * (1 + 1e-9)
     np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])
-    expected = Fault.WRENCH if part == "wrench" else Fault.HAND
+    expected = Fault.HAND_WRENCH if part == "wrench" else Fault.HAND_JOINTS
     assert (fault[bad] == expected).all() and not fault[:40].any() and not fault[2400:].any()
     assert (fault[160:1160] == Fault.RESUMING).all()
 

@@ -15,7 +15,7 @@ from drake_teleop.lab.comparison.one_dof import (
     AT_MOTOR,
     AT_SLAVE,
     PERIOD_S,
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     OneDofRun,
     Task,
     measures_of_run,
@@ -51,7 +51,7 @@ PATIENT = 1.0  # s, a time-out above any silence of these networks
 def model(grip=MEDIUM, wall=5100.0, **imperfect):
     mass, damping, stiffness = grip
     return dataclasses.replace(
-        REFERENCE,
+        REFERENCE_ONE_DOF,
         hand_mass=mass,
         hand_damping=damping,
         hand_stiffness=stiffness,

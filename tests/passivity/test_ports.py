@@ -18,7 +18,7 @@ from drake_teleop.lab.comparison.one_dof import (
     AT_MOTOR,
     AT_SLAVE,
     PERIOD_S,
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     OneDofRun,
     Task,
     measures_of_run,
@@ -33,7 +33,9 @@ from drake_teleop.station.passivity.packet import CUMULATIVE_ENERGY, pose_differ
 from drake_teleop.station.passivity.tdpa import TdpaConfig
 from drake_teleop.station.passivity.wave import WaveConfig
 
-MEDIUM = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
+MEDIUM = dataclasses.replace(
+    REFERENCE_ONE_DOF, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0
+)
 
 
 def press_deeply(method: str, seed: int, timeout: float) -> OneDofRun:
@@ -121,7 +123,7 @@ def test_tdpa_repays_the_energy_of_a_tap():
     t = np.arange(4000) * PERIOD_S
     x = 0.05 * np.sin(4.0 * np.pi * t) * np.minimum(t / 0.5, 1.0)
     found = run_one_dof(
-        REFERENCE, PassivityConfig(method="tdpa"), NetworkConfig(delay=0.05),
+        REFERENCE_ONE_DOF, PassivityConfig(method="tdpa"), NetworkConfig(delay=0.05),
         intent=np.stack([x, np.gradient(x, PERIOD_S)], axis=1),
     )  # fmt: skip
     assert found.wall_force.min() < -10.0, "the wall should have been touched"

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.lab.comparison.one_dof import PERIOD_S, REFERENCE, operator_intent, run_one_dof
+from drake_teleop.lab.comparison.one_dof import (
+    PERIOD_S,
+    REFERENCE_ONE_DOF,
+    operator_intent,
+    run_one_dof,
+)
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import LAST_PORT_WRENCH, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, method_parameters
@@ -23,8 +28,8 @@ def test_released_hand_stays_slow(method, delay):
     grip = np.tile([0.2, 5.0, 300.0], (len(intent), 1))
     grip[LET_GO:] = 0.0
     run = run_one_dof(
-        REFERENCE, PassivityConfig(method=method), NetworkConfig(delay=delay), intent=intent,
-        grip=grip, timeout=1.0,
+        REFERENCE_ONE_DOF, PassivityConfig(method=method), NetworkConfig(delay=delay),
+        intent=intent, grip=grip, timeout=1.0,
     )  # fmt: skip
     speed = np.abs(np.diff(run.master_position[LET_GO - 1 :])) / PERIOD_S
     assert speed.max() < 0.3

@@ -30,7 +30,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 #: N/m, walls of the table of margins, in addition to the scenario's own.
-WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
+MARGIN_WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
 MAX_COMPARED_OMEGA_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 #: Frequencies of the analysis [rad/s].
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
@@ -239,21 +239,21 @@ def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[s
     compared = OMEGA <= MAX_COMPARED_OMEGA_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
-    def largest_deviations_from(other: Complex) -> dict[str, float]:
+    def max_relative_deviations_from(other: Complex) -> dict[str, float]:
         found = np.abs(H[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     closed_form = two_port.hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])
     sampled = sampled_two_port(with_hand_mass, sampling, OMEGA[compared])
     models = {"closed_form": closed_form, "sampled": sampled}
-    return {name: largest_deviations_from(model) for name, model in models.items()}
+    return {name: max_relative_deviations_from(model) for name, model in models.items()}
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
     """Return stability margins for each grip and standard wall, and for `own_wall` [N/m]."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
-    walls = sorted({*WALL_STIFFNESSES_N_M, own_wall})
+    walls = sorted({*MARGIN_WALL_STIFFNESSES_N_M, own_wall})
     for grip, wall in itertools.product(GRIP_IMPEDANCES, walls):
         held = dataclasses.replace(axis_with_grip(axis, grip), wall_stiffness=wall)
         loop = cut_loop.cut_loop(held, sampling)

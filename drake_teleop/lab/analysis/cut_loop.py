@@ -122,11 +122,11 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 @njit(cache=True)
-def _response_at(zeros, poles, angle, radius):
+def _response_at(closed_multipliers, open_multipliers, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
-    for i in range(poles.shape[0]):
-        ratio *= (z - zeros[i]) / (z - poles[i])
+    for i in range(open_multipliers.shape[0]):
+        ratio *= (z - closed_multipliers[i]) / (z - open_multipliers[i])
     return 1.0 - ratio
 
 
@@ -205,6 +205,6 @@ def _add_gain_extremes_and_get_responses(angles, poles, zeros):
 
 
 @njit(cache=True)
-def _phase_near(value, reference):
-    phase = math.atan2(value.imag, value.real)
+def _phase_near(response, reference):
+    phase = math.atan2(response.imag, response.real)
     return phase + 2.0 * math.pi * np.rint((reference - phase) / (2.0 * math.pi))

@@ -42,7 +42,7 @@ JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
-_INJECTED_ENERGY_STUDY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+_SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of every run: a quarter (sensor) or half of those of the shipped scenarios.
 _COMPARISON_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
@@ -78,10 +78,10 @@ def compare_command(
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
-        limits = _run_round_trip_study(methods, seed, jobs, stage)
+        limits = _run_longest_round_trip_study(methods, seed, jobs, stage)
         released = _run_release_and_tap_study(networks, methods, seed, jobs, stage)
         runs, traces = _run_station_study(base, networks, methods, jobs, stage)
-        covering = _run_injected_energy_study(stage)
+        covering = _run_elimination_energy_study(stage)
     summary = {
         "networks": list(networks),
         "methods": list(methods),
@@ -206,7 +206,7 @@ class ReleaseAndTaps:
 def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
-    def simulate_hand(intent: Array, grip: Array | None = None) -> one_dof.OneDofRun:
+    def simulate_one_dof(intent: Array, grip: Array | None = None) -> one_dof.OneDofRun:
         return one_dof.run_one_dof(
             model,
             PassivityConfig(method=method),
@@ -224,9 +224,9 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     release_row = round(release_time / PERIOD_S)
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
     grip[release_row:] = 0.0
-    released = simulate_hand(pressing, grip)
+    released = simulate_one_dof(pressing, grip)
     after = released.master_position[release_row:]
-    tapping = [simulate_hand(_intended_tap_motion(rate, round_trip)) for rate in TAP_RATES_HZ]
+    tapping = [simulate_one_dof(_intended_tap_motion(rate, round_trip)) for rate in TAP_RATES_HZ]
     scale = model.force_scale * model.gamma
     return ReleaseAndTaps(
         release_force=float(np.abs(released.hand_force[release_row - 100 : release_row]).mean()),
@@ -257,7 +257,7 @@ def _displayed_share_of_tap_impulse(
     return float(max(displayed / pressed, 0.0)) if pressed < 0.0 else 0.0
 
 
-def _run_round_trip_study(
+def _run_longest_round_trip_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = [
@@ -314,16 +314,16 @@ def _run_station_study(
     return rows, traces
 
 
-def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
+def _run_elimination_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
-    for done, (sigma, round_trip, wall) in enumerate(_INJECTED_ENERGY_STUDY_CASES):
+    for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
         row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.AT_SLAVE))
         row["damping_Ns_per_m"] = one_dof.covering_damping(model, round_trip)
         rows.append(row)
-        progress((done + 1) / len(_INJECTED_ENERGY_STUDY_CASES))
+        progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))
     return rows
 
 

@@ -54,7 +54,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "decision": draw_decision_table(summary),
         "hands": draw_release_and_taps(summary),
         "runs": draw_force_traces(summary, traces),
-        "energy": draw_injected_energy(summary, traces),
+        "energy": draw_energy_traces(summary, traces),
         "limits": draw_round_trip_limits(summary["one_dof"]),
     }
     write_report_page_and_pictures(
@@ -208,7 +208,7 @@ def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
     return figure
 
 
-def draw_injected_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
+def draw_energy_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
     def draw_run_energy(axes: Any, shown: Mapping[str, Array]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)

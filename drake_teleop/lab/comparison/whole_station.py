@@ -162,13 +162,13 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
         raise DrakeTeleopError(what, where="result", remedy=remedy)
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
-    poses, motor = _poses_and_motor_wrenches(scenario, q, torque)
+    poses, motor = _slave_pose_and_motor_wrench(scenario, q, torque)
     contact = np.zeros_like(motor)
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
     gamma = scenario.force_scaling.scales().gamma
-    power = scenario.force_scaling.force_scale * gamma / _nonzero_kinematic_scales(scenario)
+    power = scenario.force_scaling.force_scale * gamma / _kinematic_scales_with_1_for_0(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
@@ -209,7 +209,7 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
     wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
     wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
-    power = scenario.force_scaling.force_scale / _nonzero_kinematic_scales(scenario)
+    power = scenario.force_scaling.force_scale / _kinematic_scales_with_1_for_0(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
@@ -218,19 +218,19 @@ def start_energy(scenario: Scenario) -> Array:
 
     Columns: translation, rotation.
     """
-    scales = _nonzero_kinematic_scales(scenario)
+    scales = _kinematic_scales_with_1_for_0(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     return 2 * methods.initial_method_memory(scenario.passivity.method, p, pose)[STORED_ENERGY]
 
 
-def _nonzero_kinematic_scales(scenario: Scenario) -> Array:
+def _kinematic_scales_with_1_for_0(scenario: Scenario) -> Array:
     scales = scenario.kinematic_scaling.scales
     return np.where(scales > 0.0, scales, 1.0)
 
 
-def _poses_and_motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
+def _slave_pose_and_motor_wrench(scenario: Scenario, q: Array, tau: Array) -> tuple[Array, Array]:
     # X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight.
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)
@@ -239,6 +239,6 @@ def _poses_and_motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tu
         serial_arm.pose_into(arm, q[k], poses[k])
         serial_arm.inverse_dynamics(arm, q[k], zero, zero, weight[k])
         serial_arm.jacobian(arm, q[k], J[k])
-    to_torque, excess = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
+    to_torque, excess = J.swapaxes(1, 2), (tau - weight)[:, :, np.newaxis]
     wrench = np.linalg.solve(to_torque, excess) if n == 6 else np.linalg.pinv(to_torque) @ excess
     return poses, wrench[:, :, 0]

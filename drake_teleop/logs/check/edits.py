@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import EULER_AXES, right_angled_rotations
+from drake_teleop.common.rotations import EULER_AXIS_SEQUENCES, right_angled_rotations
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read.bags import read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import Log
@@ -110,7 +110,7 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
         text = f"the quaternions are not {orientation.form}"
         fields = {f"{where}.form": forms[orientation.form]}
         yield _make_edit(description, "quaternion order", text, fields)
-    for axes in EULER_AXES if orientation.form == "euler" else ():
+    for axes in EULER_AXIS_SEQUENCES if orientation.form == "euler" else ():
         if axes != orientation.axes:
             text = f"the Euler angles are not about the axes {orientation.axes}"
             yield _make_edit(description, "Euler axes", text, {f"{where}.axes": axes})

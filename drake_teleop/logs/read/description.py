@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import EULER_AXES
+from drake_teleop.common.rotations import EULER_AXIS_SEQUENCES
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.read import description_fields as fields
 from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY, Column, Number, StrictModel
@@ -75,7 +75,7 @@ class Orientation(StrictModel):
             raise ValueError(
                 "form: euler needs axes, such as xyz (fixed) or ZYX (moving); other forms have none"
             )
-        if self.axes is not None and self.axes not in EULER_AXES:
+        if self.axes is not None and self.axes not in EULER_AXIS_SEQUENCES:
             raise ValueError(
                 f"axes {self.axes!r} are not known: give three letters, xyz for fixed and XYZ for"
                 " moving axes, none twice consecutively"

@@ -29,7 +29,7 @@ _IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
 _SAFE_STATE_MONITOR_SLOTS = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
 _DISPLAYED_WRENCH_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
-    int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
+    int, (Fault.NONE, Fault.HAND_WRENCH, Fault.HAND_JOINTS, Fault.RESUMING)
 )
 
 

@@ -31,7 +31,7 @@ _JOINT_ANGLE_SLICE = slice(regressor.FIRST_JOINT_INDEX, regressor.SAMPLE_TIME_IN
 #: Largest valid age of a sample, and of a time stamp in the future [s].
 MAX_SAMPLE_AGE_S = 0.05
 _NO_FAULT, _STALE_SAMPLE_FAULT, _BAD_READING_FAULT, _BAD_JOINTS_FAULT, _BAD_LOAD_FAULT = map(
-    int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
+    int, (Fault.NONE, Fault.OLD_SAMPLE, Fault.BAD_READING, Fault.SLAVE_JOINTS, Fault.INVALID_LOAD)
 )
 
 
