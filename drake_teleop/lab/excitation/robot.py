@@ -71,7 +71,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     """Return the scenario's slave as `Robot`, with surroundings and a table at z = 0."""
     check_scenario(scenario)
 
-    def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
+    def parse_slave_and_surroundings(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         parsed = ParseSlave(plant, scenario.slave)
         if scenario.surroundings is not None:
             AddEnvironment(plant, scenario.surroundings)
@@ -80,7 +80,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
     reserve = (_MAX_LOAD_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
-    scene = CollisionScene(parse, reserve, visuals_collide=not own)
+    scene = CollisionScene(parse_slave_and_surroundings, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_CORNERS_W)
     sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
@@ -113,7 +113,7 @@ def RobotFromModel(
     """
     missing: list[str] = []
 
-    def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
+    def parse_model_file(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         missing[:] = model.assumptions
         return model.instance, model.sensor_frame
@@ -140,7 +140,7 @@ def RobotFromModel(
         inertia = missing_mass * _ASSUMED_PAYLOAD_GYRATION_RADIUS_M**2 * np.eye(3) * 2 / 3
         reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
-        scene = CollisionScene(parse, reserve, visuals_collide=False, where=str(path))
+        scene = CollisionScene(parse_model_file, reserve, visuals_collide=False, where=str(path))
     assumptions += missing
     hint = " (--acceleration)"
     scene.arm, completed = fill_missing_joint_limits(scene.arm, str(path), acceleration, hint=hint)
