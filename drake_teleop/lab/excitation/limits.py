@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import dot, minus, plus, scale_vector, vector_at
 from drake_teleop.lab.excitation.criteria import write_gradients_by_motion
 from drake_teleop.lab.excitation.link_gradients import (
-    SEED_SIZE,
+    ADJOINT_SEED_SIZE,
     add_point_to_seed,
     add_torque_to_seeds,
     add_vector_to_seed,
@@ -150,7 +150,7 @@ def _exact_and_smooth_maximum(use, sharpness):
 def _allocate_gradient_buffers(motions):
     # Seeds, joint velocities and link velocities of virtual power, see `add_torque_to_seeds`.
     rows = motions.shape[1]
-    return np.zeros((rows, SEED_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
+    return np.zeros((rows, ADJOINT_SEED_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
 
 
 @njit(cache=True)

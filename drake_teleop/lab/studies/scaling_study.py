@@ -27,17 +27,10 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-MEASURE_BY_CRITERION = {
-    "effort": "effort_Ns",
-    "time": "task_time_s",
-    "force": "contact_force_overshoot_N",
-}
+CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
-CRITERIA_SETS = {
-    "all": tuple(MEASURE_BY_CRITERION),
-    **{name: (name,) for name in MEASURE_BY_CRITERION},
-}
-TASK_CRITERIA = dict.fromkeys(("reach", "touch", "press", "insert"), tuple(MEASURE_BY_CRITERION))
+CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+TASK_CRITERIA = dict.fromkeys(("reach", "touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
 TASK_CRITERIA["reach"] = ("effort", "time")
 _ETA_STUDY_NAME = "scaling_object"
@@ -143,9 +136,7 @@ def _criterion_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _sigmas_and_gammas()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA_KEY in rows.columns else 1
-    measures = {"success": "success"} | {
-        name: MEASURE_BY_CRITERION[name] for name in TASK_CRITERIA[task]
-    }
+    measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
     tables = {}
     for name, measure in measures.items():
         values = effects.measure_values(rows, measure)
@@ -197,7 +188,7 @@ def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
 def _summarise_measures_by_eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA_KEY].unique().to_list())
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
-    for measure in ("success", *MEASURE_BY_CRITERION.values(), "detection_time_s"):
+    for measure in ("success", *CRITERIA.values(), "detection_time_s"):
         values = effects.values_by_seed(rows, measure, by=_ETA_KEY)
         of_effect = effects.effect_half_widths_over_seeds(values)
         figures = *effects.means_and_half_widths_over_seeds(values), of_effect
@@ -215,7 +206,7 @@ def draw_task_criteria_over_scales(rows: dict[str, pl.DataFrame]) -> Figure:
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]
-            for axes, measure in zip(line, MEASURE_BY_CRITERION.values(), strict=True):
+            for axes, measure in zip(line, CRITERIA.values(), strict=True):
                 values = effects.values_by_seed(table, measure)
                 means = effects.means_and_half_widths_over_seeds(values)[0].reshape(-1, len(gammas))
                 bars = effects.effect_half_widths_over_seeds(values).reshape(means.shape)
