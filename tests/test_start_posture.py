@@ -16,7 +16,7 @@ from drake_teleop.lab.new_station import scenario_text
 from drake_teleop.lab.new_station.picture import draw_start_posture
 from drake_teleop.lab.new_station.place import (
     _iter_posture_rows_by_score,
-    _prefer_rows_away_from_limits,
+    _select_rows_far_from_limits_or_all,
     find_start_place,
     sensor_axis_along_tool,
 )
@@ -242,7 +242,7 @@ def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
     assert (part[0] < 0.7 * limit).all() and (part[1] > 0.7 * limit).any()
     assert (whole > 0.7 * limit).any(axis=1).all()
     weak = replace(arm, effort_limit=limit)
-    np.testing.assert_array_equal(_prefer_rows_away_from_limits(weak, q), [0])
+    np.testing.assert_array_equal(_select_rows_far_from_limits_or_all(weak, q), [0])
 
 
 def test_singular_values_agree_with_finite_differences_of_turning_and_sliding_joints():
@@ -418,7 +418,7 @@ def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     shapes = plain[1].posture_shapes
     postures, region = select_suitable_postures(random_postures(shapes.arm), 0.0, 0.1)
     usable, clear, clear_of_all = _iter_posture_rows_by_score(shapes.arm, postures, region, shapes)
-    expected = _prefer_rows_away_from_limits(shapes.arm, postures.q)
+    expected = _select_rows_far_from_limits_or_all(shapes.arm, postures.q)
     np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
     assert 3 < len(clear) < len(usable) < len(postures.q)
     assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
@@ -509,7 +509,7 @@ def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None
     torque = np.abs([holding_torque(arm, each) for each in q])
     limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
     weak = replace(arm, effort_limit=limit)
-    kept = q[_prefer_rows_away_from_limits(weak, q)]
+    kept = q[_select_rows_far_from_limits_or_all(weak, q)]
     roomy = least_joint_margins(weak, q) > 0.22
     assert 0 < roomy.sum() < len(q)
     if share > 1.0:

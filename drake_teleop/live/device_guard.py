@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FORCE_FADE_START_AGE_S = 0.02  # s
-_FORCE_RISE_N_S = 100.0  # N/s, of the force limit after silence
+_LIMIT_RAMP_UP_N_S = 100.0  # N/s, of the force limit after silence
 _MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
 
@@ -86,7 +86,7 @@ class DeviceGuard:
             self._was_silent = True
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
-        self._force_limit = min(self._force_limit + _FORCE_RISE_N_S * period, self._limits.force)
+        self._force_limit = min(self._force_limit + _LIMIT_RAMP_UP_N_S * period, self._limits.force)
         share = (COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_AGE_S)
         return min(max(share, 0.0), 1.0) if age < COMMAND_TIMEOUT_S else 0.0
 

@@ -15,9 +15,9 @@ from drake_teleop.lab.studies import pictures
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     FactorialModel,
-    effects_table,
     fill_missing_values,
     main_effects,
+    main_effects_table,
     means_and_half_widths_over_seeds,
     pair_means,
 )
@@ -91,7 +91,7 @@ def test_effects_compare_equal_combinations_only():
 
 
 def test_effects_table_lists_excluded_combinations():
-    table = effects_table(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
+    table = main_effects_table(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
     assert table["level"].to_list() == ["0.25", "1", "4", "8", "16"]
     assert table["runs"].to_list() == [16, 16, 8, 4, 0]
     assert table["combinations"].to_list() == [1] * 5
@@ -155,7 +155,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
         table = random.normal(0, 3.0, 6) + random.normal(0, 0.5, (6, 6))
         table = fill_missing_values(np.where(seen, table, np.nan))
         for which, into in ((seen, inside), (np.ones_like(seen), narrow)):
-            found, halves = FactorialModel(levels, [3, 2], which).effects(table)
+            found, halves = FactorialModel(levels, [3, 2], which).effects_and_half_widths(table)
             into.append(np.abs(found[0]) <= halves[0])
     assert np.mean(inside) >= 0.9  # 0.95 in the long run
     assert np.mean(narrow) < 0.8

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import qmc
 
 from drake_teleop.lab.studies.design import Factor, Study
-from drake_teleop.lab.studies.effects import effects_table, main_effects, pair_means
+from drake_teleop.lab.studies.effects import main_effects, main_effects_table, pair_means
 from drake_teleop.lab.studies.level_model import factor_levels, fit_level_model
 
 UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
@@ -47,7 +47,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
         table = table + random.normal(0, noise, table.shape)
         known_there = ~(corner & (points[:, 0] > 0.6) & (points[:, 1] < 0.4))
         model = fit_level_model(UNIT, points.T.tolist(), known_there)
-        found, halves = model.effects(table[known_there])
+        found, halves = model.effects_and_half_widths(table[known_there])
         near = [
             len(a) == len(b) and np.all(np.abs(a - b) <= h)
             for a, b, h in zip(found, truth, halves, strict=True)
@@ -119,17 +119,19 @@ def test_failed_point_does_not_change_other_effects():
     factors = [Factor("a.x", values=[0.0, 1.0, 4.0]), Factor("a.y", values=[1.0, 2.0, 3.0, 5.0])]
     study = Study(factors=factors, repeats=2, measures=["hand_work_J"])
     rows = fake_rows(study, lambda x, y, seed: 2.0 * x + 10.0 * y + seed, ("a.x", "a.y"))
-    whole = effects_table(study, rows)
+    whole = main_effects_table(study, rows)
     broken = rows.with_columns(
         hand_work_J=pl.when(pl.col("point").is_in([0, 5])).then(None).otherwise("hand_work_J")
     )
-    np.testing.assert_allclose(effects_table(study, broken)["effect"], whole["effect"], atol=1e-9)
-    assert effects_table(study, broken)["runs"].sum() == 2 * (24 - 4)
+    np.testing.assert_allclose(
+        main_effects_table(study, broken)["effect"], whole["effect"], atol=1e-9
+    )
+    assert main_effects_table(study, broken)["runs"].sum() == 2 * (24 - 4)
     # One run of a point; the weight of its seed does not change.
     broken = rows.with_columns(
         hand_work_J=pl.when(pl.col("run") == 3).then(None).otherwise("hand_work_J")
     )
-    np.testing.assert_allclose(effects_table(study, broken)["mean"], whole["mean"], atol=1e-9)
+    np.testing.assert_allclose(main_effects_table(study, broken)["mean"], whole["mean"], atol=1e-9)
 
 
 def test_pair_means_equal_the_function():

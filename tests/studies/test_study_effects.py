@@ -12,8 +12,8 @@ from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     PARETO_MEASURES,
     effect_half_widths_over_seeds,
-    effects_table,
     is_on_pareto_front,
+    main_effects_table,
     means_and_half_widths_over_seeds,
     pareto_table,
 )
@@ -69,7 +69,7 @@ def test_nan_values_are_ignored():
 
 
 def test_effects_equal_the_synthetic_ones():
-    found = effects_table(STUDY, table())
+    found = main_effects_table(STUDY, table())
     assert set(found["factor"]) == {"force_scaling.sigma", "force_scaling.gamma"}
     sigma = found.filter(measure="effort_Ns", factor="force_scaling.sigma")
     np.testing.assert_allclose(sigma["effect"], [1.0, 0.0, -1.0], atol=0.1)
@@ -117,7 +117,7 @@ def test_only_applicable_pictures_are_written(tmp_path):
 def test_range_of_a_sobol_design_has_equal_parts():
     factor = Factor("force_scaling.gamma", low=1.0, high=2.0)
     study = Study(factors=[factor], design="sobol", samples=16, measures=["success"])
-    found = effects_table(study, table(study))
+    found = main_effects_table(study, table(study))
     assert found["level"].to_list() == ["1.1", "1.3", "1.5", "1.7", "1.9"]
     assert found["runs"].sum() == 16
     assert found["mean_half"].is_nan().all()  # one repeat

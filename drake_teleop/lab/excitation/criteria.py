@@ -21,7 +21,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.regressor import regressor
 
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
-INFORMATION_SAMPLE_RATE_HZ = 1000.0  #: sample rate of A16 and D16 [Hz]
+ASSUMED_SENSOR_SAMPLE_RATE_HZ = 1000.0  #: sample rate of A16 and D16 [Hz]
 
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
 _MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
@@ -67,7 +67,7 @@ class Criterion:
         if name == "kappa_w10":
             columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
-            columns = _acceptable_parameter_errors(scales.nominal_phi)
+            columns = _acceptable_offset_and_phi_errors(scales.nominal_phi)
         self._columns = columns
 
     def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
@@ -87,7 +87,7 @@ class Criterion:
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
-        return float(np.exp(log_value) / np.sqrt(INFORMATION_SAMPLE_RATE_HZ * duration))
+        return float(np.exp(log_value) / np.sqrt(ASSUMED_SENSOR_SAMPLE_RATE_HZ * duration))
 
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
@@ -144,7 +144,7 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
     g_omega[2] = 2 * z * zz + x * xz + y * yz
 
 
-def _acceptable_parameter_errors(phi: Array) -> Array:
+def _acceptable_offset_and_phi_errors(phi: Array) -> Array:
     inertia = _MAX_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
     mass, moment = _MAX_RELATIVE_MASS_ERROR * phi[0], _MAX_COM_ERROR_M * phi[0]
     return np.repeat([*_MAX_OFFSET_ERRORS_N_NM, mass, moment, inertia], [3, 3, 1, 3, 6])

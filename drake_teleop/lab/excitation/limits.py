@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import dot, minus, plus, scale_vector, vector_at
 from drake_teleop.lab.excitation.criteria import write_gradients_by_motion
 from drake_teleop.lab.excitation.link_gradients import (
-    SEED_SIZE,
+    ADJOINT_SEED_SIZE,
     add_point_to_seed,
     add_torque_to_seeds,
     add_vector_to_seed,
@@ -30,7 +30,7 @@ LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "work
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
 ZERO_USE_CLEARANCE_MARGIN_M = 0.1
 _MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7  # smaller weights in a smooth maximum's gradient are skipped
-_DISTANCE_OF_FAR_CAPSULES_M = 1.0  # replaces distances with zero clearance use [m]
+_FAR_CAPSULE_SUBSTITUTE_DISTANCE_M = 1.0  # replaces distances with zero clearance use [m]
 
 
 class Limits(NamedTuple):
@@ -150,7 +150,7 @@ def _exact_and_smooth_maximum(use, sharpness):
 def _allocate_gradient_buffers(motions):
     # Seeds, joint velocities and link velocities of virtual power, see `add_torque_to_seeds`.
     rows = motions.shape[1]
-    return np.zeros((rows, SEED_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
+    return np.zeros((rows, ADJOINT_SEED_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
 
 
 @njit(cache=True)
@@ -250,7 +250,7 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
         for k in range(K):
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance, far = _DISTANCE_OF_FAR_CAPSULES_M, reach + ZERO_USE_CLEARANCE_MARGIN_M
+            distance, far = _FAR_CAPSULE_SUBSTITUTE_DISTANCE_M, reach + ZERO_USE_CLEARANCE_MARGIN_M
             if not _are_segments_surely_apart(ends[t, a], ends[t, b], far):
                 distance = _nearest_points_of_segments(ends[t, a], ends[t, b])[0] - reach
             excess = distance - limits.min_pair_distances[k]

@@ -26,7 +26,7 @@ from drake_teleop.load.regressor import wrench_of_load
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, SENSOR_MOTION_SIZE
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
-SEED_SIZE = 21
+ADJOINT_SEED_SIZE = 21
 _S_IN_SEED, _OMEGA_IN_SEED, _ALPHA_IN_SEED, _P_IN_SEED, _THETA_IN_SEED = 0, 3, 6, 9, 12
 _VIRTUAL_V_IN_SEED, _VIRTUAL_W_IN_SEED = 15, 18
 

@@ -35,7 +35,7 @@ _USABLE_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _USABLE_SENSOR_FORCE_SHARE, _USABLE_SENSOR_TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
-_MAX_LOAD_OVER_MODELLED_LOAD = 1.3
+_HEAVIEST_EXPECTED_OVER_MODELLED_LOAD = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
 _ASSUMED_PAYLOAD_COM_ALONG_Z_S_M, _ASSUMED_PAYLOAD_GYRATION_RADIUS_M = 0.08, 0.05
 _DEFAULT_PAYLOAD_KG = 2.0
@@ -71,7 +71,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     """Return the scenario's slave as `Robot`, with surroundings and a table at z = 0."""
     check_scenario(scenario)
 
-    def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
+    def parse_slave_and_surroundings(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         parsed = ParseSlave(plant, scenario.slave)
         if scenario.surroundings is not None:
             AddEnvironment(plant, scenario.surroundings)
@@ -79,8 +79,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
-    reserve = (_MAX_LOAD_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
-    scene = CollisionScene(parse, reserve, visuals_collide=not own)
+    reserve = (_HEAVIEST_EXPECTED_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
+    scene = CollisionScene(parse_slave_and_surroundings, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_CORNERS_W)
     sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
@@ -113,7 +113,7 @@ def RobotFromModel(
     """
     missing: list[str] = []
 
-    def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
+    def parse_model_file(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         missing[:] = model.assumptions
         return model.instance, model.sensor_frame
@@ -123,7 +123,7 @@ def RobotFromModel(
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
-        reserve = (_MAX_LOAD_OVER_MODELLED_LOAD - 1) * load
+        reserve = (_HEAVIEST_EXPECTED_OVER_MODELLED_LOAD - 1) * load
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
@@ -140,7 +140,7 @@ def RobotFromModel(
         inertia = missing_mass * _ASSUMED_PAYLOAD_GYRATION_RADIUS_M**2 * np.eye(3) * 2 / 3
         reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
-        scene = CollisionScene(parse, reserve, visuals_collide=False, where=str(path))
+        scene = CollisionScene(parse_model_file, reserve, visuals_collide=False, where=str(path))
     assumptions += missing
     hint = " (--acceleration)"
     scene.arm, completed = fill_missing_joint_limits(scene.arm, str(path), acceleration, hint=hint)

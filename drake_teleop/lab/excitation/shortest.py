@@ -35,7 +35,7 @@ PROBABILITY_ALL_WITHIN_TOLERANCE = 0.95
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
-_MAX_LOG_PERIOD_CHANGE = 0.15
+_MAX_LOG_PERIOD_CHANGE_BY_SLSQP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
 _ERROR_FACTOR_GROWTH_AFTER_MISS = 1.005  # after a round that missed the tolerance
@@ -163,7 +163,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
     def bounds(self, x: Array) -> optimizer.Bounds:
         """Return the bounds of the unknowns; only log T is bounded, about its value in x."""
-        ends = x[-1] + np.array([-_MAX_LOG_PERIOD_CHANGE, _MAX_LOG_PERIOD_CHANGE])
+        ends = x[-1] + np.array([-_MAX_LOG_PERIOD_CHANGE_BY_SLSQP, _MAX_LOG_PERIOD_CHANGE_BY_SLSQP])
         low, high = np.clip(ends, np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)).tolist()
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
@@ -177,7 +177,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[0] = 0.0
         sharpness = _TOLERANCE_OVER_CRITERION_SHARPNESS * criterion_sharpness
-        use, worst, g_V = self._max_error_ratio_with_gradient(sharpness)
+        use, worst, g_V = self._tolerance_use_and_regressor_gradient(sharpness)
         smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g[1:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
@@ -199,14 +199,14 @@ class ShortestMotionProblem(optimizer.DesignProblem):
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return predicted over required deviations (k,) of `errors`, for white noise only."""
         rows = self._weighted_regressor_rows(*motion)
-        return np.sqrt(self._variances_of_estimates(rows, period)[0])
+        return np.sqrt(self._tolerance_scaled_variances(rows, period)[0])
 
     def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
-    def _variances_of_estimates(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
+    def _tolerance_scaled_variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         # Variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k, u_k = G^-1 B v_k: G is the information of
         # weighted least squares; B contains the noise densities; e_k is a row of `errors`
         # (sandwich, White, Econometrica 1980).
@@ -220,9 +220,9 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _max_error_ratio_with_gradient(self, sharpness: float) -> tuple[float, float, Array]:
+    def _tolerance_use_and_regressor_gradient(self, sharpness: float) -> tuple[float, float, Array]:
         rows = self._weighted_regressor_rows(*self._vectors)
-        variances, v, u = self._variances_of_estimates(rows, self._period)
+        variances, v, u = self._tolerance_scaled_variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
         smooth = float(logs.max() + np.log(weights.sum()) / sharpness)

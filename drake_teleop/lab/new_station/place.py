@@ -47,7 +47,7 @@ from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShap
 WALL_EDGES_M = (0.4, 0.25, 0.15)  #: edges of the walls that are tried, the first preferred
 _TRIAL_WALL_NAME_BY_EDGE_M = {edge: f"wall of {edge:g} m" for edge in WALL_EDGES_M}
 #: Rotation R_SA from each axis of S to z.
-TOOL_AXES = {
+R_SA_BY_AXIS = {
     "z": RotationMatrix(),
     "x": RotationMatrix.MakeYRotation(np.pi / 2),
     "-x": RotationMatrix.MakeYRotation(-np.pi / 2),
@@ -67,9 +67,9 @@ _MAX_POSITION_ERROR_OVER_DISPLACEMENT = 0.1  # position error over displacement,
 _MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
 MIN_LOAD_SHARE_HELD_BY_MOTORS = 0.05  #: Share of the load that weak motors must hold at rest.
 _SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
-_MAX_JOINT_CHANGE_RAD_M = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_MAX_CORNER_JOINT_CHANGE = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
-_HEIGHT_RANGE_OF_LOWEST_POINTS_M = 1e-4  # these points share the contact
+_LOWEST_POINTS_HEIGHT_TOLERANCE_M = 1e-4  # these points share the contact
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
 _MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
@@ -144,10 +144,10 @@ def find_start_place(
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
         plane: height of the base plane, below which the arm has no joints [m].
-        axis: axis of S that points down, one of `TOOL_AXES`.
+        axis: axis of S that points down, one of `R_SA_BY_AXIS`.
     """
     table, rotation = arm.table.copy(), slice(ROTATION_COLUMN, TRANSLATION_COLUMN)
-    table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ TOOL_AXES[axis].matrix()).ravel()
+    table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ R_SA_BY_AXIS[axis].matrix()).ravel()
     pointed = replace(arm, table=table)  # with frame A instead of S
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
@@ -180,7 +180,7 @@ def find_start_place(
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
-def _prefer_rows_away_from_limits(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+def _select_rows_far_from_limits_or_all(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
     roomy = least_joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
     for share in (1.0, MIN_LOAD_SHARE_HELD_BY_MOTORS):
@@ -198,7 +198,7 @@ def _iter_posture_rows_by_score(
     if not len(postures.q):
         return
     order = np.argsort(posture_scores(arm, postures, region))[::-1]
-    usable = order[np.isin(order, _prefer_rows_away_from_limits(arm, postures.q))]
+    usable = order[np.isin(order, _select_rows_far_from_limits_or_all(arm, postures.q))]
     yield usable
     if shapes is None:
         return
@@ -221,7 +221,7 @@ def _solve_starts(
         solved = [s for k in range(len(postures.q)) for s in _starts_below_6_dof(arm, postures, k)]
     if not solved:
         return
-    rows = _prefer_rows_away_from_limits(arm, np.array([q for q, _, _ in solved]))
+    rows = _select_rows_far_from_limits_or_all(arm, np.array([q for q, _, _ in solved]))
     solved = [solved[k] for k in rows]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), least_joint_margins(arm, exact.q)
@@ -301,7 +301,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
     if not len(points):
         phi = shapes.arm.phi_load
         points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
-    lowest = points[points[:, 2] < points[:, 2].min() + _HEIGHT_RANGE_OF_LOWEST_POINTS_M]
+    lowest = points[points[:, 2] < points[:, 2].min() + _LOWEST_POINTS_HEIGHT_TOLERANCE_M]
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
@@ -310,7 +310,7 @@ def coordinates_along_axis(
 ) -> Array:
     """Return the coordinate (k,) along an axis of S, from So [m], of each point of the bodies."""
     points = shapes.X_WS.inverse() @ shapes.points_on_bodies_W(bodies).T
-    along: Array = TOOL_AXES[axis].matrix()[:, 2] @ points
+    along: Array = R_SA_BY_AXIS[axis].matrix()[:, 2] @ points
     return along
 
 
@@ -348,7 +348,7 @@ def _can_reach_corner(
     target = place.pose + np.append(np.zeros(4), displacement)
     q, status = find_posture(arm, target, place.q)
     if has_six_dof:
-        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_CHANGE_RAD_M)
+        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_CORNER_JOINT_CHANGE)
     error = np.linalg.norm(arm.pose(q)[4:] - target[4:])
     return bool(error < _MAX_POSITION_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
 
@@ -378,7 +378,7 @@ def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
     p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]
     R_JS, p_arm_S_J = R[1], p[1] + np.array([0.0, 0.0, R[0, :, 2] @ p[0]])
     axis = nearest_sensor_axis(p_SScm_S) or nearest_sensor_axis(R_JS[2]) or "z"
-    along = TOOL_AXES[axis].matrix()[:, 2]
+    along = R_SA_BY_AXIS[axis].matrix()[:, 2]
     is_behind = along @ (R_JS.T @ p_arm_S_J + p_SScm_S) < -_ROUNDING_TOLERANCE_M
     return opposite_axis(axis) if is_behind else axis
 
@@ -393,7 +393,7 @@ def tool_frame_advice(
     """Return how to add a sensor frame with z along `axis`, as a text; "" for axis "z"."""
     if axis == "z":
         return ""
-    R_SA, name = TOOL_AXES[axis], f"{sensor_frame}_z_to_tool"
+    R_SA, name = R_SA_BY_AXIS[axis], f"{sensor_frame}_z_to_tool"
     rpy = " ".join(f"{angle + 0.0:.5g}" for angle in RollPitchYaw(R_SA).vector())
     degrees = ", ".join(f"{angle + 0.0:.5g}" for angle in np.degrees(RollPitchYaw(R_SA).vector()))
     quaternion = " ".join(f"{part:.5g}" for part in R_SA.ToQuaternion().wxyz().round(5) + 0.0)

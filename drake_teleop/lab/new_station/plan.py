@@ -114,7 +114,7 @@ def plan_station(
     by_stiffness = _MAX_DISPLAYED_STIFFNESS_N_M / (_WALL_STIFFNESS_N_M * translation_scale)
     shapes.move_to(place.q)
     lowest = start.lowest_tool_point(shapes)
-    cosine = -(shapes.X_WS.rotation() @ start.TOOL_AXES[axis].matrix()[:, 2])[2]
+    cosine = -(shapes.X_WS.rotation() @ start.R_SA_BY_AXIS[axis].matrix()[:, 2])[2]
     tilt = f"{np.degrees(np.arccos(min(cosine, 1.0))):.0f} degrees from downwards"
     direction = "down" if cosine > start.MIN_COS_OF_TOOL_DOWN else tilt
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
@@ -158,7 +158,7 @@ def _find_start_and_tool_axis(
     found: list[tuple[start.StartPlace, str, PostureShapes]] = []
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
-    substitutes = start.opposite_axis(tool_axis), *start.TOOL_AXES
+    substitutes = start.opposite_axis(tool_axis), *start.R_SA_BY_AXIS
     for axis in dict.fromkeys((tool_axis, *substitutes)):
         stand_in = _make_stand_in_tool(axis, _stand_in_tool_length_m(shapes, axis))
         if is_stand_in and slave.tool != stand_in:
@@ -206,7 +206,7 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
 
 
 def _make_stand_in_tool(axis: str, length: float) -> Tool:
-    along = start.TOOL_AXES[axis].matrix()[:, 2]
+    along = start.R_SA_BY_AXIS[axis].matrix()[:, 2]
     ball = Ball(_STAND_IN_BALL_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
     com = (_STAND_IN_COM_M * along).round(6).tolist()
     return Tool(mass=_STAND_IN_TOOL_MASSES_KG[0], com=com, shapes=[ball])

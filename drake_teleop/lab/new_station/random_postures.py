@@ -26,7 +26,7 @@ _SENSOR_RADIUS_RANGE_OVER_REACH, _SENSOR_HEIGHT_RANGE_OVER_REACH = (0.35, 0.85),
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
 _PREFERRED_RADIUS_OVER_REACH = 0.6
 _PREFERRED_TOOL_HEIGHT_OVER_REACH = 0.25
-_MIN_PREFERRED_HEIGHT_OVER_REACH = -0.4
+_MIN_PREFERRED_SENSOR_HEIGHT_OVER_REACH = -0.4
 _MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_END_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 _HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
@@ -86,7 +86,7 @@ class StartRegion:
         r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane_height + self.tool_length
         height = max(
             height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
-            float(self.first_joint_W[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
+            float(self.first_joint_W[2]) + _MIN_PREFERRED_SENSOR_HEIGHT_OVER_REACH * self.reach,
         )
         direction = np.array([np.cos(self.side_direction_rad), np.sin(self.side_direction_rad)])
         return np.array([*(self.first_joint_W[:2] + r * direction), height])

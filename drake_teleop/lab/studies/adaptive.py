@@ -47,7 +47,7 @@ def propose_points(points: Array, objective: ArrayLike, candidates: Array, count
 
 
 def _fit_kernel_lengths_and_noise(points: Array, y: Array) -> tuple[Array, float]:
-    def log_loss(x: Array) -> float:
+    def neg_log_likelihood(x: Array) -> float:
         K = _matern_kernel(points / np.exp(x[:-1]), points / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])
         factor = cho_factor(K, lower=True)
@@ -56,7 +56,7 @@ def _fit_kernel_lengths_and_noise(points: Array, y: Array) -> tuple[Array, float
 
     bounds = [_LOG_LENGTH_BOUNDS] * points.shape[1] + [_LOG_NOISE_BOUNDS]
     starts = (np.log([length] * points.shape[1] + [0.1]) for length in (0.3, 1.5))
-    found = [minimize(log_loss, start, method="L-BFGS-B", bounds=bounds) for start in starts]
+    found = [minimize(neg_log_likelihood, x0, method="L-BFGS-B", bounds=bounds) for x0 in starts]
     x = min(found, key=lambda result: result.fun).x
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 

@@ -63,7 +63,7 @@ class FactorialModel:
         np.put_along_axis(weights, points, 1.0 / combinations.sum(), axis=1)
         return is_compared, combinations, weights
 
-    def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
+    def effects_and_half_widths(self, table: Array) -> tuple[list[Array], list[Array]]:
         means = [self.comparison_weights(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
@@ -180,7 +180,7 @@ class PairMeans:
     is_fitted: bool
 
 
-def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
+def main_effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
     import polars as pl
 
     table = [
@@ -250,7 +250,7 @@ class _MeasureEffectModel:
             comparable, combinations, weights = self.model.comparison_weights(factor)
             if comparable.sum() > 1:
                 is_compared, used = comparable, combinations
-                effects, halves = self.model.effects(self.table)
+                effects, halves = self.model.effects_and_half_widths(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)

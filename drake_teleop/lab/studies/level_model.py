@@ -131,7 +131,7 @@ class LevelModel:
         terms = self._regressor_rows_of_levels(at).reshape(count, -1, self.X.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
-    def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
+    def effects_and_half_widths(self, table: Array) -> tuple[list[Array], list[Array]]:
         """Return the effects of each factor and half widths of joint intervals (Bonferroni).
 
         `table` (points, seeds) contains the measure.

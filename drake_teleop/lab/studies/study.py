@@ -17,7 +17,7 @@ from drake_teleop.common.files import output_folder, studies_dir, write_json, wr
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.studies.design import FactorValues, Study
-from drake_teleop.lab.studies.effects import effects_table
+from drake_teleop.lab.studies.effects import main_effects_table
 from drake_teleop.lab.studies.measures import evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, run_study
 from drake_teleop.lab.studies.store import parse_shard
@@ -115,7 +115,7 @@ def study_command(
         if not shard:
             from drake_teleop.lab.studies.pictures import write_pictures
 
-            write_table(out / "effects.csv", effects_table(study, rows))
+            write_table(out / "effects.csv", main_effects_table(study, rows))
             write_pictures(study, rows, out)
         write_json(out / "summary.json", summary)
     if not quiet:

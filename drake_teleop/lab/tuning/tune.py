@@ -102,7 +102,7 @@ def tune(
     summary = _make_tuning_summary(found, tuned, stated, network)
     with files.output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
-        pictures = {"trade_off": draw_trade_off(found, summary)}
+        pictures = {"trade_off": draw_detectable_force_over_gamma_margin(found, summary)}
         package = "drake_teleop.lab.tuning"
         write_report_page_and_pictures(out, package, pictures, summary=summary)
         files.write_json(out / "summary.json", summary)
@@ -338,7 +338,7 @@ def _tuning_result_sentences(
     return [*lines, last]
 
 
-def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
+def draw_detectable_force_over_gamma_margin(found: SearchResult, summary: dict[str, Any]) -> Figure:
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
         axes = figure.subplots()
