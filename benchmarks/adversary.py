@@ -50,7 +50,7 @@ from drake_teleop.lab.comparison.one_dof import (
     AT_MOTOR,
     AT_SLAVE,
     PERIOD_S,
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     OneDof,
     OneDofRun,
     operator_intent,
@@ -261,7 +261,9 @@ def print_study(result: dict[str, dict[str, Any]]) -> None:
 
 def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     """Return the figures of the simple cases by case and method; see `print_known`."""
-    medium = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
+    medium = dataclasses.replace(
+        REFERENCE_ONE_DOF, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0
+    )
     begun = np.clip(TIME / 0.5, 0.0, 1.0)
     taps = begun * 0.05 * np.sin(4 * np.pi * TIME) + FREE * (1 - begun)
     swing = 0.03 * np.sin(3 * np.pi * TIME) * (begun - smooth(2.5, 0.5))
@@ -286,10 +288,10 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
 
     for name in names:
         one = PassivityConfig(method=name)
-        let_go = run_one_dof(REFERENCE, one, steady, intent=push, grip=hand)
+        let_go = run_one_dof(REFERENCE_ONE_DOF, one, steady, intent=push, grip=hand)
         free = let_go.master_position[8999:11000]
         rows = {
-            "taps": [least(one, REFERENCE, steady, intent=tap)],
+            "taps": [least(one, REFERENCE_ONE_DOF, steady, intent=tap)],
             "taps, bursts": [least(one, medium, bursts, seed=n, intent=tap) for n in range(10)],
             "press, outages": [
                 least(one, medium, steady, delays=outages(n), timeout=0.1) for n in range(20)

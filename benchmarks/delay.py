@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.lab.comparison.one_dof import (
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     RunMeasures,
     Task,
     measures_of_run,
@@ -71,7 +71,7 @@ class Row:
 
 
 def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task) -> RunMeasures:
-    model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
+    model = dataclasses.replace(REFERENCE_ONE_DOF, wall_stiffness=wall)
     intent = operator_intent(task)
     run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed, intent=intent)
     return measures_of_run(run, model, task)

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.lab.comparison.one_dof import (
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     Task,
     measures_of_run,
     operator_intent,
@@ -47,7 +47,7 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     task = Task(release_start=11.5 + longer, release_end=12.5 + longer, end=17.0 + longer)
     mass, damping, stiffness = GRIPS[grip]
     model = dataclasses.replace(
-        REFERENCE,
+        REFERENCE_ONE_DOF,
         hand_mass=mass,
         hand_damping=damping,
         hand_stiffness=stiffness,

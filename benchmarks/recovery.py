@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.lab.comparison.one_dof import (
     PERIOD_S,
-    REFERENCE,
+    REFERENCE_ONE_DOF,
     OneDofRun,
     Task,
     operator_intent,
@@ -125,7 +125,7 @@ def _some_networks(job: tuple[int, int]) -> list[Row]:
             rng = np.random.default_rng(seed)
             lines = [rough_line(path, rng) for path in paths]
             wall = float(np.exp(rng.uniform(np.log(100), np.log(5000))))
-            model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
+            model = dataclasses.replace(REFERENCE_ONE_DOF, wall_stiffness=wall)
             for row in rows:
                 config = PassivityConfig(method=row.method, force_limit=LIMIT)
                 row.add(run_one_dof(model, config, *lines, timeout=TIMEOUT, intent=intent))
@@ -136,7 +136,9 @@ def study(networks: int, processes: int = 2) -> list[Row]:
     """Run every method over the networks."""
     share = max(1, -(-networks // (16 * processes)))
     jobs = [(first, min(first + share, networks)) for first in range(0, networks, share)]
-    run_one_dof(REFERENCE, PassivityConfig(), NetworkConfig())  # compiles, before processes fork
+    run_one_dof(
+        REFERENCE_ONE_DOF, PassivityConfig(), NetworkConfig()
+    )  # compiles, before processes fork
     if processes > 1:
         with multiprocessing.get_context("fork").Pool(processes) as pool:
             parts = pool.map(_some_networks, jobs, chunksize=1)

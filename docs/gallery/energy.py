@@ -8,13 +8,13 @@ round trip of 50 ms. Below zero, the station has delivered more energy than it r
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_SLAVE, REFERENCE, run_one_dof
+from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_SLAVE, REFERENCE_ONE_DOF, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 figure, panels = plt.subplots(1, 2, figsize=(8.5, 3.2))
 for axes, method in zip(panels, ("none", "ledger"), strict=True):
-    run = run_one_dof(REFERENCE, PassivityConfig(method=method), NetworkConfig(delay=0.025))
+    run = run_one_dof(REFERENCE_ONE_DOF, PassivityConfig(method=method), NetworkConfig(delay=0.025))
     hand, wall = run.accounts[:, AT_HAND], run.accounts[:, AT_SLAVE]
     axes.plot(run.t, hand, label="hand")
     axes.plot(run.t, wall, label="wall")

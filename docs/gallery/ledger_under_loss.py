@@ -9,14 +9,14 @@ energy of all lost ones.
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_SLAVE, REFERENCE, run_one_dof
+from drake_teleop.lab.comparison.one_dof import AT_HAND, AT_SLAVE, REFERENCE_ONE_DOF, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 lossy = NetworkConfig(delay=0.05, jitter=0.3, loss=0.33, burst=0.05, burst_loss=0.9)
-run = run_one_dof(REFERENCE, PassivityConfig(method="ledger"), lossy)
+run = run_one_dof(REFERENCE_ONE_DOF, PassivityConfig(method="ledger"), lossy)
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True)
-above.plot(run.t, REFERENCE.force_scale * run.wall_force, label="wall / 17.5", color="grey")
+above.plot(run.t, REFERENCE_ONE_DOF.force_scale * run.wall_force, label="wall / 17.5", color="grey")
 above.plot(run.t, run.hand_force, label="displayed")
 above.set(ylabel="force at the hand [N]")
 above.legend()

@@ -10,16 +10,16 @@ the force scale.
 import matplotlib.pyplot as plt
 
 from drake_teleop.common.style import BLUE, GREY
-from drake_teleop.lab.comparison.one_dof import REFERENCE, measures_of_run, run_one_dof
+from drake_teleop.lab.comparison.one_dof import REFERENCE_ONE_DOF, measures_of_run, run_one_dof
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 
 columns = 3
 figure, panels = plt.subplots(3, columns, figsize=(9, 6), sharex=True, sharey=True)
 for axes, method in zip(panels.flat, METHODS, strict=True):
-    run = run_one_dof(REFERENCE, PassivityConfig(method=method), PRESETS["internet"])
-    found = measures_of_run(run, REFERENCE)
-    axes.plot(run.t, REFERENCE.force_scale * run.wall_force, color=GREY, linewidth=0.8)
+    run = run_one_dof(REFERENCE_ONE_DOF, PassivityConfig(method=method), PRESETS["internet"])
+    found = measures_of_run(run, REFERENCE_ONE_DOF)
+    axes.plot(run.t, REFERENCE_ONE_DOF.force_scale * run.wall_force, color=GREY, linewidth=0.8)
     axes.plot(run.t, run.hand_force, color=BLUE, linewidth=0.8)
     axes.set_title(f"{method}: {'stable' if found.stable else 'unstable'}")
     axes.set_ylim(-6, 3)
