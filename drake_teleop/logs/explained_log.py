@@ -113,6 +113,9 @@ def _correctable_fields(description: Description, by_pose: bool) -> DescriptionF
         "wrench.weight": weight if isinstance(weight, str) else np.array(weight),
         "gravity": description.gravity_W,
     }
+    for name in ("wrench", "imu", "pose"):
+        if (stream := getattr(description, name)) is not None:
+            out[f"{name}.time.scale"] = np.array(stream.time.scale)
     if imu is not None and imu.specific_force is not None and not by_pose:
         out["imu.position"] = np.array(imu.position)
     elif pose is not None and pose.position is not None:
@@ -160,6 +163,9 @@ def _correct_fields_by_cause(
             fields["gravity"] = true * np.linalg.norm(fields["gravity"]) / np.linalg.norm(true)
         case "weight removed" | "payload configured":  # an estimated payload would count as exact
             fields["wrench.weight"] = "removed"
+        case "clock rate":
+            for name in [x for x in fields if x.endswith(".time.scale")]:
+                fields[name] = fields[name] / values["ratio"]
         case "torque factor":
             _correct_unit_or_torque_scale(fields, values["factor"])
         case "pose frame":
@@ -195,7 +201,8 @@ def _correct_unit_or_torque_scale(fields: DescriptionFields, torque_factor: floa
 
 
 _SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
-_MIN_BLOCK_MEANS_TO_EXPLAIN, _BLOCK_MEAN_BANDWIDTH_HZ = 100, 25.0
+_MIN_BLOCK_MEANS_TO_EXPLAIN, _BLOCK_MEAN_BANDWIDTH_HZ = 50, 25.0
+_MAX_GYROSCOPE_GAIN_ERROR = 0.005
 _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
 
 
@@ -206,9 +213,14 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitE
     if None.
     """
 
+    clock_rate: str | None = "clock rate of poses"
+    if log.has_calendar_time or (found and _has_gyroscope_the_speed_of_poses(log, found.splines)):
+        clock_rate = None
+
     def means_at_additional_delay(more_s: float) -> BlockMeans:
         if found is not None:
-            return _block_means_of_splines(log, found, delay_s + more_s)
+            means = _block_means_of_splines(log, found, delay_s + more_s)
+            return replace(means, clock_rate=clock_rate)
         return block_means_of_log(remove_delay(log, delay_s + more_s))
 
     data = means_at_additional_delay(0.0)
@@ -240,6 +252,15 @@ def _block_means_of_splines(log: Log, found: PoseEstimate, delay_s: float) -> Bl
         lost |= log.bridged
     noise = _acceleration_noise_of_splines_m_s2(splines)
     return block_means_of_record(log.t, log.wrench, motion_at, gravity, lost, noise)
+
+
+def _has_gyroscope_the_speed_of_poses(log: Log, splines: PoseSplines) -> bool:
+    imu = None if log.posed is None else log.posed.imu
+    if imu is None or imu.angular_velocity is None:
+        return False
+    omega = splines.motion(imu.t, np.zeros(3))[1]
+    ratio = np.sqrt(imu.angular_velocity.var(axis=0).sum() / (omega.var(axis=0).sum() + 1e-30))
+    return bool(abs(ratio - 1.0) < _MAX_GYROSCOPE_GAIN_ERROR)
 
 
 def _acceleration_noise_of_splines_m_s2(splines: PoseSplines) -> float:

@@ -69,7 +69,7 @@ from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_FINDINGS_PREVENTING_IDENTIFICATION = ("left-handed", "high-pass")
+_FINDINGS_PREVENTING_IDENTIFICATION = ("left-handed", "high-pass", "clock rate")
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
@@ -259,6 +259,11 @@ def _explain_residual(
     why = None
     if _is_misfit_explainable(log, fitted.motion is not None):
         why = explained_log.explain_log(log, fitted.delay_s, fitted.motion)
+    if why is not None and why.is_misfit and _clock_rate_causes(why):
+        why = replace(why, causes=())
+    contradicts = fitted.motion is None and log.posed is not None and log.posed.imu is not None
+    if contradicts and not _clock_rate_causes(why):
+        why = None  # poses and IMU disagree, and the load is that of the IMU
     causes = () if why is None else why.causes
     need_motion = any(x.name not in CAUSES_AT_REST for x in (*frame_findings, *causes))
     if need_motion and (too_still := too_little_motion(log)) is not None:
@@ -267,6 +272,10 @@ def _explain_residual(
     if why is not None and by_gains and not why.is_acceleration_missing:
         why = replace(why, causes=(), explained=True, loads=())
     return why, None
+
+
+def _clock_rate_causes(why: MisfitExplanation | None) -> tuple[Finding, ...]:
+    return () if why is None else tuple(x for x in why.causes if x.name == "clock rate")
 
 
 def _correct_delay(
@@ -309,6 +318,7 @@ def _findings_that_invalidate_load(
         errors = () if passed is None else (passed,)
         if not errors and why.is_misfit and why.causes:
             errors = motion_findings(check)
+    errors = _clock_rate_causes(why) or errors
     if raw.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
         errors += tuple(edits.correct_accelerometer_unit(raw.described, fitted.log)[0])
     return errors
@@ -371,10 +381,10 @@ def _is_misfit_explainable(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
     if log.static or (high - low <= _CONSTANT_CHANNEL_TOLERANCE * np.maximum(high, -low)).any():
         return False
-    if log.posed is not None and log.posed.imu is not None and not by_splines:
-        return False  # poses and IMU disagree
-    still = by_splines and not log.specific_force.any()
-    return still or 5.0 < np.median(np.linalg.norm(log.specific_force, axis=1)) < 20.0
+    imu = None if log.described is None else log.described.imu
+    if by_splines or (log.described and (imu is None or imu.specific_force is None)):
+        return True
+    return bool(5.0 < np.median(np.linalg.norm(log.specific_force, axis=1)) < 20.0)
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:

@@ -18,12 +18,17 @@ from drake_teleop.logs.causes.instants import (
     SPECIFIC_FORCE_SIGNALS,
     WRENCH_SIGNALS,
 )
-from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, LoadModel
+from drake_teleop.logs.causes.model import (
+    CLOCK_RATE_POWER,
+    OFFSETS_AND_LOAD,
+    SYMMETRIC_MATRIX_INDICES,
+    LoadModel,
+)
 from drake_teleop.logs.causes.state import FittedModel
 
 EXTENSIONS_BY_PLAUSIBILITY = (
-    *("axes", "gravity", "weight", "torque factor", "offsets", "load", "linear drift", "gain"),
-    *("frame", "rotation", "contact", "cable", "drift"),
+    *("axes", "gravity", *CLOCK_RATE_POWER, "weight", "torque factor", "offsets", "load"),
+    *("linear drift", "gain", "frame", "rotation", "contact", "cable", "drift"),
 )
 """Order of plausibility: of nearly equal candidates the first is chosen."""
 _UNIT_RATIOS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
@@ -37,6 +42,8 @@ TORQUE_UNIT_FACTORS = tuple(
 _MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.0
 _MIN_GRAVITY_TILT_DEG, _MAX_GRAVITY_ERROR_TILTED, _MAX_GRAVITY_ERROR_UPRIGHT = 0.25, 0.05, 0.02
 _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
+_TRIED_CLOCK_RATE_FACTORS, _MIN_CLOCK_RATE_ERROR = np.geomspace(1e-3, 1e4, 71), 0.005
+_MAX_CLOCK_RATE_STD_OVER_ERROR = 0.1
 _MIN_CHANNEL_GAIN_ERROR, _MAX_CHANNEL_GAIN_ERROR = 0.003, 0.25
 _MIN_POSE_SHIFT_M, _MAX_POSE_SHIFT_M = 0.010, 1.5
 _MIN_SENSOR_ROTATION_DEG, _MIN_LOAD_MASS_OVER_DEVIATION = 1.0, 10.0
@@ -74,10 +81,13 @@ def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candida
         "cable": data.has_positions and data.has_enough_acceleration,
         "drift": not drifts,
     }
+    if data.clock_rate is not None:
+        possible[data.clock_rate] = data.has_enough_acceleration
+    has_clock_rate = bool(CLOCK_RATE_POWER.keys() & set(model.extensions))
     for name, is_possible in possible.items():
-        if is_possible and name not in model.extensions:
+        if is_possible and name not in model.extensions and not has_clock_rate:
             yield from _fit_extension(state, name)
-    if data.has_enough_acceleration:
+    if data.has_enough_acceleration and not has_clock_rate:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
         found = add_step_change(state, kind)
@@ -109,7 +119,11 @@ def _scored_candidate(
 
 def _fit_extension(state: FittedModel, name: str) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
-    starts = [start_parameters_of_tilt_fit(state), None] if name == "gravity" else [None]
+    starts: list[Array | None] = [None]
+    if name == "gravity":
+        starts = [start_parameters_of_tilt_fit(state), None]
+    if name in CLOCK_RATE_POWER:
+        starts = [_start_parameters_of_clock_rate_fit(state, model, name)]
     best = max((state.refit(model, start) for start in starts), key=lambda x: x.likelihood)
     if _is_extension_effect_large(best, name):
         yield _scored_candidate(name, state, best)
@@ -131,12 +145,45 @@ def _is_extension_effect_large(state: FittedModel, name: str) -> bool:
             return bool(x[0] > _MIN_REMOVED_MASS_SHARE * mass or arm > _MIN_REMOVED_MOMENT_ARM_M)
         case "frame":
             return bool(np.linalg.norm(x) > _MIN_POSE_SHIFT_M)
+        case _ if name in CLOCK_RATE_POWER:
+            ratio, deviation = clock_rate_ratio_and_std(state, name)
+            precise = deviation < _MAX_CLOCK_RATE_STD_OVER_ERROR * abs(ratio - 1.0)
+            return bool(precise and abs(ratio - 1.0) > _MIN_CLOCK_RATE_ERROR)
         case "rotation":
             return bool(np.linalg.norm(x) > np.radians(_MIN_SENSOR_ROTATION_DEG))
         case "linear drift" | "drift":
             least = _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise
             return bool((drift_amplitudes(state) > least).any())
     return True
+
+
+def _start_parameters_of_clock_rate_fit(state: FittedModel, model: LoadModel, name: str) -> Array:
+    """Return start parameters with the best of the tried factors; all rows have one weight."""
+    simple = LoadModel((name,), axes=model.axes, torque_factor=model.torque_factor)
+    y = state.data.with_other_rows_zeroed(state.rows.used).y[:, simple.columns]
+    sums = y.T @ y
+    channels = np.arange(WRENCH_SIGNALS.start, WRENCH_SIGNALS.stop)
+    weights = 1.0 / sums[channels, channels].reshape(2, 3).sum(axis=1).repeat(3)[:, None]
+    x, best = model.start_parameters(state.x, state.model), np.inf
+    for factor in _TRIED_CLOCK_RATE_FACTORS:
+        J = simple.wrench_derivative(np.eye(simple.size)[-1] * (factor - 1.0))[OFFSETS_AND_LOAD]
+        gram = np.einsum("pci,qci->pq", J @ sums, weights * J)
+        right = np.einsum("pci,ci->p", J, weights * sums[channels])
+        theta = np.linalg.lstsq(gram, right, rcond=1e-14)[0]
+        if theta[6] > 0.0 and -right @ theta < best:
+            best = -right @ theta
+            x[OFFSETS_AND_LOAD], x[model.parameter_slices[name]] = theta, factor - 1.0
+    return x
+
+
+def clock_rate_ratio_and_std(state: FittedModel, name: str) -> tuple[float, float]:
+    """Return described over true time step and its standard deviation; (0, inf) if impossible."""
+    x, covariance = state.parameters_of_extension(name)
+    power, factor = CLOCK_RATE_POWER[name], 1.0 + float(x[0])
+    if factor <= 0.0:
+        return 0.0, np.inf
+    ratio = factor ** (1.0 / power)
+    return ratio, float(np.sqrt(covariance[0, 0])) * ratio / (power * factor)
 
 
 def has_negative_mass(state: FittedModel) -> bool:
@@ -162,6 +209,9 @@ def is_plausible(state: FittedModel) -> bool:
     if has_negative_inertia(state):
         return False
     parts, mass = state.model.parameter_slices, state.x[6]
+    clocks = CLOCK_RATE_POWER.keys() & parts.keys()
+    if any(clock_rate_ratio_and_std(state, name)[0] == 0.0 for name in clocks):
+        return False
     # A removed weight or a cable requires an inertia to compare with.
     required = _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6])
     if {"weight", "cable"} & parts.keys() and not required <= mass < MAX_PLAUSIBLE_MASS_KG:

@@ -16,6 +16,7 @@ from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes import candidates
 from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
+from drake_teleop.logs.causes.model import CLOCK_RATE_POWER
 from drake_teleop.logs.causes.state import FittedModel
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
@@ -116,6 +117,8 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
             )
         case "weight":
             return _removed_weight_cause(state)
+        case _ if extension in CLOCK_RATE_POWER:
+            return _clock_rate_cause(state, extension)
         case "frame":
             name, values = "pose frame", {"position_in_sensor": (-x).tolist()}
             text = (
@@ -174,6 +177,22 @@ def _removed_weight_cause(state: FittedModel) -> Finding:
         " the load"
     )
     return Finding("payload configured", text, values=values)
+
+
+def _clock_rate_cause(state: FittedModel, extension: str) -> Finding:
+    ratio, deviation = candidates.clock_rate_ratio_and_std(state, extension)
+    text = (
+        f"the time steps of the record are {ratio:.4g} (+- {1.96 * deviation:.2g}) times those with"
+        " which a rigid load explains the wrench: unit or rate of the clock is probably wrong"
+    )
+    if extension == "clock rate of poses" and ratio > 1.0:
+        mass = ratio**2 * float(state.x[6])
+        text += (
+            f"; just as possible: the inertia is that of {mass:.4g} kg, and the weight of a payload"
+            f" of {mass - state.x[6]:.4g} kg with the same centre of mass is already removed from"
+            " the wrench (set wrench.weight: removed)"
+        )
+    return Finding("clock rate", text, values={"ratio": ratio})
 
 
 def _torque_factor_cause(state: FittedModel) -> Finding:

@@ -26,7 +26,12 @@ from drake_teleop.logs.causes.intervals import (
     covariance_of_load_by_torque_unit,
     deviations_of_load_if_unexplained,
 )
-from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, LoadModel
+from drake_teleop.logs.causes.model import (
+    CLOCK_RATE_POWER,
+    DELAY_INDEX,
+    OFFSETS_AND_LOAD,
+    LoadModel,
+)
 from drake_teleop.logs.causes.state import FittedModel, fit_model
 
 MAX_SEARCH_ROUNDS = 4
@@ -41,7 +46,10 @@ _MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL, _MAX_CONTACT_RESIDUAL_SHARE = 0.2, 1.1,
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO, _MAX_EFFECTIVE_MISFIT_SHARE = 15.0, 0.9
 _CERTAIN_CAUSE_SCORE, _MIN_WEIGHT_OVER_CABLE_SCORE = 1000.0, 1.0 / 3.0
 _STEP_CAUSES, _MAX_CANDIDATE_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
-_CAUSES_LIKE_COLOURED_NOISE = ("axes", "gravity", "weight", "torque factor", "contact")
+_CAUSES_LIKE_COLOURED_NOISE = (
+    *("axes", "gravity", "weight", "torque factor", "contact"),
+    *CLOCK_RATE_POWER,
+)
 _FLEXIBLE_CAUSES = ("cable", "drift")  # with many columns, which resemble other causes
 _FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE = 80.0, 0.1
 

@@ -54,6 +54,7 @@ class BlockMeans:
         acceleration_noise: standard deviation of acceleration noise in a block mean [m/s^2]; inf if
             the acceleration is unknown and taken as zero.
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
+        clock_rate: extension of `LoadModel` for a wrong rate of the clock, or None.
     """
 
     t: Array
@@ -64,6 +65,7 @@ class BlockMeans:
     has_positions: bool
     acceleration_noise: float = 0.0
     alpha_noise_share: float = 0.0
+    clock_rate: str | None = None
 
     @cached_property
     def has_enough_acceleration(self) -> bool:

@@ -24,7 +24,12 @@ OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter v
 _NUM_EXTENSION_PARAMETERS = {
     "gravity": 3, "weight": 4, "torque factor": 1, "frame": 3, "rotation": 3,
     "linear drift": 6, "drift": 18, "cable": 12,
+    "clock rate of poses": 1, "clock rate of orientations": 1, "clock rate of gyroscope": 1,
 }  # fmt: skip
+CLOCK_RATE_POWER = {
+    "clock rate of poses": 2, "clock rate of orientations": 2, "clock rate of gyroscope": 1,
+}  # fmt: skip
+"""Extensions 1 + x = r**power, with time step r times the true one; x scales accelerations."""
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _ROTATION_COLUMNS_OF_STEP_CHANGE = slice(16, 25)
@@ -154,7 +159,7 @@ class LoadModel:
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.parameter_slices
-        varied = "gravity" in parts or "frame" in parts
+        varied = {"gravity", "frame", *CLOCK_RATE_POWER} & parts.keys()
         M = np.zeros((len(x) if varied else 1, 12, instants.NUM_SIGNALS))
         M[:, 0:3, instants.SPECIFIC_FORCE_SIGNALS] = M[:, 3:6, instants.ALPHA_SIGNALS] = np.eye(3)
         M[:, 6:12, instants.OMEGA_PRODUCTS] = np.eye(6)
@@ -166,6 +171,14 @@ class LoadModel:
             r = x[:, parts["frame"]]
             M[:, :3, instants.ALPHA_SIGNALS] -= cross_matrix(r)
             M[:, :3, instants.OMEGA_PRODUCTS] += centripetal_matrix(r)
+        for name in CLOCK_RATE_POWER.keys() & parts.keys():
+            factor = 1.0 + x[:, parts[name].start, None, None]
+            M[:, :, instants.ALPHA_SIGNALS] *= factor
+            if name != "clock rate of gyroscope":
+                M[:, :, instants.OMEGA_PRODUCTS] *= factor
+            if name == "clock rate of poses":
+                M[:, 0:3, instants.SPECIFIC_FORCE_SIGNALS] *= factor
+                M[:, 0:3, instants.GRAVITY_SIGNALS] += (factor - 1.0) * np.eye(3)
         return M
 
     def wrench_derivative(self, x: Array) -> Array:

@@ -176,7 +176,20 @@ def block_means_of_log(log: Log) -> BlockMeans:
     if log.R_WS is not None and log.gravity_W is not None:
         gravity, motion = log.gravity_W, (*log.motion, log.R_WS)
     noise = np.inf if log.is_acceleration_unknown else 0.0
-    return block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged, noise)
+    means = block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged, noise)
+    return replace(means, clock_rate=_clock_rate_extension(log))
+
+
+def _clock_rate_extension(log: Log) -> str | None:
+    """Return the extension for signals that depend on the clock; None if they are unknown."""
+    if log.described is None or log.has_calendar_time or log.is_acceleration_unknown:
+        return None
+    imu = log.described.imu
+    if imu is None:
+        return "clock rate of poses"
+    if imu.specific_force is None or imu.angular_acceleration is not None:
+        return None
+    return f"clock rate of {'orientations' if imu.angular_velocity is None else 'gyroscope'}"
 
 
 def wrench_of_weight(weight: Array, gravity: Array) -> Array:

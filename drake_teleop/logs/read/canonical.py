@@ -62,6 +62,7 @@ class Log:
         described: the description, with estimates for `auto`.
         estimated: "gravity", "weight", if the data determine them.
         resolution: quantization step of force and torque, for static poses [N, N m].
+        has_calendar_time: True for time stamps since 1970, whose unit is certain.
     """
 
     t: Array
@@ -82,6 +83,7 @@ class Log:
     described: Description | None = None
     estimated: tuple[str, ...] = ()
     resolution: tuple[float, float] = (0.0, 0.0)
+    has_calendar_time: bool = False
 
     def __post_init__(self) -> None:
         for name, row_shape in _ROW_SHAPE_OF_FIELD.items():

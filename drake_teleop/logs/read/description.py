@@ -42,8 +42,8 @@ class Time(StrictModel):
     offset: Number = Field(default=0.0, description="seconds that are added to the stream's clock")
     scale: Number = Field(
         default=1.0,
-        ge=0.5,
-        le=2,
+        ge=1e-3,
+        le=1e3,
         description="factor on the time since the first row, for a clock that drifts",
     )
 

@@ -37,6 +37,7 @@ from drake_teleop.logs.read.tables import Table, decimal_resolution
 
 MIN_STATIC_POSES, MIN_CUTOFF_HZ = 3, 1e-3
 _CONVERTED_CHUNK_ROWS, _MIN_IMU_GAP_OVER_STEP = 2**16, 4.0
+_MIN_CALENDAR_TIME_S, _MAX_CALENDAR_TIME_S = 1e8, 1e10  # years 1973 and 2286
 _EstimateAuto = Callable[..., auto_frames.Estimate]
 
 
@@ -124,6 +125,8 @@ class _LogReader:
         t = streams.uniform_times_of_streams(clock.t, kinematics, self.source)
         log = self._make_log(t, resample(t, clock.t, wrench), imu, pose)
         log = replace(log, estimated=tuple(name for name, is_free in free.items() if is_free))
+        has_calendar_time = _MIN_CALENDAR_TIME_S < clock.t[0] < _MAX_CALENDAR_TIME_S
+        log = replace(log, has_calendar_time=bool(has_calendar_time))
         log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
