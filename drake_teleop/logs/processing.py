@@ -46,8 +46,9 @@ from drake_teleop.logs.check.conventions import (
     motion_findings,
 )
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
-from drake_teleop.logs.check.high_pass import high_pass_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
+from drake_teleop.logs.check.sensor_filter import sensor_filter_finding
+from drake_teleop.logs.check.wrench_channels import wrench_channel_finding
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
@@ -69,7 +70,9 @@ from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_FINDINGS_PREVENTING_IDENTIFICATION = ("left-handed", "high-pass", "clock rate")
+_FINDINGS_PREVENTING_IDENTIFICATION = (
+    *("left-handed", "high-pass", "low-pass", "clock rate", "channel sign", "mixed axes"),
+)
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
@@ -207,7 +210,8 @@ def identify_log(
         if accepted and accepted.is_acceleration_missing and not result.identifiable.all():
             findings = (*findings, explained_log.missing_acceleration_finding(accepted))
     corrections = [x for x in causes if x.name not in CAUSES_WITHOUT_CORRECTION]
-    misfit = _unexplained_misfit(why, result, corrections)
+    unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
+    misfit = _unexplained_misfit(why, result, corrections, unexplained)
     if misfit is not None and (corrections or not findings):
         findings, causes = (explained_log.misfit_finding(misfit, corrections),), ()
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
@@ -263,7 +267,7 @@ def _explain_residual(
         why = replace(why, causes=())
     contradicts = fitted.motion is None and log.posed is not None and log.posed.imu is not None
     if contradicts and not _clock_rate_causes(why):
-        why = None  # poses and IMU disagree, and the load is that of the IMU
+        why = _misfit_of_imu_motion(log, fitted.delay_s)  # the load is that of the IMU
     causes = () if why is None else why.causes
     need_motion = any(x.name not in CAUSES_AT_REST for x in (*frame_findings, *causes))
     if need_motion and (too_still := too_little_motion(log)) is not None:
@@ -272,6 +276,15 @@ def _explain_residual(
     if why is not None and by_gains and not why.is_acceleration_missing:
         why = replace(why, causes=(), explained=True, loads=())
     return why, None
+
+
+def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
+    """Return the misfit if the motion of the IMU, without poses, does not explain the wrench."""
+    if not _is_misfit_explainable(log, by_splines=False):
+        return None
+    log = replace(log, posed=None, R_WS=None, gravity=None, gravity_W=None)
+    why = explained_log.explain_log(log, delay_s, None)
+    return why if why is not None and why.is_misfit else None
 
 
 def _clock_rate_causes(why: MisfitExplanation | None) -> tuple[Finding, ...]:
@@ -314,8 +327,11 @@ def _findings_that_invalidate_load(
         text = f"payload not identifiable: {too_still}; {MORE_MOTION_REMEDY}"
         errors = (Finding("payload", text),)
     elif not errors and why is not None and (why.is_misfit or why.causes):
-        passed = None if raw.static else high_pass_finding(fitted.log, fitted.delay_s)
-        errors = () if passed is None else (passed,)
+        found = None if raw.static else sensor_filter_finding(fitted.log, fitted.delay_s)
+        if not raw.static and why.is_misfit:
+            splines = None if fitted.motion is None else fitted.motion.splines
+            found = wrench_channel_finding(fitted.log, splines, fitted.delay_s) or found
+        errors = () if found is None else (found,)
         if not errors and why.is_misfit and why.causes:
             errors = motion_findings(check)
     errors = _clock_rate_causes(why) or errors
@@ -342,12 +358,16 @@ def _apply_explanation(
 
 
 def _unexplained_misfit(
-    why: MisfitExplanation | None, load: Identification, corrections: list[Finding]
+    why: MisfitExplanation | None,
+    load: Identification,
+    corrections: list[Finding],
+    unexplained: float,
 ) -> MisfitExplanation | None:
     """Return `why` if its residual is neither noise nor an effect of unknown accelerations."""
     if why is None or not why.is_misfit or why.is_acceleration_missing:
         return None
-    if load.identifiable[6:].any() and not (corrections and why.is_residual_large):
+    useless = not why.causes and unexplained > 0.5
+    if load.identifiable[6:].any() and not ((corrections and why.is_residual_large) or useless):
         return None  # vibrations may leave a large residual
     return why
 
