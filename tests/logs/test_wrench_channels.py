@@ -88,7 +88,7 @@ def test_nothing_is_identified_from_euler_angles_averaged_across_180_deg(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("limit", [0.5, 0.7])
+@pytest.mark.parametrize("limit", [0.4, 0.5])
 def test_nothing_is_identified_with_a_saturated_gyroscope_beside_poses(
     tmp_path: Path, limit: float
 ) -> None:

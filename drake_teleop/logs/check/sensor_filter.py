@@ -19,7 +19,7 @@ def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
     """Return a finding if a high-pass or low-pass on the load's wrench explains the wrench."""
     from scipy.signal import butter, lfilter  # slow to import
 
-    least, fitting = dict.fromkeys(("none", "high-pass", "low-pass"), np.inf), {}
+    least, fitting = dict.fromkeys(("none", "high-pass", "low-pass"), np.inf), {"none": 1.0}
     for moved in (log, remove_delay(log, -delay_s)):  # a filter resembles a delay
         few = moved.select_rows(slice(None, None, max(1, int(1.0 / (_COMPARED_RATE_HZ * log.dt)))))
         t, dt = few.t - few.t[0], mean_time_step(few.t)
