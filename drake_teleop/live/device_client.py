@@ -163,8 +163,6 @@ def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
 
 
 class RealTimeVirtualDevice:
-    """Virtual device in real time."""
-
     limits = DeviceLimits(force=10.0)
 
     def __init__(self, virtual: VirtualDevice) -> None:
