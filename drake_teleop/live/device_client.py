@@ -163,6 +163,8 @@ def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
 
 
 class RealTimeVirtualDevice:
+    """Virtual device whose time is the computer's clock."""
+
     limits = DeviceLimits(force=10.0)
 
     def __init__(self, virtual: VirtualDevice) -> None:

@@ -130,6 +130,8 @@ class OneDofRun:
 
 @dataclass(frozen=True)
 class RunMeasures:
+    """Measures of one run of the task."""
+
     #: True: at rest in hold and end, within 0.5 mm about a parabola, also at a rotating tool's tip.
     stable: bool
     hunting: float  #: largest peak-to-peak motion in hold and end [m]
