@@ -336,7 +336,7 @@ def _apply_explanation(
         causes = explained_log.replace_frame_causes(why, frame_findings[0])
     if raw.estimated:
         note = explained_log.removed_weight_note(why)
-    elif causes and not why.has_several_gains:
+    elif causes and not why.needs_full_gain_matrix:
         note = ""
     return explained_log.apply_explanation_to_load(load, why), causes, note
 
@@ -467,10 +467,6 @@ def eliminate_log(
             of `load`.
         free: log of free motion with the same load; None: calm parts of the record itself.
         statistic: contact statistic, "level", "cusum" or "glr".
-
-    Raises:
-        DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
-            static poses.
     """
     _check_path_and_cutoff(path, cutoff_hz)
     if untouched_s is not None:
@@ -684,13 +680,13 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
 
 
 def _resolve_force_scales(
-    given: dict[str, Any], eta: float | None, has_gripper: bool
+    given_scales: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
-    for name, value in given.items():
+    for name, value in given_scales.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_TELEOP_FORCE_SCALE:
             what = f"{value:g} is outside 0 to {_MAX_TELEOP_FORCE_SCALE:g}"
             raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
-    sigma, kept, gamma, *separate = given.values()
+    sigma, kept, gamma, *separate = given_scales.values()
     if kept is not None and not has_gripper:
         what = "sigma_object requires a gripper"
         remedy = "give the gripper's identification.json as well, or use sigma"

@@ -74,9 +74,6 @@ def tune(
 
     Returns:
         The content of summary.json (docs/choose.md).
-
-    Raises:
-        DrakeTeleopError: for invalid hands, walls or names, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), press_trial.make_operating_range(hands, walls, task)
@@ -117,7 +114,7 @@ def tune(
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of `search_settings`."""
+    """Settings chosen by `search_settings`, and the runs that it compared."""
 
     settings: TunedSettings
     #: Tried settings in one axis, with the predicted `threshold_N` and `gamma`.
@@ -213,7 +210,7 @@ def _search_max_gamma(
 def meets_requirements(
     row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
 ) -> bool:
-    """Return whether a run comes to rest, is quiet and renders the contact force accurately."""
+    """Return whether a run is at rest, quiet and within `max_force_error` of the contact force."""
     exact = press_trial.is_share_accepted(row["share"], max_force_error)
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 

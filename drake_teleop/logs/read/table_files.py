@@ -228,13 +228,13 @@ def _find_separator(line: str) -> str:
     return " " if "," not in bare and " " in bare else ","
 
 
-def _header_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+def _header_in_comment(comments: list[str], rows: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
-    if not marked or not all(_is_decimal_number(cell) for cell in rest[0].split(separator)):
+    if not marked or not all(_is_decimal_number(cell) for cell in rows[0].split(separator)):
         return None
     cells = None if separator == " " else separator
     names = [name.strip() for name in marked[-1].lstrip("# ").split(cells)]
-    matching = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
+    matching = len(names) == len(rows[0].split(separator)) and len(set(names)) == len(names)
     return names if matching else None
 
 

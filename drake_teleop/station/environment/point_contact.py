@@ -69,16 +69,13 @@ def FindContactPairs(
     slip_speed: float,
     row_bodies: Sequence[int] = (),
 ) -> ShapePairs:
-    """Return the pairs of a shape of the tool and one of the environment, unless filtered.
+    """Return the pairs of tool and environment shapes that no collision filter excludes.
 
     Args:
         tool: for each shape of the tool, the pose X_SBody of the shape's body.
         environment: model instances of the objects to touch.
         slip_speed: sliding speed above which friction is full [m/s].
         row_bodies: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
-
-    Raises:
-        DrakeTeleopError: for an unbounded shape.
     """
     context = plant.CreateDefaultContext()
     compiled_pairs, monitored_pairs, monitoring_reason = list[Array](), list[Array](), ""
