@@ -131,6 +131,10 @@ def identify_load(
         progress: True shows progress bars; or a `StartStage` that receives the progress.
         trajectory: excitation of the scenario's duration; None: this process designs one, once.
         log: folder of the log, see `simulate`.
+
+    Raises:
+        DrakeTeleopError: if the load estimator is off, or if `trajectory` violates a limit or has
+            another duration.
     """
     check_scenario(scenario)
     if not scenario.load_estimator.enabled:

@@ -370,11 +370,7 @@ def _count_saturated_samples(x: Array, repeats: NDArray[np.bool_]) -> int:
 
 
 def _frozen_spans(values: Array, repeats: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
-    """Return first and last row of the longest frozen part of each channel (N, k) that has one.
-
-    A frozen channel is constant, not at an end of its range, while another channel of its vector
-    covers much of its own range; in most other rows it changes.
-    """
+    """Return first and last row of the longest frozen part of each channel (N, k) that has one."""
     found = {}
     for i, x in enumerate(values.T):
         held = np.concatenate([[False], x[1:] == x[:-1]])

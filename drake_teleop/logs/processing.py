@@ -230,7 +230,6 @@ def identify_log(
 def _read_and_fit_load(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
-    """Return the log as read, its load, and findings on its poses."""
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     fitted, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
@@ -286,7 +285,6 @@ def _correct_delay(
     method: str,
     cutoff_hz: float | None,
 ) -> tuple[LoadFitOfLog, tuple[Finding, ...]]:
-    """Return the load and the findings on poses with an estimated delay corrected by `why`."""
     source, motion = fitted.delay_source, fitted.motion
     if source != "estimated":
         return fitted, frame_findings
@@ -467,6 +465,10 @@ def eliminate_log(
             of `load`.
         free: log of free motion with the same load; None: calm parts of the record itself.
         statistic: contact statistic, "level", "cusum" or "glr".
+
+    Raises:
+        DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
+            static poses.
     """
     _check_path_and_cutoff(path, cutoff_hz)
     if untouched_s is not None:

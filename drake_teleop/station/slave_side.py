@@ -67,6 +67,9 @@ def MakeSlaveSide(
             its output `pose_command` (7) is the setpoint of both. Its input `pose_command` (7) is
             that of this side; `slave_state` (2 n), `pose_slave` (7), `contact_wrench_S` (6) and the
             parts of a sample are connected if it has such inputs.
+
+    Raises:
+        DrakeTeleopError: for an unreachable start, or if load estimate or noise floor is required.
     """
     check_scenario(scenario)
     _check_load_is_known(scenario, load_estimate)

@@ -47,6 +47,9 @@ def MakeTeleopStation(
             passivity are unused.
         slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`, such as one with
             another controller; load_estimate, load_covariance and noise_floor are unused.
+
+    Raises:
+        DrakeTeleopError: for an invalid value, or a custom side without a required port.
     """
     check_scenario(scenario)
     for name, side in (("master", master), ("channel", channel), ("slave", slave)):

@@ -74,6 +74,9 @@ def tune(
 
     Returns:
         The content of summary.json (docs/choose.md).
+
+    Raises:
+        DrakeTeleopError: for invalid hands, walls or names, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), press_trial.make_operating_range(hands, walls, task)

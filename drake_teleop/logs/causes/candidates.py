@@ -163,7 +163,6 @@ def _is_extension_effect_large(state: FittedModel, name: str) -> bool:
 
 
 def _start_parameters_of_clock_rate_fit(state: FittedModel, model: LoadModel, name: str) -> Array:
-    """Return start parameters of the best-fitting clock rate; all rows have one weight."""
     simple = LoadModel((name,), axes=model.axes, torque_factor=model.torque_factor)
     y = state.data.with_other_rows_zeroed(state.rows.used).y[:, simple.columns]
     sums = y.T @ y

@@ -219,7 +219,6 @@ def _edits_with_far_better_fit(
     given: LoadFitQuality,
     tried: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
-    """Return (fit, finding, description) of edits with a far better fit and a positive mass."""
     positive, negative = [], []
     for finding, edited in tried:
         fit = edits.call_or_none_if_unreadable(fit_description, edited)

@@ -2,9 +2,7 @@
 
 Nested columns become several: `name.field` for the fields of a structure, and `name[k]` for the
 elements of a list or array of constant length, besides the whole as `name`. Separator, decimal
-sign, header and encoding (UTF-8, UTF-16, else Windows-1252) of text are detected. Lines with `#`
-and other text before the header are comments, except column names directly before the numbers.
-A row of units below the header completes the column names.
+sign, header and encoding (UTF-8, UTF-16, else Windows-1252) of text are detected.
 """
 
 from __future__ import annotations

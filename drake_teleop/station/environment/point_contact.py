@@ -76,6 +76,9 @@ def FindContactPairs(
         environment: model instances of the objects to touch.
         slip_speed: sliding speed above which friction is full [m/s].
         row_bodies: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
+
+    Raises:
+        DrakeTeleopError: for an unbounded shape.
     """
     context = plant.CreateDefaultContext()
     compiled_pairs, monitored_pairs, monitoring_reason = list[Array](), list[Array](), ""

@@ -85,6 +85,10 @@ def AddWristSensor(
             to it, or 1 ms for a continuous plant.
         model_instance: source of `joint_position`; all joints of the plant by default.
         name: name of the block; "<name>_noise" is its noise source.
+
+    Raises:
+        DrakeTeleopError: for a plant that is not finalized or in another builder, a missing weld, a
+            tool without mass, or an unsuitable period.
     """
     _check_finalized_in_builder(builder, plant)
     config = config or WristSensorConfig(ideal=True)
