@@ -117,7 +117,7 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: tolerances.Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return half widths over tolerances (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom."""
+    """Return 95 % and `TOLERANCE_CONFIDENCE` half widths over tolerances, degrees of freedom."""
     load = found.identification
     errors = tolerances.derivatives_over_tolerances(tolerance, load.phi)
     deviations = tolerances.deviations_over_tolerances(errors, load.covariance)

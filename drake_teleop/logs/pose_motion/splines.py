@@ -133,7 +133,7 @@ class PoseSplines:
         for part in (slice(0, 3), slice(3, 7)):
 
             def penalized(log_frequency: float, part: slice = part) -> tuple[Array, float, float]:
-                """Return normal matrix, noise variance, -2 log likelihood, for columns `part`."""
+                """Return normal matrix, noise variance, -2 log likelihood; `part`: pose columns."""
                 weight = self.rate / (2 * np.pi * np.exp(log_frequency)) ** (2 * SPLINE_DEGREE)
                 band = gram + weight * penalty
                 factor = cholesky_banded(band)
