@@ -11,6 +11,7 @@ import pytest
 import yaml
 from known_motion import motion_at
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
@@ -85,6 +86,14 @@ def test_remedy_gives_the_load(tmp_path: Path, ratio: float, streams: str) -> No
     assert {finding.name for finding in repaired.findings} <= accepted
     assert repaired.identification.mass == pytest.approx(3.13, rel=0.005)
     assert repaired.identification.identifiable[6]
+
+
+def test_positions_in_mm_are_no_clock_rate(tmp_path: Path) -> None:
+    """A slow clock and a torque in N mm have nearly the same effect."""
+    columns = record(3.9)
+    columns["p"] *= 1e3
+    with pytest.raises(DrakeTeleopError, match=r"pose\.position\.unit: mm"):
+        identified(tmp_path, columns, "p")
 
 
 def test_inspect_names_the_clock_rate_alone(tmp_path: Path) -> None:
