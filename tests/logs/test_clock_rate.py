@@ -90,8 +90,8 @@ def test_remedy_gives_the_load(tmp_path: Path, ratio: float, streams: str) -> No
 
 def test_positions_in_mm_are_no_clock_rate(tmp_path: Path) -> None:
     """A slow clock and a torque in N mm have nearly the same effect."""
-    columns = record(3.9)
-    columns["p"] *= 1e3
+    columns = planted.good()
+    planted.in_mm(columns)
     with pytest.raises(DrakeTeleopError, match=r"pose\.position\.unit: mm"):
         identified(tmp_path, columns, "p")
 
