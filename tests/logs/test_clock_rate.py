@@ -64,7 +64,10 @@ def apply_remedy(path: Path, fields: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("ratio", "streams"),
-    [(0.5, "p"), (3.0, "p"), (1.02, "ga"), (4.0, "ga"), (10.0, "gap"), (0.7, "gap"), (1.5, "ap")],
+    [
+        *((0.5, "p"), (3.0, "p"), (1.02, "ga"), (4.0, "ga")),
+        *((10.0, "gap"), (0.7, "gap"), (1.02, "gap"), (1.5, "ap")),
+    ],
 )
 def test_remedy_gives_the_load(tmp_path: Path, ratio: float, streams: str) -> None:
     found = identified(tmp_path, record(12.0, ratio), streams)
@@ -72,7 +75,9 @@ def test_remedy_gives_the_load(tmp_path: Path, ratio: float, streams: str) -> No
     (finding,) = found.findings
     assert finding.name == "clock rate"
     assert finding.values["ratio"] == pytest.approx(ratio, rel=0.005)
-    assert ("same centre of mass" in finding.message) == (streams == "p" and ratio > 1.0)
+    # Poses with a gyroscope that differs by 2 % are used as poses: its gain may be wrong.
+    by_poses = streams == "p" or (streams, ratio) == ("gap", 1.02)
+    assert ("same centre of mass" in finding.message) == (by_poses and ratio > 1.0)
     apply_remedy(tmp_path / "log.yaml", finding.fields)
     repaired = identify_log(tmp_path / "log.yaml")
     # A gyroscope determines the ratio to 0.2 %, which leaves the effect of a small gain error.

@@ -67,7 +67,7 @@ class Candidate:
 
 
 def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candidate]:
-    """Yield fits of a model with one further extension each, if its effect is sufficient."""
+    """Yield fits of the model with one further extension each, whose effect exceeds its limit."""
     model, data = state.model, state.data
     if is_first_round:
         yield from _axis_permutation_candidates(state)
@@ -92,7 +92,7 @@ def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candida
     for kind in ("offsets", "load"):
         found = add_step_change(state, kind)
         if found is not None:
-            yield _scored_candidate(kind, state, found, num_times=1)
+            yield _scored_candidate(kind, state, found, num_step_times=1)
     for c in range(6):
         if c not in model.gain_channels:
             larger = state.refit(replace(model, gain_channels=(*model.gain_channels, c)))
@@ -103,17 +103,22 @@ def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candida
     if spans and spans != state.contact_spans:
         larger = FittedModel.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
-        yield _scored_candidate("contact", state, larger, num_extra=6 + 2 * ends)
+        yield _scored_candidate("contact", state, larger, num_extra_parameters=6 + 2 * ends)
 
 
 def _scored_candidate(
-    name: str, state: FittedModel, larger: FittedModel, *, num_times: int = 0, num_extra: int = 0
+    name: str,
+    state: FittedModel,
+    larger: FittedModel,
+    *,
+    num_step_times: int = 0,
+    num_extra_parameters: int = 0,
 ) -> Candidate:
     rows = float(state.data.used.sum())
-    cost = larger.model.size - state.model.size + num_extra
+    cost = larger.model.size - state.model.size + num_extra_parameters
     score = 2.0 * (larger.likelihood - state.likelihood) - cost * np.log(rows)
-    if num_times:
-        score += (0.5 * cost - 2.0 * num_times) * np.log(rows)
+    if num_step_times:
+        score += (0.5 * cost - 2.0 * num_step_times) * np.log(rows)
     return Candidate(name, larger, float(score))
 
 
@@ -158,7 +163,6 @@ def _is_extension_effect_large(state: FittedModel, name: str) -> bool:
 
 
 def _start_parameters_of_clock_rate_fit(state: FittedModel, model: LoadModel, name: str) -> Array:
-    """Return start parameters with the best of the tried factors; all rows have one weight."""
     simple = LoadModel((name,), axes=model.axes, torque_factor=model.torque_factor)
     y = state.data.with_other_rows_zeroed(state.rows.used).y[:, simple.columns]
     sums = y.T @ y
@@ -177,7 +181,7 @@ def _start_parameters_of_clock_rate_fit(state: FittedModel, model: LoadModel, na
 
 
 def clock_rate_ratio_and_std(state: FittedModel, name: str) -> tuple[float, float]:
-    """Return described over true time step and its standard deviation; (0, inf) if impossible."""
+    """Return described over true time step and its deviation; (0, inf) for a factor <= 0."""
     x, covariance = state.parameters_of_extension(name)
     power, factor = CLOCK_RATE_POWER[name], 1.0 + float(x[0])
     if factor <= 0.0:
@@ -295,7 +299,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     far = not _MIN_USUAL_TORQUE_FACTOR < best.model.torque_factor < 1.0 / _MIN_USUAL_TORQUE_FACTOR
     most = _MAX_EXTREME_TORQUE_FACTOR_ERROR if far else _MAX_TORQUE_FACTOR_ERROR
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
-    found = _scored_candidate("torque factor", state, best, num_extra=1)
+    found = _scored_candidate("torque factor", state, best, num_extra_parameters=1)
     if not abs(value[0]) < limit:  # a factor beside the known ratios is not a cause
         found = replace(found, score=min(found.score, _SCORE_CAP_OF_UNKNOWN_TORQUE_FACTOR))
     yield found
@@ -338,7 +342,7 @@ def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
     if force_square_error(best) < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * force_square_error(identity):
         larger = state.refit(replace(state.model, axes=best), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
-            found = _scored_candidate("axes", state, larger, num_extra=3)
+            found = _scored_candidate("axes", state, larger, num_extra_parameters=3)
             # The given axes imply a negative mass, which is impossible.
             more = _SCORE_OF_AVOIDED_NEGATIVE_MASS if has_negative_inertia(state) else 0.0
             yield replace(found, score=found.score + more)

@@ -204,7 +204,7 @@ class LeaderDevice:
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the arm without and with the hand's mass, and `joint_table`."""
+        """Tables of the leader arm, without and with the mass of the user's hand; `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:
