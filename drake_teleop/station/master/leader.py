@@ -193,6 +193,10 @@ class LeaderDevice:
         return self.arm.num_joints
 
     @property
+    def sliding_joints(self) -> tuple[int, ...]:
+        return self.arm.sliding_joints
+
+    @property
     def hand_weight(self) -> float:
         """Weight of the hand [N]."""
         gravity = np.linalg.norm(self.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])

@@ -80,6 +80,11 @@ class ArmModel:
         return len(self.joint_names)
 
     @property
+    def sliding_joints(self) -> tuple[int, ...]:
+        """Indices of the prismatic joints, whose positions are in m."""
+        return tuple(map(int, np.flatnonzero(self.table[:-1, IS_PRISMATIC_COLUMN])))
+
+    @property
     def middle_positions(self) -> Array:
         """Middles (n,) of the joint ranges; for an infinite range its point nearest to 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
