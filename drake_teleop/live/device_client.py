@@ -163,7 +163,7 @@ def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
 
 
 class RealTimeVirtualDevice:
-    """Virtual device in real time."""
+    """Virtual device whose time is the computer's clock."""
 
     limits = DeviceLimits(force=10.0)
 

@@ -116,7 +116,7 @@ class DeviceLink:
             return
 
     def reset_pose_origin(self, now: float) -> None:
-        """Make the device's present pose the origin of `hand_inputs`, the hand's start pose."""
+        """Let `hand_inputs` return zero displacement at the device's present pose."""
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:

@@ -35,7 +35,7 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def choice_names() -> dict[str, tuple[str, ...]]:
-    """Return the options of the inputs network, grip, sensor and method, which are indices."""
+    """Return by name the options that network, grip, sensor and method of `Inputs` index."""
     shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSOR_NAMES}
     return shipped | {"method": tuple(METHODS)}
 

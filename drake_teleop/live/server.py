@@ -117,11 +117,7 @@ class LiveDrive:
             progress(1.0)
 
     def wait(self) -> None:
-        """Wait for the end of the session, by `stop` or Ctrl-C.
-
-        Raises:
-            DrakeTeleopError: if the record is incomplete.
-        """
+        """Wait for the session's end, by `stop` or Ctrl-C; raise if the record is incomplete."""
         try:
             while not self._over.wait(0.2):
                 pass

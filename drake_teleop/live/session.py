@@ -94,7 +94,8 @@ def add_missing_signals(log: SimulationResult) -> SimulationResult:
     values = missing | {name: log[name] for name in log.signals}
     order = [name for name in SIGNALS if name in values]
     order += [name for name in values if name not in SIGNALS]
-    specs = [signal_with_size(name, values[name].shape[-1]) for name in order]
+    known = {spec.name: spec for spec in log.specs}
+    specs = [known.get(name) or signal_with_size(name, values[name].shape[-1]) for name in order]
     return SimulationResult(log.t, {name: values[name] for name in order}, specs)
 
 

@@ -132,7 +132,7 @@ class SecondMoments:
             self._sums += part + np.triu(part, 1).T
 
     def mean_noise_covariance_of_z(self, noise: NoiseStd, wrench: Array) -> Array:
-        """Return the mean covariance (19, 19) of z by noise; `wrench` (6,) is noise [N, N m]."""
+        """Return the mean covariance (19, 19) of z due to `noise` of motion and `wrench` (6,)."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2

@@ -78,7 +78,7 @@ def parse_tolerance(text: str) -> Tolerance:
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the k required entries by [offsets; phi], over tolerances."""
+    """Return derivatives (k, 16) by [offsets; phi] of the entries with a tolerance, over it."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -98,7 +98,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of required entries over tolerances; inf: undetermined."""
+    """Return standard deviations (k,) of entries with a tolerance, over it; inf: undetermined."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", derivatives, finite, derivatives)
@@ -107,14 +107,14 @@ def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
 
 
 def display_values_of_required_entries(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the values (k,) of the required entries for a load phi (10,) [kg, mm, kg m^2]."""
+    """Return load phi's values (k,) of the entries with a tolerance [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
 def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
-    """Return absolute tolerances (k,) of the required entries for load phi [kg, mm, kg m^2]."""
+    """Return the tolerances (k,), made absolute for load phi [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     names = tolerance.required_quantity_names

@@ -22,7 +22,7 @@ class CausalContactAndScaledWrench:
     Attributes:
         mode: "delayed", or "predicted" (extrapolated over `lag_s`).
         lag_s: sum of the motion's delay and the delay of the low-pass [s].
-        contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma (load's wrench).
+        contact, scaled: (N, 6) F_c, and gamma F_c plus sigma times the load's wrench.
         offsets: (6,) subtracted sensor offsets [N, N m].
     """
 

@@ -178,14 +178,14 @@ def _fit_noise_floor_and_threshold(
     return floor, _FINAL_THRESHOLD_OVER_EXPECTED_MAX * reached, rows.select_rows(quiet)
 
 
-def _expected_maximum_in_free_motion(values: Array, block: int, samples: int) -> float:
-    """Return the expected maximum of a statistic in `samples` samples of free motion, Eq. (T13)."""
-    block = min(block, len(values) // 4)
-    count = len(values) // block
-    largest = values[: count * block].reshape(count, block).max(axis=1)
+def _expected_maximum_in_free_motion(values: Array, block_size: int, num_samples: int) -> float:
+    """Return the expected maximum of a statistic in `num_samples` of free motion, Eq. (T13)."""
+    block_size = min(block_size, len(values) // 4)
+    count = len(values) // block_size
+    largest = values[: count * block_size].reshape(count, block_size).max(axis=1)
     lower, middle = np.log(np.quantile(np.maximum(largest, 1.0), [0.25, 0.5]))
     scale = (middle - lower) / (_GUMBEL_MEDIAN - _GUMBEL_QUARTILE)
-    rare = -math.log(-math.log(1.0 - 1.0 / max(3, samples // block)))
+    rare = -math.log(-math.log(1.0 - 1.0 / max(3, num_samples // block_size)))
     return math.exp(lower + scale * (rare - _GUMBEL_QUARTILE))
 
 

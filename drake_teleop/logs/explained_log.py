@@ -301,7 +301,7 @@ def _replace_load_by_fit_of_causes(load: Identification, why: MisfitExplanation)
     no_load = bool(why.causes) and why.causes[0].name == "no load"
     if no_load or has_negative_mass(why.state):
         identifiable = np.repeat([True, False], [6, 10])
-    if why.has_several_gains:
+    if why.needs_full_gain_matrix:
         identifiable = np.zeros(16, bool)
     return replace(
         load,

@@ -32,6 +32,7 @@ BANDWIDTH_FOR_GAP_LENGTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
 """Smallest reported share of repeated rows, and smallest number of rows of a reported block."""
+_MIN_FROZEN_ROWS, _MIN_MOTION_SHARE_BESIDE_FROZEN = 50, 0.3
 _MAX_DRAFT_CORRECTIONS = 5  # by the data
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _COLUMNS_THAT_MARK_CANONICAL_LOG = {"f_x", "tau_x"}
@@ -249,11 +250,21 @@ def _inspect_stream_and_list_bad_rows(
     if moving:
         findings += _repeated_rows_findings(at, values, repeats, figures.get("rate_hz"), time)
     figures["columns"] = {}
-    for column, x in zip(_channel_labels(columns, table), values.T, strict=True):
+    frozen = _frozen_spans(values, repeats) if moving else {}
+    for i, (column, x) in enumerate(zip(_channel_labels(columns, table), values.T, strict=True)):
         finite = x[np.isfinite(x)]
         if not len(finite):
             continue
-        saturated = 0 if time is None or not moving else _count_saturated_samples(x, repeats)
+        saturated = 0
+        if i in frozen:
+            first, last = (table.line_in_file(row) for row in frozen[i])
+            text = (
+                f"{at}: {column} keeps the value {x[frozen[i][0]]:.4g} in rows {first} to {last},"
+                " but other channels vary: sensor or connection failed; delete these rows"
+            )
+            findings.append(Finding("dead channel", text))
+        elif time is not None and moving:
+            saturated = _count_saturated_samples(x, repeats)
         ends = {"min": float(finite.min()), "max": float(finite.max())}
         noise = float(white_noise_deviations(finite[:, None])[0])
         mean = {"mean": float(finite.mean()), "noise": noise, "saturated": saturated}
@@ -356,6 +367,25 @@ def _count_saturated_samples(x: Array, repeats: NDArray[np.bool_]) -> int:
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
+
+
+def _frozen_spans(values: Array, repeats: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
+    """Return first and last row of the longest frozen part of each channel (N, k) that has one."""
+    found = {}
+    for i, x in enumerate(values.T):
+        held = np.concatenate([[False], x[1:] == x[:-1]])
+        runs = find_runs_of_true(held)
+        start, stop = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
+        if stop - start < _MIN_FROZEN_ROWS or repeats[start:stop].all():
+            continue
+        vector = values[:, 3 * (i // 3) : 3 * (i // 3) + 3]
+        ranges = np.nanmax(vector, axis=0) - np.nanmin(vector, axis=0)
+        covers = np.ptp(vector[start:stop], axis=0) > _MIN_MOTION_SHARE_BESIDE_FROZEN * ranges
+        changes_elsewhere = np.mean(np.delete(held, slice(start, stop))) < 0.5
+        at_end = x[start] in (np.nanmin(x), np.nanmax(x))
+        if changes_elsewhere and not at_end and covers.any():
+            found[i] = (int(start) - 1, int(stop) - 1)
+    return found
 
 
 def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:

@@ -234,7 +234,6 @@ def identify_log(
 def _read_and_fit_load(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
-    """Return the log as read, its load, and findings on its poses."""
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     fitted, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
@@ -299,7 +298,6 @@ def _correct_delay(
     method: str,
     cutoff_hz: float | None,
 ) -> tuple[LoadFitOfLog, tuple[Finding, ...]]:
-    """Return the load and the findings on poses with an estimated delay corrected by `why`."""
     source, motion = fitted.delay_source, fitted.motion
     if source != "estimated":
         return fitted, frame_findings
@@ -352,7 +350,7 @@ def _apply_explanation(
         causes = explained_log.replace_frame_causes(why, frame_findings[0])
     if raw.estimated:
         note = explained_log.removed_weight_note(why)
-    elif causes and not why.has_several_gains:
+    elif causes and not why.needs_full_gain_matrix:
         note = ""
     return explained_log.apply_explanation_to_load(load, why), causes, note
 
@@ -704,13 +702,13 @@ def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
 
 
 def _resolve_force_scales(
-    given: dict[str, Any], eta: float | None, has_gripper: bool
+    given_scales: dict[str, Any], eta: float | None, has_gripper: bool
 ) -> dict[str, float | None]:
-    for name, value in given.items():
+    for name, value in given_scales.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_TELEOP_FORCE_SCALE:
             what = f"{value:g} is outside 0 to {_MAX_TELEOP_FORCE_SCALE:g}"
             raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
-    sigma, kept, gamma, *separate = given.values()
+    sigma, kept, gamma, *separate = given_scales.values()
     if kept is not None and not has_gripper:
         what = "sigma_object requires a gripper"
         remedy = "give the gripper's identification.json as well, or use sigma"

@@ -27,7 +27,7 @@ TRUE_INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -
 """Mass [kg], centre of mass [m] and inertia [kg m^2] of the gripper in S, similar to a Robotiq
 2F-85."""
 FINGERTIP_POSITION_S = np.array([0.0, 0.0, 0.17])
-TRUE_RECORD_OFFSETS = np.array(
+TRUE_SENSOR_OFFSETS = np.array(
     [[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]]
 )
 """(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
@@ -114,7 +114,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             _write_record(out, name, row, pushes, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
-        offsets = {"offsets": TRUE_RECORD_OFFSETS[0], "offsets_touched": TRUE_RECORD_OFFSETS[1]}
+        offsets = {"offsets": TRUE_SENSOR_OFFSETS[0], "offsets_touched": TRUE_SENSOR_OFFSETS[1]}
         contacts = [_summarize_true_contact(touch) for touch in FINGERTIP_PUSHES]
         truth = {**load, "phi": TRUE_PHI, **offsets, "delay_s": POSE_DELAY_S, "contacts": contacts}
         write_json(out / "truth.json", truth)
@@ -202,7 +202,7 @@ def _write_record(
 
     t, motion_at = _jittered_time_stamps(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
-    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_RECORD_OFFSETS[row]
+    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_SENSOR_OFFSETS[row]
     for touch in pushes:
         wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
@@ -269,7 +269,7 @@ def sample_episode(
         push *= random.uniform(5, 15) / np.linalg.norm(push)
         touch = FingertipPush(start, start + random.uniform(0.4, 0.9), tuple(push))
         contact -= touch.wrench_S(t, R_WS)
-    offsets = TRUE_RECORD_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
+    offsets = TRUE_SENSOR_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
     wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     *_, R_late, p_late = motion_at(t - lag_frames / fps)

@@ -85,7 +85,7 @@ class DelayTracker:
     def update_delay(
         self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
     ) -> None:
-        """Update the delay by a wrench (6,), its motion `at`, and motions `before` and `after`."""
+        """Update the delay by a wrench (6,), the motion at its time, and those before and after."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
         if 0.0 <= elapsed < DELAY_SAMPLE_PERIOD_S or step <= 0.0:

@@ -57,8 +57,8 @@ class RecordEvaluation:
     Attributes:
         identified_log: the identification; None if it failed for the reason `failure`.
         relative_half_widths: (k,) of the 95 % intervals, divided by the tolerances.
-        is_within_tolerance: (k,) True if the `TOLERANCE_CONFIDENCE` interval fits, without
-            `doubts`.
+        is_within_tolerance: (k,) True if the `TOLERANCE_CONFIDENCE` interval is within the
+            tolerance, without `doubts`.
         is_known: (k,) True if the previous result was within the tolerance, too.
         doubts: problems of the record; no parameter is known then.
     """
@@ -117,7 +117,7 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: tolerances.Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom, (k,) each."""
+    """Return 95 % and `TOLERANCE_CONFIDENCE` half widths over tolerances, degrees of freedom."""
     load = found.identification
     errors = tolerances.derivatives_over_tolerances(tolerance, load.phi)
     deviations = tolerances.deviations_over_tolerances(errors, load.covariance)
@@ -217,7 +217,7 @@ def calibrate(
         previous = results[-1] if results else None
         return evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay)
 
-    def store_evaluation(result: RecordEvaluation) -> bool:
+    def store_evaluation_and_get_is_done(result: RecordEvaluation) -> bool:
         results.append(result)
         show(result)
         return bool(result.is_known.all())
@@ -242,7 +242,7 @@ def calibrate(
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):
-                        done, pending = store_evaluation(pending.result()), None
+                        done, pending = store_evaluation_and_get_is_done(pending.result()), None
                         if done:
                             break
                 done = done or recorder.longest_part_s >= seconds
@@ -251,8 +251,8 @@ def calibrate(
             write_record()
         raise
     if pending is not None:
-        store_evaluation(pending.result())
+        store_evaluation_and_get_is_done(pending.result())
     if not results or not results[-1].is_known.all():
         write_record()
-        store_evaluation(evaluate())
+        store_evaluation_and_get_is_done(evaluate())
     return results

@@ -25,7 +25,7 @@ from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
 from drake_teleop.robots.udp import LOCALHOST, open_udp_receiver
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
-_ZERO_WRENCH_PERIOD_S = 0.01  # period of zero wrenches while nothing comes
+_ZERO_WRENCH_SEND_PERIOD_S = 0.01  # period of zero wrenches while nothing comes
 
 
 class TareRequestPort:
@@ -58,7 +58,7 @@ def compensate_stream(
     changes: ZeroAndLoadMonitor | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the source ends or Ctrl-C; return numbers of wrenches and flags."""
+    """Compensate readings until the source ends or Ctrl-C; return counts of wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
 
@@ -72,7 +72,7 @@ def compensate_stream(
 
     def longest_read_timeout_s() -> float:
         left = compensator.time_to_stale(time.monotonic())
-        return min(left, _ZERO_WRENCH_PERIOD_S) if left > 0.0 else _ZERO_WRENCH_PERIOD_S
+        return min(left, _ZERO_WRENCH_SEND_PERIOD_S) if left > 0.0 else _ZERO_WRENCH_SEND_PERIOD_S
 
     with suppress(KeyboardInterrupt), raise_interrupt_on_sigint():
         while not INTERRUPTED_EVENT.is_set():

@@ -76,8 +76,8 @@ def topics_frames_and_streams(
     return topics, frames, tuple(_STREAM_OF_TOPIC.get(name, name) for name in topics)
 
 
-def damaged_reading_of_topic(name: str) -> Reading:
-    return DAMAGED_WRENCH_READING._replace(stream=_STREAM_OF_TOPIC.get(name, name))
+def reading_for_damaged_message(topic: str) -> Reading:
+    return DAMAGED_WRENCH_READING._replace(stream=_STREAM_OF_TOPIC.get(topic, topic))
 
 
 class MessageConverter:
@@ -262,7 +262,7 @@ class Ros2Source(streams.Source):
             try:
                 data = deserialize_message(message, kind)
             except Exception:  # of rmw, without a common type
-                self._found.append(damaged_reading_of_topic(name))
+                self._found.append(reading_for_damaged_message(name))
                 return
             self._found += self._converter.readings_of_message(name, data, number)
 

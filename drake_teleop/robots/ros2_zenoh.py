@@ -20,8 +20,8 @@ from drake_teleop.robots.ros2 import (
     WRENCH_STAMPED,
     MessageConverter,
     checked_topic_name,
-    damaged_reading_of_topic,
     domain_of_address,
+    reading_for_damaged_message,
     topics_frames_and_streams,
 )
 from drake_teleop.robots.streams import CompensatedWrench, Reading, Source
@@ -127,7 +127,7 @@ class CdrConverter(MessageConverter):
         try:
             data = self._types.deserialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])
         except self._damaged:
-            return [damaged_reading_of_topic(name)]
+            return [reading_for_damaged_message(name)]
         return self.readings_of_message(name, data, number)
 
 

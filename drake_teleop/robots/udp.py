@@ -26,7 +26,7 @@ from drake_teleop.robots.streams import (
 LOCALHOST = "127.0.0.1"
 READING_FORMAT = struct.Struct("<4sIQd15d")
 WRENCH_POSE_FORMAT = struct.Struct("<4sIQd13d")
-WRENCH_FORMAT = struct.Struct("<4sIQd12d")
+COMPENSATED_WRENCH_FORMAT = struct.Struct("<4sIQd12d")
 _READING_TAG, _WRENCH_POSE_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _HEADER_FORMAT = struct.Struct("<4sIQd")
 _MAX_PACKETS_PER_CALL = 256
@@ -68,11 +68,11 @@ def pack_wrench(out: CompensatedWrench) -> bytes:
 
 
 def unpack_wrench(packet: bytes) -> CompensatedWrench:
-    if len(packet) != WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
+    if len(packet) != COMPENSATED_WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
         what = f"its {len(packet)} bytes are not a compensated wrench of drake_teleop_udp.h"
-        remedy = f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}"
+        remedy = f"send {COMPENSATED_WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}"
         raise DrakeTeleopError(what, where="packet", remedy=remedy)
-    _, flags, number, t, *values = WRENCH_FORMAT.unpack(packet)
+    _, flags, number, t, *values = COMPENSATED_WRENCH_FORMAT.unpack(packet)
     return CompensatedWrench(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 

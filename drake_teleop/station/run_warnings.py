@@ -20,7 +20,7 @@ from drake_teleop.station.oscillation import doubled_quaternions, flag_pose_osci
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
+from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 
@@ -237,7 +237,7 @@ def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: Arm
     window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
-        slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
+        slides = k in arm.sliding_joints
         least = _MIN_WARNED_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD
         spans = find_spans(t, far > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, far, spans)

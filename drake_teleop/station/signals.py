@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from drake_teleop.station.result import Signal
 
 #: Name of the station's log sink; its rows are the output ports in one vector.
@@ -13,6 +15,9 @@ def _make_signal(name: str, components: str, units: str, description: str) -> Si
     return Signal(name, tuple(components.split()), unit[0] if len(unit) == 1 else unit, description)
 
 
+#: Attribute of a station, for units in the log: indices of sliding joints of slave (key False) and
+#: master (key True).
+SLIDING_JOINTS_ATTRIBUTE = "sliding_joints"
 #: Prefix of the pose signals of moving bodies of the surroundings.
 MOVING_BODY_POSE_PREFIX = "pose_of_"
 
@@ -29,12 +34,14 @@ _CHANNEL_ENERGY_AND_SILENCE_COMPONENTS = (
 )
 
 
-def _signals_by_name(num_joints: int) -> dict[str, Signal]:
+def _signals_by_name(num_joints: int, sliding: Collection[int] = ()) -> dict[str, Signal]:
     numbers = range(1, num_joints + 1)
     names = " ".join(f"joint_{i}" for i in numbers)
-    angles, torques = (names, "rad"), (names, "N m")
+    units = ["m" if k in sliding else "rad" for k in range(num_joints)]
+    forces = ["N" if k in sliding else "N m" for k in range(num_joints)]
+    angles, torques = (names, ",".join(units)), (names, ",".join(forces))
     state_names = " ".join(f"{letter}_{i}" for letter in "qv" for i in numbers)
-    state = (state_names, ",".join(num_joints * ["rad"] + num_joints * ["rad/s"]))
+    state = (state_names, ",".join([*units, *(f"{unit}/s" for unit in units)]))
     rows = (
         ("measured_wrench_S", _WRENCH_COMPONENTS, "sensor's wrench, Eq. (1), at sample_time"),
         ("specific_force_S", ("s_x s_y s_z", "m/s^2"), "a - g at So, at sample_time"),
@@ -48,7 +55,7 @@ def _signals_by_name(num_joints: int) -> dict[str, Signal]:
         ("sample_time", ("t", "s"),
          "time of the wrist sensor's sample in this row; other signals are of t"),
         ("load_estimate", _LOAD_ESTIMATE_COMPONENTS, "offsets and phi, Eq. (7)"),
-        ("slave_state", state, "true joint angles and velocities, at t"),
+        ("slave_state", state, "true joint positions and velocities, at t"),
         ("joint_torque", torques, "motor torques of the slave"),
         ("load_state", ("state", "1"),
          "state of the load estimate: 0 learning, 1 settled, 2 disturbed, 3 another load"),
@@ -56,7 +63,7 @@ def _signals_by_name(num_joints: int) -> dict[str, Signal]:
         ("sheet_state", ("z v_z", "m,m/s"), "deflection of the sheet spring's end, upwards"),
         ("intent", _POSE_COMPONENTS, "intended pose of the stylus, X_BE"),
         ("hand_wrench_E", _WRENCH_COMPONENTS, "wrench of the hand on the stylus at Eo, in B"),
-        ("master_state", state, "joint angles and velocities of the device"),
+        ("master_state", state, "joint positions and velocities of the device"),
         ("pose_master", _POSE_COMPONENTS, "pose X_BE of the stylus"),
         ("twist_master", _TWIST_COMPONENTS, "twist of the stylus in the device's base"),
         ("pose_command", _POSE_COMPONENTS, "setpoint of the slave, X_WS"),
@@ -85,11 +92,15 @@ def _signals_by_name(num_joints: int) -> dict[str, Signal]:
 SIGNALS = _signals_by_name(6)
 
 
-def signal_with_size(name: str, size: int) -> Signal:
-    """Return the description of a recorded signal; `size` is its number of components."""
+def signal_with_size(name: str, size: int, sliding: Collection[int] = ()) -> Signal:
+    """Return the description of a recorded signal; `size` is its number of components.
+
+    `sliding` contains the indices of joints with positions in m and forces in N.
+    """
     if name.startswith(MOVING_BODY_POSE_PREFIX):
         body = name.removeprefix(MOVING_BODY_POSE_PREFIX)
         return _make_signal(name, *_POSE_COMPONENTS, f"pose of the body {body} in W, at t")
-    if size == len(SIGNALS[name].components):
+    if size == len(SIGNALS[name].components) and not sliding:
         return SIGNALS[name]
-    return _signals_by_name(size // 2 if name in ("slave_state", "master_state") else size)[name]
+    num_joints = size // 2 if name in ("slave_state", "master_state") else size
+    return _signals_by_name(num_joints, sliding)[name]

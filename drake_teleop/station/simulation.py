@@ -19,7 +19,7 @@ from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.station.operator.decision import OUTCOME_INDEX
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
-from drake_teleop.station.signals import LOG_BLOCK_NAME, signal_with_size
+from drake_teleop.station.signals import LOG_BLOCK_NAME, SLIDING_JOINTS_ATTRIBUTE, signal_with_size
 
 # Interval of progress updates [ms].
 _SIM_MS_PER_PROGRESS = 20
@@ -187,5 +187,9 @@ def read_recorded_signals(simulator: Simulator, start: float) -> SimulationResul
     signals = {name: data[:, column] for name, column in log_slices_of_signals(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
-    specs = [signal_with_size(name, values.shape[1]) for name, values in signals.items()]
+    sliding = getattr(diagram, SLIDING_JOINTS_ATTRIBUTE, {})
+    specs = [
+        signal_with_size(name, values.shape[1], sliding.get(name == "master_state", ()))
+        for name, values in signals.items()
+    ]
     return SimulationResult(t[kept], signals, specs)

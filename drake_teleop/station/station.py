@@ -14,6 +14,8 @@ from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import Scenario, check_scenario
+from drake_teleop.station.signals import SLIDING_JOINTS_ATTRIBUTE
+from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave_side import MakeSlaveOnTrajectory, MakeSlaveSide
 from drake_teleop.station.wiring import build_with_log, connect_ports
 
@@ -93,7 +95,8 @@ def MakeTeleopStation(
     for name in ("clutch", "intended_pose", "intended_twist"):
         if master.HasInputPort(name):
             builder.ExportInput(master.GetInputPort(name), name)
-    return build_with_log(builder, "teleop_station", sides, scenario.rates.log_hz)
+    station = build_with_log(builder, "teleop_station", sides, scenario.rates.log_hz)
+    return _with_sliding_joints(station, scenario)
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
@@ -102,7 +105,15 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     expect_type(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
     slave = builder.AddNamedSystem("slave_side", MakeSlaveOnTrajectory(scenario, trajectory))
-    return build_with_log(builder, "identification_station", (slave,), scenario.rates.log_hz)
+    station = build_with_log(builder, "identification_station", (slave,), scenario.rates.log_hz)
+    return _with_sliding_joints(station, scenario)
+
+
+def _with_sliding_joints(station: Diagram, scenario: Scenario) -> Diagram:
+    slave = NominalSlave(scenario.slave).arm.sliding_joints
+    sliding = {False: slave, True: scenario.master.device(0.0, 0.0).sliding_joints}
+    setattr(station, SLIDING_JOINTS_ATTRIBUTE, sliding)
+    return station
 
 
 def GetBlock(station: Diagram, name: str) -> System:

@@ -353,6 +353,27 @@ def test_limits_without_a_useful_motion_are_an_error_with_the_limit(slave, limit
         excite(robot, harmonics=2, starts=1)
 
 
+def test_arm_that_rotates_its_sensor_about_one_axis_is_an_error(tmp_path, capsys):
+    limit = '<limit lower="-2" upper="2" effort="200" velocity="2"/></joint>'
+    parts = ['<robot name="planar"><link name="l0"/>']
+    for k in range(4):
+        kind = "prismatic" if k == 2 else "revolute"
+        parts.append(
+            f'<link name="l{k + 1}"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01"'
+            f' izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j{k}"'
+            f' type="{kind}"><parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<origin xyz="0.2 0 0.05"/><axis xyz="0 0 1"/>{limit}'
+        )
+    path = tmp_path / "planar.urdf"
+    path.write_text("".join([*parts, "</robot>"]))
+    with pytest.raises(SystemExit) as stop:
+        main(["excite", "--model", str(path), "--sensor-frame", "l4", "--out", str(tmp_path)])
+    assert stop.value.code == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "rotate the sensor about fewer than two axes" in message
+    assert "load_estimate" in message and "--time" not in message
+
+
 @pytest.mark.long
 @pytest.mark.slow
 def test_identification_refuses_an_unsuitable_trajectory(short):

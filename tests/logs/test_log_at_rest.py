@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from known_motion import GRAVITY_W
-from planted import OFFSETS, PHI, Columns, written
+from planted import OFFSETS, PHI, Columns, good, written
 
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
@@ -107,3 +107,14 @@ def test_correction_with_an_implausible_mass_is_not_stated() -> None:
 
     assert fit(1276.0) == []
     assert len(fit(1.5)) == 1
+
+
+def test_motion_of_an_imu_counts_beside_poses_at_rest(tmp_path: Path) -> None:
+    columns = good()
+    size = len(columns["t"])
+    noise = np.random.default_rng(1).normal(size=(size, 3))
+    columns |= {"R": np.tile(np.eye(3), (size, 1, 1)), "p": 0.3 + 1e-5 * noise}
+    s, omega = (float(np.linalg.norm(columns[x].std(axis=0))) for x in ("s", "omega"))
+    assert motion_rms(read_log(written(tmp_path, columns))) == pytest.approx((s, omega), rel=0.1)
+    by_pose = motion_rms(read_log(written(tmp_path, columns, imu=False)))
+    assert by_pose[0] < 0.1 * s and by_pose[1] < 0.1 * omega

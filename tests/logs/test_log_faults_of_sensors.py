@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import planted
 import polars as pl
 import pytest
 
@@ -68,3 +69,37 @@ def test_constant_wrench_is_reported(sample_tables, change, value):
     with pytest.raises(DrakeTeleopError, match=r"the same in all samples|sensor is connected"):
         identify_log(folder / "free.yaml")
     inspect_command(folder / "free.yaml", folder / "inspected", quiet=True)
+
+
+FROZEN_ROWS = slice(700, 1100)
+
+
+def findings_of_edited_channel(tmp_path, name, edit):
+    columns = planted.good()
+    columns[name][:, 1] = edit(columns[name][:, 1].copy())
+    return planted.findings(tmp_path, columns, imu=name == "omega")
+
+
+@pytest.mark.parametrize("name", ["force", "torque", "omega"])
+def test_channel_that_keeps_its_value_is_named_with_its_rows(tmp_path, name):
+    def freeze(x):
+        x[FROZEN_ROWS] = x[FROZEN_ROWS.start]
+        return x
+
+    message = findings_of_edited_channel(tmp_path, name, freeze)["dead channel"]
+    column = {"force": "f1", "torque": "m1", "omega": "w1"}[name]
+    assert f"{column} keeps the value" in message and "in rows 701 to 1100," in message
+
+
+@pytest.mark.parametrize("name", ["force", "torque"])
+def test_coarse_or_saturated_channels_are_not_frozen(tmp_path, name):
+    def saturate(x):
+        return x.clip(*np.quantile(x, [0.1, 0.9]))
+
+    assert "dead channel" not in findings_of_edited_channel(tmp_path, name, saturate)
+
+    def quantize(x):
+        step = np.ptp(x) / 8
+        return step * np.round(x / step)
+
+    assert "dead channel" not in findings_of_edited_channel(tmp_path, name, quantize)

@@ -164,6 +164,18 @@ def test_wrench_is_limited_by_the_motors_and_logged():
     assert np.abs(torque).max() == pytest.approx(0.9, rel=1e-9)
 
 
+@pytest.mark.parametrize("peak_torque", [0.002, 0.006])
+def test_torque_is_limited_to_the_peak(peak_torque):
+    shown = ConnectedLeader(leader(peak_torque=peak_torque)).step(np.zeros(6), F)
+    assert np.abs(shown[3:]).max() == pytest.approx(peak_torque, rel=1e-9)
+
+
+@pytest.mark.parametrize("peak_force", [0.2, 0.5])
+def test_force_is_limited_to_the_peak(peak_force):
+    shown = ConnectedLeader(leader(peak_force=peak_force)).step(np.zeros(6), F)
+    assert np.linalg.norm(shown[:3]) == pytest.approx(peak_force, rel=1e-9)
+
+
 def test_joints_have_end_stops():
     held = ConnectedLeader(leader(hand=(0.2, 1e-3)))
     for _ in range(800):

@@ -81,7 +81,11 @@ def test_c_header_has_the_same_layout_and_flags() -> None:
             sum(int((re.findall(r"\d+", x) or [1])[0]) for x in n.split(",")) for _, n in fields
         ]
         lengths.append(sum(sizes[kind] * n for (kind, _), n in zip(fields, counts, strict=True)))
-    assert lengths == [udp.READING_FORMAT.size, udp.WRENCH_POSE_FORMAT.size, udp.WRENCH_FORMAT.size]
+    assert lengths == [
+        udp.READING_FORMAT.size,
+        udp.WRENCH_POSE_FORMAT.size,
+        udp.COMPENSATED_WRENCH_FORMAT.size,
+    ]
     bits = {name: int(value) for name, value in re.findall(r"DT_(\w+) = (\d+)", HEADER)}
     assert bits == {str(flag.name): flag.value for flag in ReadingFlag}
 

@@ -104,6 +104,20 @@ def test_log_has_one_component_per_joint(scenario):
     assert len(SIGNALS["slave_state"].components) == 12
 
 
+def test_sliding_joints_and_devices_in_task_space_have_units_m_and_n(scenario):
+    changed = replace(scenario, master__model="omega_6", simulation__duration=0.002)
+    station = MakeTeleopStation(changed, load_estimate=true_load(changed))
+    units = simulate(station, changed.simulation, progress=False).units
+    for name, unit, force in (("joint_3", "rad", "N m"), ("joint_4", "m", "N")):
+        assert units["joint_position"][name] == units["joint_command"][name] == unit
+        assert units["joint_torque"][name] == force
+    state = units["slave_state"]
+    assert [state[k] for k in ("q_3", "q_4", "v_3", "v_4")] == ["rad", "m", "rad/s", "m/s"]
+    device = units["master_state"]
+    assert [device[k] for k in ("q_3", "q_4", "v_3", "v_4")] == ["m", "rad", "m/s", "rad/s"]
+    assert units["measured_wrench_S"]["tau_x"] == "N m"
+
+
 def test_start_pose_and_assumptions(scenario):
     slave = NominalSlave(scenario.slave)
     assert NominalSlave(scenario.slave) is slave

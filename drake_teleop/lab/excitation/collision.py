@@ -140,7 +140,7 @@ class CollisionScene:
     def find_collision_candidates_and_touching(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_ShapePair, Array], list[str]]:
-        """Return distances (T,) [m] of pairs that may collide, and names of pairs in contact.
+        """Return distances (T,) [m] by pair that may collide, and names of body pairs in contact.
 
         Excluded pairs are on one link, almost always near, at constant distance, or in contact at
         `start`.

@@ -8,6 +8,7 @@ from itertools import accumulate, chain, islice
 
 import numpy as np
 
+from drake_teleop.common import vectors
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
@@ -17,6 +18,8 @@ from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.station.slave.arm import ArmModel
+from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _AMPLITUDE_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
@@ -67,6 +70,10 @@ def excite(
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
     scaled = Criterion(criterion, robot.criterion_scales)
+    if _num_rotation_axes(robot.arm) < 2:
+        what = "the joints rotate the sensor about fewer than two axes, so no motion excites"
+        remedy = "use an arm with two, or pass a known load_estimate to MakeTeleopStation (Python)"
+        raise DrakeTeleopError(f"{what} all parameters", where=robot.name, remedy=remedy)
     with show_progress(progress) as stage:
         report = stage("Design the trajectory")
 
@@ -86,6 +93,15 @@ def excite(
         remedy = "raise this limit, or give more --time, a longer --period or another --seed"
         raise DrakeTeleopError(f"{what}; it uses {uses[0]}", where=robot.name, remedy=remedy)
     return excitation
+
+
+def _num_rotation_axes(arm: ArmModel) -> int:
+    # Axes in S: a SCARA arm has one, although it can rotate about several joints.
+    postures = np.random.default_rng(0).uniform(*joint_sampling_range(arm), (20, arm.num_joints))
+    first, *others = (tuple(arm.pose(q)[:4]) for q in postures)
+    inverse = vectors.conjugate_quaternion(first)
+    axes = [vectors.quaternion_product(inverse, other)[1:] for other in others]
+    return int(np.linalg.matrix_rank(np.array(axes), tol=1e-6))
 
 
 def assemble_excitation(

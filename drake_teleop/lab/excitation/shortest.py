@@ -197,7 +197,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """Return predicted over required deviations (k,) of `errors`, for white noise only."""
+        """Return predicted deviations (k,) of `errors`, over tolerances, for white noise only."""
         rows = self._weighted_regressor_rows(*motion)
         return np.sqrt(self._tolerance_scaled_variances(rows, period)[0])
 
@@ -234,7 +234,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
 
 def white_noise_densities_over_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
-    """Return the density matrix (6, 6) of wrench and motion noise over wrench noise alone."""
+    """Return the density (6, 6) of wrench and motion noise, relative to that of wrench noise."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)

@@ -46,10 +46,6 @@ def new_command(
 
     Returns:
         The summary of the run.
-
-    Raises:
-        DrakeTeleopError: for an unusable model, an arm that cannot point its tool down, an unknown
-            name, or an existing station.
     """
     scenario = folder / "station.yaml"
     if scenario.exists():

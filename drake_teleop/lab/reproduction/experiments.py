@@ -78,7 +78,7 @@ class RunsWithAndWithoutContact:
 
 
 def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> MotionRun:
-    """Simulate a movement and calculate the scaled wrench for each sigma."""
+    """Simulate a movement and scale its wrench, for each share in `SIGMAS` of the load's."""
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation, progress=progress)
     wrench, s, omega, alpha = sensor_samples(result)

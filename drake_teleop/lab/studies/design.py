@@ -51,7 +51,7 @@ class Factor:
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: FactorValue) -> list[float]:
-        """Return [share of the range] of a number, or 0 or 1 for each listed other value."""
+        """Return [share of the range] of a number, or an indicator 0 or 1 for each listed value."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
@@ -186,7 +186,7 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[FactorValues], first: int = 0) -> list[dict[str, Any]]:
-        """Return a row (run, point, repeat, seed, values) per run; points count from `first`."""
+        """Return a row per run: its number, point (from `first`), repeat, seed, factor values."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values

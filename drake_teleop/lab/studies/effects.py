@@ -47,9 +47,10 @@ class FactorialModel:
     has_value: BooleanArray
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags of comparable levels of `factors` and of used combinations, and weights.
+        """Return flags of comparable levels of `factors`, flags of used combinations, and weights.
 
-        Combinations are those of the other factors' levels. With two `factors` a level is a pair.
+        Comparable levels have points at all used combinations of the other factors' levels. With
+        two `factors` a level is a pair.
         The weights (comparable levels, n) map values of points to means over used combinations.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in factors]
@@ -146,7 +147,7 @@ class MainEffect:
         effect, effect_half_width: (n,) difference from the mean of all levels, and its half width.
         missing_reasons: (n,) why a value is missing, else "".
         num_used_combinations, num_unused_combinations: of the other factors' levels.
-        is_fitted: True if the values are from a regression.
+        is_fitted: True if the values are from a `LevelModel`.
     """
 
     level_names: list[str]
@@ -313,7 +314,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which points, rows of `values` to minimise, are complete and not dominated."""
+    """Return True (n,) for complete points, rows of minimised `values`, that none dominates."""
     found = complete.copy()
     other = values[complete]
     for index in np.flatnonzero(complete):

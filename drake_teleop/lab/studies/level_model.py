@@ -27,7 +27,7 @@ TOO_FEW_POINTS = "too few points"
 
 
 def largest_complete_block(has_value: BooleanArray) -> tuple[BooleanArray, BooleanArray]:
-    """Return rows and columns of the largest block without missing values.
+    """Return flags of the rows and columns of a large block without missing values.
 
     `has_value` is True where a level (row) has a value at a combination (column).
     """
@@ -49,10 +49,10 @@ def missing_value_reasons(
 
 
 CONFIDENCE_LEVEL = 0.95
-# Models: number of parts of a range, and whether products of pairs are terms. The first one that
+# Models: number of sections of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_MODEL_FORMS_BY_PREFERENCE = [(parts, True) for parts in (5, 4, 3)]
-_MODEL_FORMS_BY_PREFERENCE += [(parts, False) for parts in (5, 4, 3, 2)]
+_MODEL_FORMS_BY_PREFERENCE = [(num_sections, True) for num_sections in (5, 4, 3)]
+_MODEL_FORMS_BY_PREFERENCE += [(num_sections, False) for num_sections in (5, 4, 3, 2)]
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_LEVEL_COMBINATIONS = 50_000
 
@@ -62,7 +62,7 @@ class Levels:
     """Levels of a factor at n points.
 
     Attributes:
-        index: (n,) level of each point.
+        index: (n,) index in `names` of each point's level.
         names: labels of the levels with a point.
         within: (n,) position in the section of a range, -1/2 to 1/2; None for listed values.
         centred_columns: (n, k) centred coordinates of the points: numbers, or indicators of all
@@ -77,16 +77,16 @@ class Levels:
     middle_columns: Array
 
 
-def factor_levels(factor: Factor, column: Sequence[FactorValue], parts: int = 5) -> Levels:
-    """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
+def factor_levels(factor: Factor, column: Sequence[FactorValue], num_sections: int = 5) -> Levels:
+    """Return the levels of a factor's values (n,); a range is cut into equal sections."""
     listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
     if factor.low is not None and factor.high is not None and any(v not in listed for v in column):
         share = places[:, 0]
-        index = np.minimum((share * parts).astype(np.int64), parts - 1)
-        within = share * parts - index - 0.5
+        index = np.minimum((share * num_sections).astype(np.int64), num_sections - 1)
+        within = share * num_sections - index - 0.5
         present, index = np.unique(index, return_inverse=True)
-        middles = (present[:, None] + 0.5) / parts
+        middles = (present[:, None] + 0.5) / num_sections
         names = [f"{factor.low + m * (factor.high - factor.low):.3g}" for m in middles[:, 0]]
         return Levels(index, names, within, places - 0.5, middles - 0.5)
     present, index = np.unique([listed.index(v) for v in column], return_inverse=True)
@@ -118,7 +118,7 @@ class LevelModel:
     pseudo_inverse: Array
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags as `FactorialModel` does, and a matrix from coefficients to means."""
+        """Return flags as `FactorialModel` does, and weights of coefficients in levels' means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(factors))
         related = [*factors, *others]
         shape = [len(self.factors[factor].names) for factor in related]
@@ -146,7 +146,7 @@ class LevelModel:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
             over_points = design * self._std_over_residual_std(terms)
-            halves.append(np.hypot(over_points, self._pooled_half_width_over_seeds(table, terms)))
+            halves.append(np.hypot(over_points, self._effects_half_width_over_seeds(table, terms)))
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
@@ -189,7 +189,7 @@ class LevelModel:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
         return _student_quantile(num_intervals, self._degrees_of_freedom) * float(np.sqrt(variance))
 
-    def _pooled_half_width_over_seeds(self, table: Array, effect_rows: Array) -> float:
+    def _effects_half_width_over_seeds(self, table: Array, effect_rows: Array) -> float:
         seeds = table.shape[1]
         if seeds == 1:
             return 0.0
@@ -214,8 +214,8 @@ def fit_level_model(
     missing by chance, not by failure.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _MODEL_FORMS_BY_PREFERENCE:
-        levels = [factor_levels(f, c, parts) for f, c in zip(factors, columns, strict=True)]
+    for num_sections, products in _MODEL_FORMS_BY_PREFERENCE:
+        levels = [factor_levels(f, c, num_sections) for f, c in zip(factors, columns, strict=True)]
         model = _build_level_model(levels, products, known, by_chance)
         if model is not None:
             found = model

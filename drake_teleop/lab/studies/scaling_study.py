@@ -87,9 +87,9 @@ def scaling_study_command(
 
 
 def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
-    """Return merits, bootstrap intervals and failures for a selection of criteria.
+    """Return the rating of each sigma and gamma by these `criteria`.
 
-    `tables` [task][criterion or "success"] are arrays (s, g, seeds).
+    `tables` [task][criterion or "success"] are arrays (sigmas, gammas, seeds).
     """
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}

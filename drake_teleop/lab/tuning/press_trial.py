@@ -237,7 +237,7 @@ class StationPressTrial:
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Function that a study runs: find the largest gamma for all extremes, in one axis."""
+    """Study function: find the largest gamma that is stable and accurate at all `corners`."""
 
     base_scenario: Scenario
     operating_range: OperatingRange

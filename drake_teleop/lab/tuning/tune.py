@@ -117,7 +117,7 @@ def tune(
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of `search_settings`."""
+    """Settings chosen by `search_settings`, and the runs that it compared."""
 
     settings: TunedSettings
     #: Tried settings in one axis, with the predicted `threshold_N` and `gamma`.
@@ -213,7 +213,7 @@ def _search_max_gamma(
 def meets_requirements(
     row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
 ) -> bool:
-    """Return whether a run comes to rest, is quiet and renders the contact force accurately."""
+    """Return whether a run is at rest, quiet and within `max_force_error` of the contact force."""
     exact = press_trial.is_share_accepted(row["share"], max_force_error)
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 

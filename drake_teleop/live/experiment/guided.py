@@ -235,7 +235,7 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of a message that participants may make, or None."""
+    """Return the valid requests in a message that participants may make; None without any."""
     message = parse_message(text) or {}
     found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:

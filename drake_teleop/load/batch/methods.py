@@ -58,7 +58,7 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
-        equations: second moments of the other samples.
+        equations: second moments of the samples that are not rejected.
     """
 
     identification: Identification

@@ -123,7 +123,7 @@ def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: fl
 
 @dataclass(frozen=True, eq=False)
 class EstimatorOptions:
-    """Options of `identify_batch`."""
+    """Arguments of `identify_batch` that each estimator receives."""
 
     noise: NoiseStd
     offsets: bool = True

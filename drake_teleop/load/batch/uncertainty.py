@@ -204,8 +204,8 @@ def covariance_for_random_walks(
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `step_covariance` (6, 6) is that of the residual's step per sample; `kept` (N,) marks used
-    samples.
+    `step_covariance` (6, 6) is that of the residual's change per sample; `kept` (N,) is True for
+    used samples.
     """
     covariance = np.zeros((16, 16))
     if not step_covariance.any():

@@ -127,7 +127,7 @@ def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
     """Update the contact flag in `memory` after `update_statistics`; return True in contact.
 
     Contact begins if statistic 0, 1 or 2 (`statistic`) reaches `enter`; `leave`: CONTACT_END_LEVEL;
-    `hold`: as for `ContactDetector`; `widths`: `NoiseFloor.sum_widths`.
+    `hold`: see `ContactDetector`; `widths`: `NoiseFloor.sum_widths`.
     """
     if memory[CONTACT_INDEX] == 0.0:
         if memory[STATISTICS_START + statistic] >= enter:

@@ -110,7 +110,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate_by_block_mean(estimate, V, wrench, root):
-    """Update [theta (16); covariance (256)] by a block's mean, Eq. (T6); return its chi-squared."""
+    """Update [theta (16); P (256)] by a mean wrench, whitened by `root`; return chi-squared."""
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
     for c in range(6):
@@ -140,28 +140,28 @@ def update_estimate_by_block_mean(estimate, V, wrench, root):
 
 
 @njit(cache=True)
-def _update_load_filter_by_block(memory, filter_start, block, noise):
-    phi = memory[filter_start + 6 : filter_start + 16].copy()
+def _update_load_filter_by_block(memory, filter_index, samples_per_block, noise):
+    phi = memory[filter_index + 6 : filter_index + 16].copy()
     wrench = memory[_WRENCH_SUM_START:_MOTION_SUM_START]
     motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
     V = memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START].reshape(6, 10)
-    before = memory[filter_start : filter_start + 272].copy()
-    root = whitening_matrix(motion, phi, noise, noise[15], block)
+    before = memory[filter_index : filter_index + 272].copy()
+    root = whitening_matrix(motion, phi, noise, noise[15], samples_per_block)
     chi = update_estimate_by_block_mean(before, V, wrench, root)
     if noise[15] == 0.0:
-        copy_into(memory, filter_start, before, 0, 272)
+        copy_into(memory, filter_index, before, 0, 272)
     else:
-        root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
-        update_estimate_by_block_mean(memory[filter_start : filter_start + 272], V, wrench, root)
+        root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], samples_per_block)
+        update_estimate_by_block_mean(memory[filter_index : filter_index + 272], V, wrench, root)
     return chi
 
 
 @njit(cache=True)
-def _restart_filter_from_known_load(memory, filter_start):
-    copy_into(memory, filter_start, memory, _KNOWN_LOAD_START, 272)
-    if filter_start == _NEW_FILTER_START:
+def _restart_filter_from_known_load(memory, filter_index):
+    copy_into(memory, filter_index, memory, _KNOWN_LOAD_START, 272)
+    if filter_index == _NEW_FILTER_START:
         for j in range(10):
-            memory[filter_start + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
+            memory[filter_index + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
         memory[_NEW_LOAD_START_INDEX] = memory[_SAMPLE_COUNT_INDEX]
         memory[_NEW_RESIDUAL_SQUARES_START:_WRENCH_SUM_START] = memory[_ALPHA_SQUARES_INDEX] = 0.0
     memory[_CUSUM_INDEX] = memory[_ESTIMATE_AGE_INDEX] = 0.0
@@ -178,9 +178,9 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 
 @njit(cache=True)
-def _add_alpha_noise_to_inertia_variances(memory, noise, block):
+def _add_alpha_noise_to_inertia_variances(memory, noise, samples_per_block):
     theta, P = memory[NEW_LOAD_SLICE], memory[_NEW_LOAD_COVARIANCE_SLICE].reshape(16, 16)
-    expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
+    expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / samples_per_block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
     scale = abs(theta[10]) + abs(theta[13]) + abs(theta[15]) + 2.0 * moment / abs(theta[6])
@@ -190,7 +190,7 @@ def _add_alpha_noise_to_inertia_variances(memory, noise, block):
 
 @njit(cache=True)
 def update_change_detector(memory, sample, block, noise, window, hold, mass_std_ratio):
-    """Update `memory` by a sample (15,); `block` and on: `change_detector_parameters`."""
+    """Update `memory` by a sample (15,); `block` and later: `change_detector_parameters`."""
     V = np.empty((6, 10))
     motion = sample[regressor.SAMPLE_MOTION]
     regressor.regressor_into(motion[:3], motion[3:6], motion[6:], V)
@@ -277,7 +277,7 @@ def change_detector_parameters(
     relative_wrench_error: float = 0.0,
     mass_std_ratio: float | None = None,
 ) -> DetectorParameters:
-    """Return block [samples], noise (17,), window and hold [blocks], mass_std_ratio.
+    """Return block length [samples], noise (17,), window and hold [blocks], mass_std_ratio.
 
     `noise`: variances of wrench, motion and relative wrench error, duration of that error [blocks].
 

@@ -115,7 +115,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y to G[:, first:]; Z sums y z^T, X and Y are [E V] of y and z."""
+    """Write the sum of [E V](y)^T W [E V](z) to G[:, first:]; Z (19, 19) is the sum of y z^T."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
@@ -136,7 +136,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right_side(LZ, W, index, factors, g):
-    """Write the sum of X^T W r (16,) to g; LZ sums r z^T, X is [E V] of z, r the residual."""
+    """Write the sum of [E V](z)^T W F over samples to g (16,); LZ (6, 19) is the sum of F z^T."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -204,7 +204,7 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated_parameters(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 where G - `strength` N stays positive definite, otherwise to 0."""
+    """Set `taper` (16,) to 1 for parameters whose noise part N of G is subtractable, else to 0."""
     taper[:] = 1.0
     for i in range(16):
         for j in range(16):

@@ -97,7 +97,7 @@ def _is_com_of_load_change_near_sensor(known, new):
 def monitor_load(out, memory, sample, fallback, period, block, noise, window, hold, mass_std_ratio):
     """Process one sample (15,): ramp `out` (16,), [offsets; phi], to the load to remove.
 
-    `fallback` (10,) is the phi for a changed load; `block` and on: `change_detector_parameters`.
+    `fallback` (10,) is the phi for a changed load; `block` and later: `change_detector_parameters`.
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)

@@ -224,7 +224,7 @@ def find_contact_spans(state: FittedModel) -> TimeSpans:
 
 
 def replace_contacts_by_steps(state: FittedModel) -> FittedModel | None:
-    """Return a fit with changes of load and offsets instead of contacts; None if it fits badly."""
+    """Return a fit with step changes in place of contacts; None without any, or for a poor fit."""
     blocks = _NormalEquationsOfBlocks(state)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_NUM_LOADS):
@@ -274,7 +274,7 @@ class _NormalEquationsOfBlocks:
         self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return flags of blocks `among` with a residual as in contact; None for too few blocks."""
+        """Return True for blocks `among` with residuals above noise and motion errors, or None."""
         found = self._fit_calmest_blocks(np.flatnonzero(among))
         if found is None:
             return None
@@ -303,7 +303,7 @@ class _NormalEquationsOfBlocks:
             ends = np.r_[blocks[:length], blocks[-length:]]
             level, move, last = self._trimmed_fit_of_blocks(blocks, ends, 0.0)
             calm = float(np.median(level[last]))
-            if self._do_other_blocks_fit_badly(level, last, np.setdiff1d(blocks, last), calm):
+            if self._is_residual_large_elsewhere(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
         limit = max(_CONTACT_RMS_OVER_NOISE**2, (_CONTACT_RMS_OVER_CALM**2) * usual)
@@ -311,7 +311,7 @@ class _NormalEquationsOfBlocks:
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
 
-    def _do_other_blocks_fit_badly(
+    def _is_residual_large_elsewhere(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))

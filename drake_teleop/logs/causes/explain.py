@@ -257,8 +257,8 @@ class MisfitExplanation:
         return not self.explained and bool(np.isinf(self.state.data.acceleration_noise))
 
     @property
-    def has_several_gains(self) -> bool:
-        """True if the found gain errors only approximate a full gain matrix."""
+    def needs_full_gain_matrix(self) -> bool:
+        """True for several gain errors, or one with rotation or cable, as of a full gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.extensions)
         return len(model.gain_channels) > 1 or bool(model.gain_channels and others)

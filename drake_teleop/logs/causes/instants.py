@@ -102,7 +102,7 @@ class BlockMeans:
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
-        """Return block sums of products of y (M, W) with earlier rows: (blocks, lags, W, W)."""
+        """Return (blocks, lags, W, W): sums of rows y_i y_(i-d)^T, plus transpose if lag d > 0."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))

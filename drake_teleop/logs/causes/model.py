@@ -21,7 +21,7 @@ from drake_teleop.logs.causes.instants import (
 )
 
 OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter vector
-_NUM_EXTENSION_PARAMETERS = {
+_NUM_PARAMETERS_OF_EXTENSION = {
     "gravity": 3, "weight": 4, "torque factor": 1, "frame": 3, "rotation": 3,
     "linear drift": 6, "drift": 18, "cable": 12,
     "clock rate of poses": 1, "clock rate of orientations": 1, "clock rate of gyroscope": 1,
@@ -75,7 +75,7 @@ class LoadModel:
     def parameter_slices(self) -> dict[str, slice]:
         """Slices of the parameter vector for each extension, "gain c" (channel c) and "step i"."""
         out, at = {}, DELAY_INDEX + 1
-        sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
+        sizes = [(name, _NUM_PARAMETERS_OF_EXTENSION[name]) for name in self.extensions]
         sizes += [(f"gain {c}", 1) for c in self.gain_channels]
         steps = enumerate(self.steps)
         sizes += [(f"step {i}", 6 if step.kind == "offsets" else 10) for i, step in steps]
@@ -122,7 +122,7 @@ class LoadModel:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return the model's wrench for x (B, size), as coefficients (B, 6, W) of W signals."""
+        """Return coefficients (B, 6, W) for x (B, size), which times W signals are the wrench."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, _step_change_columns(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _wrench_coefficients_of_load(x[:, 6:16]) @ motion
@@ -182,7 +182,7 @@ class LoadModel:
         return M
 
     def wrench_derivative(self, x: Array) -> Array:
-        """Return derivatives (size, 6, k) by x of the wrench's coefficients of k used signals."""
+        """Return derivatives (size, 6, k) by x of `wrench_coefficients` of the k used signals."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
             steps[self.parameter_slices["rotation"]] = _FINITE_DIFFERENCE_ROTATION_RAD
@@ -192,7 +192,7 @@ class LoadModel:
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual_coefficients(self, x: Array) -> Array:
-        """Return measured minus model wrench for x (size,): coefficients (6, k) of used signals."""
+        """Return coefficients (6, k) that times k used signals are measured minus model wrench."""
         out = -self.wrench_coefficients(x[None])[0]
         out[np.arange(6), instants.WRENCH_SIGNALS.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])

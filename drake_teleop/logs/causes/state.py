@@ -34,7 +34,7 @@ class UsedRows:
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of products of W used signals at lags of 0 to 4 rows."""
+        """Sums (5, W, W) of y_i y_(i-d)^T, plus transpose if d > 0, for lags d of 0 to 4 rows."""
         return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
@@ -103,7 +103,7 @@ class FittedModel:
 
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
-        residual: (6, k) residual wrench as coefficients of the signals `rows.y`.
+        residual: (6, k) coefficients, which times a row of `rows.y` are the residual wrench.
         noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
         noise_power: (6,) variance of the whitened residual.
         contact_spans: (start, stop) of contacts, whose rows are not used [s].

@@ -61,12 +61,12 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        """True if the fitted load has a positive mass and explains the wrench."""
+        """True if the mass is positive and `unexplained` below `GOOD_UNEXPLAINED` plus noise."""
         limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
         return self.mass > 0 and self.unexplained < limit
 
     def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
-        """Return the largest accepted `unexplained`: the noise share plus `share_beside_noise`."""
+        """Return the limit of `unexplained`: noise share plus `share_beside_noise`, but bounded."""
         return min(share_beside_noise + self.noise_share, MIN_UNDETERMINED_UNEXPLAINED)
 
 
@@ -219,7 +219,6 @@ def _edits_with_far_better_fit(
     given: LoadFitQuality,
     tried: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
-    """Return (fit, finding, description) of edits with a far better fit and a positive mass."""
     positive, negative = [], []
     for finding, edited in tried:
         fit = edits.call_or_none_if_unreadable(fit_description, edited)

@@ -62,7 +62,7 @@ def findings_if_load_is_suspicious(
     delay: float | None,
     check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
-    """Return findings, except "lag", on the description of a log whose load is suspicious.
+    """Return findings, except "lag", unless mass, fit, delay and gravity are plausible.
 
     `predicted` (N, 6) is the wrench by the load. `check` compares the description with the data.
     Raise DrakeTeleopError if the load is useless and a remedy is known.
@@ -212,7 +212,7 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
 
 _WRENCH_FIELDS = ("force", "torque")
 _IMU_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration")
-_MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
+_MIN_LIVE_CHANNEL_NOISE_OVER_LOG_RANGE = 1e-6
 
 
 def _dead_or_repeated_channel_findings(
@@ -262,6 +262,6 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
 def _dead_channels(numbers: dict[str, Array]) -> list[str]:
     x = np.stack(list(numbers.values()), axis=1)
     spread, noise = np.ptp(x, axis=0), white_noise_deviations(x)
-    if not (noise > _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE * spread).any():
+    if not (noise > _MIN_LIVE_CHANNEL_NOISE_OVER_LOG_RANGE * spread).any():
         return []
     return [name for name, width in zip(numbers, spread, strict=True) if width == 0.0]

@@ -204,7 +204,7 @@ def _find_numbered_or_array_vectors(table: Table, plain: _NamesAndUnits) -> _Col
 def _other_wrench_findings(
     table: Table, plain: _NamesAndUnits, found: _Columns
 ) -> Iterator[Finding]:
-    """Yield a finding for each complete wrench of a table beside the one in `found`."""
+    """Yield a finding for each pair of force and torque in the table besides that in `found`."""
     pair = "force", "torque"
     used = {x for names in found.values() for x in names}
     taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
@@ -261,7 +261,7 @@ def _find_vectors(plain: _NamesAndUnits) -> _Columns:
 
 
 def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
-    """Return the columns of each vector of a `kind`, by its name; only complete vectors, if any."""
+    """Return columns by vector of a `kind`; incomplete vectors only if none is complete."""
     axes = "wxyz" if kind == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
     groups: dict[str, dict[str, str]] = {}

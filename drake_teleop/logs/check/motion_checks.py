@@ -38,7 +38,7 @@ from drake_teleop.logs.read.mounting import (
 
 SPEED_RATIO_RANGE_OF_DEGREES = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
-MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02  # calibrated sensors are within 1 %
+MIN_REPORTED_RELATIVE_GRAVITY_ERROR = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION, _ALPHA_COMPARISON_CUTOFF_HZ = 5.0, 5.0
 _MIN_ALPHA_CORRELATION, _MAX_UNSWAPPED_OVER_BEST_CORRELATION = 0.8, 0.5
 _GRAVITY_WINDOW_RANGE_S, _MIN_GRAVITY_WINDOWS, _MAX_GRAVITY_WINDOWS = (2.0, 8.0), 6, 60
@@ -169,7 +169,7 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
     ratio, deviation = np.mean(ratios), np.std(ratios, ddof=1) / np.sqrt(len(ratios))
     off = abs(ratio - 1.0)
     if not 0.7 < ratio < 1.4 or off < max(
-        MIN_REPORTED_GRAVITY_ERROR_SHARE + 3.0 * deviation,
+        MIN_REPORTED_RELATIVE_GRAVITY_ERROR + 3.0 * deviation,
         _MIN_GRAVITY_ERROR_OVER_DEVIATION * deviation,
     ):
         return None

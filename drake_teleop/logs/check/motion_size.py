@@ -62,7 +62,7 @@ def too_little_motion(log: Log) -> str | None:
 
 @lru_cache(maxsize=1)  # edits of the wrench keep the poses, whose identity is the key
 def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
-    """Return `motion_rms` by covariance of even and odd poses, in which noise cancels, or None."""
+    """Return `motion_rms` by covariance of even and odd poses, without noise; None: few poses."""
     poses = posed.poses.with_continuous_quaternions()
     count = max(1, int(0.5 * _BLOCK_S * poses.rate))
     rows = len(poses.t) // (2 * count) * 2 * count

@@ -294,9 +294,9 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     deviation = np.minimum(by_spread, _STD_CAP_OVER_FRAME_DIFFERENCE_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
-    def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:
-        centre = ln_half_width_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
-        return (np.abs(part - centre) <= _MAX_INLIER_DEVIATIONS * deviation).all(axis=1), centre
+    def inliers_and_centre(frames: Array) -> tuple[NDArray[np.bool_], Array]:
+        centre = ln_half_width_and_centre_of_calm_half(frames, np.full(6, 1e-300))[1]
+        return (np.abs(frames - centre) <= _MAX_INLIER_DEVIATIONS * deviation).all(axis=1), centre
 
     whole = inliers_and_centre(residual)[0].sum()
     best: tuple[int, int, Array, Array] | None = None

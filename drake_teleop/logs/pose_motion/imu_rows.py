@@ -39,21 +39,21 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     powers = position_std**2 / splines.rate, rotation_std**2 / splines.rate
     averaged = imu.average_to_rate(_COMPARED_IMU_RATE_HZ)
     sensors = {
-        which: _fit_sensor_model(splines, averaged.t, y, gravity_W, which, powers[which])
-        for which, y in enumerate((averaged.specific_force, averaged.angular_velocity))
+        index: _fit_sensor_model(splines, averaged.t, y, gravity_W, index, powers[index])
+        for index, y in enumerate((averaged.specific_force, averaged.angular_velocity))
         if y is not None
     }
-    found = {which: sensor for which, sensor in sensors.items() if sensor is not None}
+    found = {index: sensor for index, sensor in sensors.items() if sensor is not None}
     if not found or len(found) < len(sensors):
         return None
     rows = imu.average_to_rate(_ADDED_IMU_ROWS_RATE_HZ)
     t = rows.t + found[max(found)].time_shift_s  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
-        found[which].correct_bias_and_gain(y[inside]) if which in found and y is not None else None
-        for which, y in enumerate((rows.specific_force, rows.angular_velocity))
+        found[index].correct_bias_and_gain(y[inside]) if index in found and y is not None else None
+        for index, y in enumerate((rows.specific_force, rows.angular_velocity))
     )
-    own = tuple(found[which].noise_power if which in found else 0.0 for which in range(2))
+    own = tuple(found[index].noise_power if index in found else 0.0 for index in range(2))
     imu_rows = ImuSplineRows(t[inside], rows.rate, powers, (own[0], own[1]))
     imu_rows = imu_rows.with_data_in_sensor_axes(splines, gravity_W, s, omega)
     both = PoseSplines(splines.poses, splines.spacing, imu_rows)
@@ -65,7 +65,7 @@ def _fit_sensor_model(
     t: Array,
     y: Array,
     gravity_W: Array,
-    which: int,
+    sensor_index: int,
     pose_noise_power: float,
 ) -> _ImuSensorModel | None:
     """Fit a model of accelerometer (0) or gyroscope (1) data y (K, 3); None for a poor fit."""
@@ -82,7 +82,7 @@ def _fit_sensor_model(
     frequency = np.fft.rfftfreq(len(even), dt)
     used = frequency <= _COMPARED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
     omega: NDArray[np.floating] = 2.0 * np.pi * frequency[used]
-    noise = pose_noise_power * omega ** (4 - 2 * which)
+    noise = pose_noise_power * omega ** (4 - 2 * sensor_index)
     energy = float(np.sum(taper**2)) / dt
 
     def tapered_spectrum(x: Array) -> ComplexArray:
@@ -91,16 +91,16 @@ def _fit_sensor_model(
     # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
     least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
     Y = tapered_spectrum(values)
-    one = tapered_spectrum(np.ones((len(even), 1)))
+    ones = tapered_spectrum(np.ones((len(even), 1)))
     tau, power = 0.0, least
     for step in range(_SENSOR_FIT_STEPS):
-        x = splines.motion(even + tau, gravity_W)[which]
+        x = splines.motion(even + tau, gravity_W)[sensor_index]
         X, change = tapered_spectrum(x), tapered_spectrum(np.gradient(x, dt, axis=0))
         if step == 0:
             power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
         weight = 1.0 / np.sqrt(energy * (noise + power))
-        D, b, shift = _fit_imu_gain_errors_bias_and_shift(Y - X, X, one, change, weight)
-        residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
+        D, b, shift = _fit_imu_gain_errors_bias_and_shift(Y - X, X, ones, change, weight)
+        residual: Array = np.abs(Y - X - X @ D.T - ones * b - shift * change) ** 2
         power = _estimate_imu_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
         tau += shift
         if abs(tau) > _MAX_IMU_SHIFT_S:
@@ -112,13 +112,13 @@ def _fit_sensor_model(
 
 
 def _fit_imu_gain_errors_bias_and_shift(
-    y: ComplexArray, X: ComplexArray, one: ComplexArray, X_rate: ComplexArray, weight: Array
+    y: ComplexArray, X: ComplexArray, ones: ComplexArray, X_rate: ComplexArray, weight: Array
 ) -> tuple[Array, Array, float]:
     K = len(y)
     columns = np.zeros((K, 3, 13), complex)
     for i in range(3):
         columns[:, i, 3 * i : 3 * i + 3] = X
-        columns[:, i, 9 + i] = one[:, 0]
+        columns[:, i, 9 + i] = ones[:, 0]
     columns[:, :, 12] = X_rate
     A = (columns * weight[:, None, None]).reshape(3 * K, 13)
     right = (y * weight[:, None]).ravel()

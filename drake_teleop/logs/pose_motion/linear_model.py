@@ -48,7 +48,7 @@ class LinearFit:
     """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16); 0 for signals that are 0.
+        coefficients: (6, 16), which times the signals are the wrench; 0 for signals that are 0.
         covariance: (6, 16, 16) of the rows of coefficients.
         noise_power: (bands, 6) mean noise power.
         channel_costs: (6,) negative log likelihood of each channel.
@@ -353,22 +353,24 @@ def _spectrum_to_time_signal(spectrum: spectral.ComplexArray, grid: WrenchGrid) 
     return np.asarray(np.fft.irfft(full, grid.transform_length, axis=0)[: len(grid.t)])
 
 
-def _max_residuals_over_std(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
+def _max_residuals_over_std(x: Array, y: Array, weights: Array, used: NDArray[np.bool_]) -> Array:
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
-    scale = _NORMAL_STD_OVER_MEDIAN_DEVIATION * np.median(residual[inside], axis=0)
+    scale = _NORMAL_STD_OVER_MEDIAN_DEVIATION * np.median(residual[used], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     scale = np.maximum(scale, MIN_NOISE_STD_OVER_WRENCH_RMS * rms + 1e-30)
     return np.asarray((residual / scale).max(axis=1))
 
 
-def _std_growth_by_rejection(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
-    if kept.sum() < 2 * x.shape[1]:
+def _std_growth_by_rejection(
+    x: Array, used_rows: NDArray[np.bool_], kept_rows: NDArray[np.bool_]
+) -> float:
+    if kept_rows.sum() < 2 * x.shape[1]:
         return np.inf
-    whole, left = (x[rows].T @ x[rows] for rows in (inside, kept))
+    whole, left = (x[rows].T @ x[rows] for rows in (used_rows, kept_rows))
     # pinv returns zeros for motions that no kept sample contains, hence the share of the whole.
     grams = np.array([whole, left + 1e-6 * whole])
     inverses = np.linalg.pinv(grams, rcond=1e-12, hermitian=True)
     every, some = np.diagonal(inverses, axis1=1, axis2=2)
-    return float(np.sqrt(np.max(some / every) * kept.sum() / inside.sum()))
+    return float(np.sqrt(np.max(some / every) * kept_rows.sum() / used_rows.sum()))

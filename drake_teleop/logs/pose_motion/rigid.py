@@ -32,7 +32,7 @@ _OMEGA_PRODUCT_AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, eq=False)
 class RigidParameters:
-    """Parameters [offsets; phi] (16,), delay tau [s], r = p_PoSo_P [m] and R_PS, Eq. (T79)."""
+    """Parameters [offsets; phi] (16,), delay tau [s], r = p_PoSo_P (Po to So) [m], R_PS; (T79)."""
 
     theta: Array
     delay_s: float
@@ -77,7 +77,7 @@ class RigidFit:
 
 
 def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
-    """Return M (19, 22), (T79): [`PoseSplines.signals`; wrench] to [1; wrench; motion of S]."""
+    """Return M (19, 22), (T79): M [`PoseSplines.signals`; wrench] = [1; wrench; motion of S]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
@@ -91,7 +91,10 @@ def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
 
 
 def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None) -> Array:
-    """Return coefficients (6, 16) of load phi (10,), Eq. (T73), without a weight [m, m c] (4,)."""
+    """Return C (6, 16), Eq. (T73): C times the 16 motion signals is the wrench of load phi (10,).
+
+    It excludes the force of gravity on `removed_weight` [m, m c] (4,).
+    """
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
     def wrench_coefficients(phi: Array) -> Array:
@@ -185,7 +188,7 @@ def _solve_rigid_fit(
 
 
 def _parameter_covariance(
-    record: _RigidFitData, solution: _RigidSolution, inflation: float, gain_std: float
+    record: _RigidFitData, solution: _RigidSolution, inflation: float, wrench_gain_std: float
 ) -> Array:
     inverse, undetermined = solution.inverse_gram, solution.is_undetermined
     W, none = solution.residual_weights, np.zeros((6, NUM_MOMENT_SIGNALS))
@@ -194,9 +197,9 @@ def _parameter_covariance(
     covariance = 0.5 * inverse @ middle @ inverse
     covariance *= np.outer(*2 * [_std_inflation_by_estimated_weights(record, solution)])
     larger = covariance * inflation**2
-    if gain_std:
+    if wrench_gain_std:
         clean = record.moments - record.noise_moments
-        effects = gain_std * _parameter_errors_by_unit_gain_errors(solution, clean)
+        effects = wrench_gain_std * _parameter_errors_by_unit_gain_errors(solution, clean)
         covariance = covariance + effects @ effects.T
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
@@ -227,7 +230,7 @@ def _residual_wrench_coefficients(state: RigidParameters) -> Array:
 
 
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38) and e (6, 38), coefficients of the residual wrench."""
+    """Return B = -de/dx (6, 23, 38), e (6, 38); e times 38 signals is the residual wrench."""
     L, M = _residual_wrench_coefficients(state), _delayed_motion_transformation(state)
     step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
@@ -331,7 +334,7 @@ class UnitsAndAxes:
     Attributes:
         position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
         position_unit_ratio_std: its standard deviation; inf if undetermined.
-        max_mass_std_kg: largest standard deviation of M_g (3, 3), force over minus gravity.
+        max_mass_std_kg: largest standard deviation of M_g (3, 3), with force M_g (-gravity).
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         axis_masses_kg: (3,) singular values of M_g [kg].
     """
@@ -344,7 +347,7 @@ class UnitsAndAxes:
 
     @property
     def is_usable(self) -> bool:
-        """Whether M_g, force over minus gravity, is known to 5 % of the mean mass."""
+        """Whether the standard deviations of M_g are below 5 % of the mean mass."""
         return bool(self.max_mass_std_kg < 0.05 * self.axis_masses_kg.mean())
 
     @property

@@ -133,7 +133,7 @@ class PoseSplines:
         for part in (slice(0, 3), slice(3, 7)):
 
             def penalized(log_frequency: float, part: slice = part) -> tuple[Array, float, float]:
-                """Return normal matrix, noise variance, -2 log likelihood for a cut-off."""
+                """Return normal matrix, noise variance, -2 log likelihood; `part`: pose columns."""
                 weight = self.rate / (2 * np.pi * np.exp(log_frequency)) ** (2 * SPLINE_DEGREE)
                 band = gram + weight * penalty
                 factor = cholesky_banded(band)
@@ -284,12 +284,12 @@ def _split_rows_into_blocks(num_rows: int) -> list[slice]:
 
 
 def _spline_normal_equations(
-    parts: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
+    samples: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
 ) -> tuple[Array, Array]:
     """Return the normal equations of a spline: band (degree + 1, n) and right side (n, width)."""
     size, order = len(knots) - degree - 1, degree + 1
     band, right = np.zeros((order, size)), np.zeros((size, width))
-    for t, x in parts:
+    for t, x in samples:
         A = BSpline.design_matrix(t, knots, degree)
         basis, first = A.data.reshape(-1, order), A.indices[::order]
         starts = np.flatnonzero(np.diff(first, prepend=-1))  # first row after each knot

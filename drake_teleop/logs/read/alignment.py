@@ -124,7 +124,7 @@ def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
 
 
 def polynomial_fit_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
-    """Return weights (6, w) from w <= n samples to coefficients of their fitted polynomial."""
+    """Return weights (6, w), which times w <= n samples are coefficients of a fitted polynomial."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
     half = max(_MIN_SMOOTHER_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)

@@ -149,8 +149,8 @@ def _add_mat_variable(
             _add_mat_variable(*part, byte_order, f"{name}.{label}", depth + 1, found)
 
 
-def _parse_mat_numbers(part: tuple[int, memoryview], byte_order: str) -> NDArray:
-    kind, content = part
+def _parse_mat_numbers(element: tuple[int, memoryview], byte_order: str) -> NDArray:
+    kind, content = element
     if kind not in _DTYPE_OF_MAT_TYPE:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
     dtype = _DTYPE_OF_MAT_TYPE[kind]

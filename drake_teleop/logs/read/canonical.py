@@ -147,7 +147,6 @@ class Log:
 
 
 def write_log(log: Log, path: str | Path) -> None:
-    """Write a log as a canonical table."""
     import polars as pl
 
     path = Path(path)

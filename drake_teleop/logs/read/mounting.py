@@ -294,7 +294,7 @@ class Mounting:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the fit is valid and gives R_SI to 1 deg about every axis."""
+        """Whether `fits_pose` is True and R_SI known to 1 deg about every axis."""
         return self.fits_pose and bool((self.deviations_deg < MAX_ROTATION_DEVIATION_DEG).all())
 
 

@@ -2,9 +2,7 @@
 
 Nested columns become several: `name.field` for the fields of a structure, and `name[k]` for the
 elements of a list or array of constant length, besides the whole as `name`. Separator, decimal
-sign, header and encoding (UTF-8, UTF-16, else Windows-1252) of text are detected. Lines with `#`
-and other text before the header are comments, except column names directly before the numbers.
-A row of units below the header completes the column names.
+sign, header and encoding (UTF-8, UTF-16, else Windows-1252) of text are detected.
 """
 
 from __future__ import annotations
@@ -228,13 +226,13 @@ def _find_separator(line: str) -> str:
     return " " if "," not in bare and " " in bare else ","
 
 
-def _header_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+def _header_in_comment(comments: list[str], rows: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
-    if not marked or not all(_is_decimal_number(cell) for cell in rest[0].split(separator)):
+    if not marked or not all(_is_decimal_number(cell) for cell in rows[0].split(separator)):
         return None
     cells = None if separator == " " else separator
     names = [name.strip() for name in marked[-1].lstrip("# ").split(cells)]
-    matching = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
+    matching = len(names) == len(rows[0].split(separator)) and len(set(names)) == len(names)
     return names if matching else None
 
 

@@ -148,8 +148,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][safe_state.SILENCE_TIME]
-    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][safe_state.SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][safe_state.SILENCE_TIME_INDEX]
+    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][safe_state.SILENCE_TIME_INDEX]
 
 
 @njit(cache=True)

@@ -69,7 +69,7 @@ def FindContactPairs(
     slip_speed: float,
     row_bodies: Sequence[int] = (),
 ) -> ShapePairs:
-    """Return the pairs of a shape of the tool and one of the environment, unless filtered.
+    """Return the pairs of tool and environment shapes that no collision filter excludes.
 
     Args:
         tool: for each shape of the tool, the pose X_SBody of the shape's body.

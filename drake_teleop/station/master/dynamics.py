@@ -107,6 +107,11 @@ class HapticDevice:
         return q
 
     @property
+    def sliding_joints(self) -> tuple[int, ...]:
+        """Indices of the positions in m."""
+        return () if self.is_phantom else (0, 1, 2)
+
+    @property
     def is_phantom(self) -> bool:
         return not self.parameters.in_task_space
 

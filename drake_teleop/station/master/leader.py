@@ -193,6 +193,10 @@ class LeaderDevice:
         return self.arm.num_joints
 
     @property
+    def sliding_joints(self) -> tuple[int, ...]:
+        return self.arm.sliding_joints
+
+    @property
     def hand_weight(self) -> float:
         """Weight of the hand [N]."""
         gravity = np.linalg.norm(self.arm.table[-1, serial_arm.LAST_ROW_GRAVITY_COLUMN :][:3])
@@ -200,7 +204,7 @@ class LeaderDevice:
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the arm without and with the hand's mass, and `joint_table`."""
+        """Tables of the leader arm, without and with the mass of the user's hand; `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:

@@ -28,7 +28,7 @@ _FORCE_MODEL_SIZE = 6
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
 _MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_START = 12, 13, 14
 _COVARIANCE_START = _FORCE_MODEL_START + _FORCE_MODEL_SIZE
-MEMORY_SIZE = _COVARIANCE_START + _FORCE_MODEL_SIZE**2
+PERCEPTION_MEMORY_SIZE = _COVARIANCE_START + _FORCE_MODEL_SIZE**2
 """Size of the memory of `update_perception_into`."""
 
 EXCESS_FORCE_START, DETECTION_THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
@@ -60,7 +60,7 @@ class Perception:
 
 
 def initial_memory() -> Array:
-    memory = np.zeros(MEMORY_SIZE)
+    memory = np.zeros(PERCEPTION_MEMORY_SIZE)
     memory[_COVARIANCE_START:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
     return memory
 
@@ -70,7 +70,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     """Update the operator's force perception by one step of `dt` [s].
 
     Args:
-        memory: (MEMORY_SIZE,) from `initial_memory`, updated.
+        memory: (PERCEPTION_MEMORY_SIZE,) from `initial_memory`, updated.
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
         hand_force, velocity: (3,) force of the hand on the stylus [N], stylus velocity [m/s].
         attentive: if false, detect no contact and only adapt the expected force.

@@ -19,7 +19,7 @@ from drake_teleop.station.passivity.packet import dot_of_group, length_of_group,
 _HAND_VELOCITY_FILTER_S = 4e-3
 _PREDICTED_CONTACT_STIFFNESS_FACTOR = 1.1
 _MAX_WALL_STIFFNESS, _MIN_WALL_STIFFNESS = 2500.0, 50.0  # N/m
-_HAND_POSE_LEAD_PERIODS = 2.0
+_EXTRAPOLATED_HAND_PERIODS = 2.0
 _CONTACT_ONSET_HAND_OFFSET_FADE_S = 0.3
 _FRICTION_COEFFICIENT_DECAY_S = 1.0
 _MIN_FRICTION_RELAXATION_S, _FRICTION_SLIP_SPEED = 0.1, 1e-3
@@ -247,7 +247,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         offset[i] *= fade
         offset_to_slave[i] -= offset[i]
     hand_speed = work_along(normal, memory[shared.FILTERED_OWN_VELOCITY])
-    penetration = work_along(normal, offset_to_slave) + _HAND_POSE_LEAD_PERIODS * T * hand_speed
+    penetration = work_along(normal, offset_to_slave) + _EXTRAPOLATED_HAND_PERIODS * T * hand_speed
     force = size
     if size > 0.0:
         change = k * penetration + damper * (hand_speed - speed)

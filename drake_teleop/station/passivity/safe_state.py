@@ -22,12 +22,12 @@ _HAND_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
 _layout = slots.SlotAllocator(MASTER_MONITOR_SIZE)
-SILENCE_TIME = _layout.number()  #: time without packets [s], also at the slave
+SILENCE_TIME_INDEX = _layout.number()  #: time without packets [s], also at the slave
 _PRESENT_HAND_WRENCH_LIMITS = _layout.vector(2)  # present limits
 _WRENCH_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
 _CONNECTED_TIME = _layout.number()  # time since the last silence
 # Monitor state of the slave.
-_layout = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME + 1)
+_layout = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME_INDEX + 1)
 _TIME_SINCE_STOP_BEGAN = _layout.number()  # time since it began to stop
 _TIME_SINCE_RESUME_BEGAN = _layout.number()  # time since it began to resume
 _COMMAND_POSE_AT_STOP = _layout.vector(7)  # command when it began to stop
@@ -43,7 +43,7 @@ def initial_master_monitor(device_limits: Array | None = None) -> Array:
     """
     state = np.zeros(MASTER_MONITOR_SIZE)
     if device_limits is None:
-        state[SILENCE_TIME] = np.inf
+        state[SILENCE_TIME_INDEX] = np.inf
     else:
         state[_PRESENT_HAND_WRENCH_LIMITS] = device_limits
         state[_CONNECTED_TIME] = RESUME_TIME_S
@@ -53,7 +53,7 @@ def initial_master_monitor(device_limits: Array | None = None) -> Array:
 def initial_slave_monitor(pose: Array) -> Array:
     """Return the silence monitor's state (SLAVE_MONITOR_SIZE,) of a slave at rest at `pose`."""
     state = np.zeros(SLAVE_MONITOR_SIZE)
-    state[SILENCE_TIME] = np.inf
+    state[SILENCE_TIME_INDEX] = np.inf
     state[_COMMAND_POSE_AT_STOP] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
     return state
 
@@ -61,9 +61,9 @@ def initial_slave_monitor(pose: Array) -> Array:
 @njit(cache=True)
 def _update_silence_time(healthy, fault, T, state):
     if fault:
-        state[SILENCE_TIME] = np.inf
+        state[SILENCE_TIME_INDEX] = np.inf
     else:
-        state[SILENCE_TIME] = 0.0 if healthy else state[SILENCE_TIME] + T
+        state[SILENCE_TIME_INDEX] = 0.0 if healthy else state[SILENCE_TIME_INDEX] + T
 
 
 @njit(cache=True)
@@ -74,7 +74,7 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
     longest time without packets. `displayed` (6,): last displayed wrench. `state` is updated.
     """
     _update_silence_time(healthy, fault, T, state)
-    connected = state[SILENCE_TIME] <= timeout
+    connected = state[SILENCE_TIME_INDEX] <= timeout
     state[_CONNECTED_TIME] = min(state[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
     present, fall = state[_PRESENT_HAND_WRENCH_LIMITS], state[_WRENCH_LIMIT_FALL_RATE]
     for g in range(2):
@@ -102,7 +102,7 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
     last, before = state[_LAST_COMMAND], state[_COMMAND_BEFORE_LAST]
     start, velocity = state[_COMMAND_POSE_AT_STOP], state[_COMMAND_VELOCITY_AT_STOP_START]
     step = np.empty(6)
-    if state[SILENCE_TIME] <= timeout:
+    if state[SILENCE_TIME_INDEX] <= timeout:
         state[_TIME_SINCE_RESUME_BEGAN] = min(state[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
     elif state[_TIME_SINCE_RESUME_BEGAN] > 0.0:
         fields.pose_difference_into(last, before, velocity)

@@ -72,11 +72,6 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:
-        """Return the scales of gripper, object and contact.
-
-        Raises:
-            DrakeTeleopError: eta with other scales, eta without gripper_phi, or negative mass.
-        """
         if self.gripper_phi is not None and self.gripper_phi[0] < 0.0:
             what = f"a mass of {self.gripper_phi[0]:g} kg is negative"
             remedy = "give phi as of `identify`: [m, m cx, m cy, m cz, Ixx, ...]"

@@ -171,7 +171,10 @@ class JointCoupling(LeafSystem):
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
         self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
         sources = {self._state.ticket(), self.xd_ticket()}
-        joints, pose = weak_callback(self._calc_joint_command), weak_callback(self._calc_tool_pose)
+        joints, pose = (
+            weak_callback(self._calc_joint_command),
+            weak_callback(self._calc_commanded_pose),
+        )
         self.DeclareVectorOutputPort("leader_joints", n, joints, sources)
         self.DeclareVectorOutputPort("pose_command", 7, pose, sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_joints_and_clutch)
@@ -185,7 +188,7 @@ class JointCoupling(LeafSystem):
     def _calc_joint_command(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._commanded_joint_positions(context))
 
-    def _calc_tool_pose(self, context: Context, output: BasicVector) -> None:
+    def _calc_commanded_pose(self, context: Context, output: BasicVector) -> None:
         joints = np.array(self._commanded_joint_positions(context))
         pose_into(self._table, joints, output.get_mutable_value())
 

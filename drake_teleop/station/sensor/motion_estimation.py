@@ -255,7 +255,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memory, sample):
-    """Convert true values to a sample by sensor chain and motion estimator.
+    """Write the `sample` (`load.regressor`) that sensor chain and motion estimator make of `truth`.
 
     Implausible values flag the last sample instead. `sensor` is (constants of the chain, constants
     of the estimator, ideal). Others: see `read_sensor_into`.

@@ -80,6 +80,11 @@ class ArmModel:
         return len(self.joint_names)
 
     @property
+    def sliding_joints(self) -> tuple[int, ...]:
+        """Indices of the prismatic joints, whose positions are in m."""
+        return tuple(map(int, np.flatnonzero(self.table[:-1, IS_PRISMATIC_COLUMN])))
+
+    @property
     def middle_positions(self) -> Array:
         """Middles (n,) of the joint ranges; for an infinite range its point nearest to 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
@@ -318,10 +323,8 @@ def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Arr
 
 @njit(cache=True)
 def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array) -> None:
-    """Write the lower half of the mass matrix to M (n, n); overwrite `link` and `inertia`.
-
-    Composite rigid bodies: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
-    """
+    """Write the lower half of the mass matrix to M (n, n); overwrite `link` and `inertia`."""
+    # Composite rigid bodies: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
     n = M.shape[0]
     for row in range(n):
         # Velocity at Wo and angular velocity for unit joint speed.

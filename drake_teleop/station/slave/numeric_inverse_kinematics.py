@@ -59,7 +59,7 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 def _pose_error_into(table, L, pose, q, x, J, e, Jt_e):
     """Write Jacobian J (6, n), pose error e (6,) and J^T e (n,), to `Jt_e`, at q; return |e|^2.
 
-    Rotations are multiplied by L.
+    Rotational rows of J and e are multiplied by L.
     """
     jacobian_and_pose(table, q, J, x)
     a = vectors.normalized_quaternion(vectors.quaternion_at(pose, 0))

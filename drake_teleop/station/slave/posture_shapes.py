@@ -225,10 +225,8 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
 def _complete_and_bound_collision_shapes(
     plant: MultibodyPlant, scene_graph: geometry.SceneGraph
 ) -> None:
-    """Add visual shapes as missing collision shapes of bodies; remove unbounded collision shapes.
-
-    Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
-    """
+    """Add visual shapes as missing collision shapes of bodies; remove unbounded ones."""
+    # Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     added = []  # afterwards, because Drake's lists move when shapes are added
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
