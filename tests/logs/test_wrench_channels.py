@@ -31,7 +31,7 @@ def turn_into_base_axes(columns: Columns, part: str) -> Columns:
 @pytest.mark.parametrize("channel", range(6))
 def test_channel_with_opposite_sign_is_named(tmp_path: Path, channel: int, imu: bool) -> None:
     path = written(tmp_path, negate(record(None), channel), imu=imu, pose=not imu)
-    finding = wrench_channel_finding(read_log(path), None, 0.0)
+    finding = wrench_channel_finding(read_log(path, bandwidth_hz=15.0), None, 0.0)
     assert finding is not None and finding.name == "channel sign"
     assert finding.values["part"] == CHANNELS[channel]
 
@@ -39,7 +39,7 @@ def test_channel_with_opposite_sign_is_named(tmp_path: Path, channel: int, imu: 
 @pytest.mark.parametrize("part", ["force", "torque"])
 def test_part_in_base_axes_is_named(tmp_path: Path, part: str) -> None:
     path = written(tmp_path, turn_into_base_axes(record(None), part), imu=False)
-    finding = wrench_channel_finding(read_log(path), None, 0.0)
+    finding = wrench_channel_finding(read_log(path, bandwidth_hz=15.0), None, 0.0)
     assert finding is not None and finding.name == "mixed axes"
     assert finding.values["part"] == part
 
@@ -47,7 +47,7 @@ def test_part_in_base_axes_is_named(tmp_path: Path, part: str) -> None:
 @pytest.mark.parametrize("drift_N", [0.0, 3.0])
 def test_correct_wrench_has_no_channel_finding(tmp_path: Path, drift_N: float) -> None:
     path = written(tmp_path, record(None, drift_N), imu=False)
-    assert wrench_channel_finding(read_log(path), None, 0.0) is None
+    assert wrench_channel_finding(read_log(path, bandwidth_hz=15.0), None, 0.0) is None
 
 
 @pytest.mark.slow
