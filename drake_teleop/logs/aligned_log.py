@@ -45,7 +45,7 @@ _MAX_KNOWN_DELAY_STD_S, _EDGE_MARGIN_OVER_KNOT_SPACING = 0.005, 2.0
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9
-_MIN_SPLINE_RECORD_DURATION_S = 4.0  # shorter records have too few frequencies for splines
+MIN_SPLINE_RECORD_DURATION_S = 4.0  # shorter records have too few frequencies for splines
 # Fewest kept samples, and largest cut-off of the low-pass over their rate; kept samples per chunk,
 # and neighbours for smoothing.
 _MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
@@ -212,7 +212,7 @@ def fit_load_to_posed_log(
     The load is None for a method without splines, a log without poses over 4 s, or an IMU that
     contradicts the poses.
     """
-    is_long = log.t[-1] - log.t[0] >= _MIN_SPLINE_RECORD_DURATION_S
+    is_long = log.t[-1] - log.t[0] >= MIN_SPLINE_RECORD_DURATION_S
     if log.posed is None or log.static or method not in METHODS_WITH_SPLINES or not is_long:
         return None, ()
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)

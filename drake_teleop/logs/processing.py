@@ -25,6 +25,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import explained_log
 from drake_teleop.logs.aligned_log import (
     METHODS_WITH_SPLINES,
+    MIN_SPLINE_RECORD_DURATION_S,
     LoadFitOfLog,
     fit_load_to_posed_log,
     read_aligned_log,
@@ -279,11 +280,14 @@ def _explain_residual(
 
 def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
     """Return the misfit if the motion of the IMU, without poses, does not explain the wrench."""
-    if not _is_misfit_explainable(log, by_splines=False):
+    is_short = log.t[-1] - log.t[0] < MIN_SPLINE_RECORD_DURATION_S  # not compared with poses
+    if is_short or not _is_misfit_explainable(log, by_splines=False):
         return None
     log = replace(log, posed=None, R_WS=None, gravity=None, gravity_W=None)
     why = explained_log.explain_log(log, delay_s, None)
-    return why if why is not None and why.is_misfit else None
+    if why is None or not why.is_misfit:
+        return None
+    return replace(why, causes=()) if _clock_rate_causes(why) else why
 
 
 def _clock_rate_causes(why: MisfitExplanation | None) -> tuple[Finding, ...]:
