@@ -128,9 +128,9 @@ def identify_load(
     """Simulate an excitation trajectory and identify the load.
 
     Args:
-        progress: True shows progress bars; or a `StartStage` that receives the progress.
+        progress: True for progress bars, or a `StartStage`.
+        log: as in `simulate`.
         trajectory: excitation of the scenario's duration; None: this process designs one, once.
-        log: folder of the log, see `simulate`.
 
     Raises:
         DrakeTeleopError: if the load estimator is off, or if `trajectory` violates a limit or has

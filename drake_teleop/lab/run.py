@@ -91,8 +91,7 @@ def run_command(
 ) -> dict[str, Any]:
     """Run a scenario, or repeat `drive`; replace the results in `out`.
 
-    Return summary.json and session.json in one dictionary. The message of a KeyboardInterrupt
-    contains the number of recorded samples.
+    Return summary.json and session.json in one dictionary.
     """
     if drive is not None and (seed is not None or fresh):
         what = "a recorded drive contains its seed and load, which cannot be replaced"
@@ -162,8 +161,8 @@ def run_scenario(
     A run that estimates the load without intent and task uses an excitation trajectory.
 
     Args:
-        progress: True shows progress bars; or a `StartStage` that receives the progress.
-        log: folder of the log, see `simulate`.
+        progress: True for progress bars, or a `StartStage`.
+        log: as in `simulate`.
         fresh: True ignores the cached load.
     """
     check_scenario(scenario)

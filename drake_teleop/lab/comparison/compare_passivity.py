@@ -122,7 +122,7 @@ def longest_round_trip(
 ) -> float:
     """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
 
-    `jitter` and `loss` become fields of `NetworkConfig`. If both are 0, only the first seed runs.
+    Without `jitter` and `loss` only the first seed runs.
     """
     longest = 0.0
     for round_trip in ROUND_TRIPS_S:

@@ -38,14 +38,11 @@ def new_command(
     sensor: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Write `station.yaml` and `start.png` into `folder`; run the station into `first_run` there.
+    """Write `station.yaml` and `start.png` into `folder`, run the station, return its summary.
 
     Args:
         tool: model file of the tool; None: the bodies beyond the sensor, or a placeholder.
         sensor: preset of the wrist sensor; None: the default sensor.
-
-    Returns:
-        The summary of the run.
     """
     scenario = folder / "station.yaml"
     if scenario.exists():
@@ -96,12 +93,7 @@ def new_command(
 def scenario_text(
     plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
-    """Return the commented scenario as YAML; `slave` has its model, packages and sensor frame.
-
-    Args:
-        tool: path of the tool's file, if given.
-        sensor: preset of the wrist sensor, or None.
-    """
+    """Return the commented scenario as YAML; `slave` has its model, packages and sensor frame."""
     s, swing, place = plan.translation_scale, plan.swing_amplitude_m, plan.place
     down = 1.5 * swing + min(0.01, swing / 4.0)  # at most 10 mm into the wall
     if place.is_set_by_position:

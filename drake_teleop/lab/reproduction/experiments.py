@@ -184,10 +184,7 @@ def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedV
 
 
 def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array:
-    """Return by how much raw f_x, f_y, f_z, |f| (4,) leave their contact-free range in contact [N].
-
-    For a negative number no threshold on this quantity detects the contact.
-    """
+    """Return by how much raw f_x, f_y, f_z, |f| leave their contact-free range in contact [N]."""
     touched, free = (
         np.column_stack([force, np.linalg.norm(force, axis=1)])
         for force in (one.scaled_wrenches[1.0][:, :3] for one in (run.touched, run.free))

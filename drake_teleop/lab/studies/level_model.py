@@ -27,10 +27,7 @@ TOO_FEW_POINTS = "too few points"
 
 
 def largest_complete_block(has_value: BooleanArray) -> tuple[BooleanArray, BooleanArray]:
-    """Return flags of the rows and columns of a large block without missing values.
-
-    `has_value` is True where a level (row) has a value at a combination (column).
-    """
+    """Return flags of the rows and columns of a large block without missing values."""
     counts = has_value.sum(axis=0)
     patterns, times = np.unique(has_value[:, counts == counts.max()], axis=1, return_counts=True)
     rows = patterns[:, np.argmax(times)]

@@ -88,7 +88,7 @@ class OperatingRange:
     def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
         """Parts of the test, each with its own seed: factor of gamma, grips, walls [N/m].
 
-        The softest grip fails first: it is tested twice. The last part has no margin.
+        The softest grip fails first: it is tested twice.
         """
         low, high = self.walls
         margin, hands = self.requirements.loop_gain_margin, list(self.hands)
