@@ -172,6 +172,14 @@ def test_noise_of_the_force_at_rest_is_no_oscillation(seed):
         assert run_warnings(without_network(force), Scenario(), ARM) == []
 
 
+@pytest.mark.parametrize("rms", [4.0, 12.0])
+def test_force_too_large_for_sensor_noise_is_reported(rms):
+    """A stiff wall lets the force chatter without one frequency."""
+    force = rms * np.random.default_rng(4).normal(size=(len(T), 3)) * during(2, 3)[:, None]
+    (warning,) = run_warnings(without_network(force), Scenario(), ARM)
+    assert "the rendered force oscillates" in warning
+
+
 def test_missed_orientation_of_an_arm_with_five_joints_is_no_warning(monkeypatch):
     result = recorded(ik_status=(0, IkStatus.WRIST_SINGULAR * during(1.0, 2.0)))
     assert "WRIST_SINGULAR from 1.000 to 2.000 s" in run_warnings(result, OVER_NETWORK, ARM)[0]

@@ -44,6 +44,7 @@ _SETTLING_TIME_IN_TIME_CONSTANTS = 6.0  # of the position loop, until the error 
 _MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 _MIN_FORCE_OSCILLATION_CYCLES = 4
 _MIN_POWER_SHARE_OF_OSCILLATION = 0.5  # near its frequency; white noise has less than 0.3
+_MAX_RENDERED_SENSOR_NOISE_RMS_N = 2.0
 _MAX_LISTED_SPANS = 3  # further time spans are counted
 _REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 
@@ -298,12 +299,14 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
         return
     over_network = "ports" in result
     frequency, share = oscillation.dominant_frequency(t, part)
-    if not over_network and share < _MIN_POWER_SHARE_OF_OSCILLATION:
+    largest_rms = _maximum_within_spans(t, rms, spans)
+    small = largest_rms < _MAX_RENDERED_SENSOR_NOISE_RMS_N
+    if not over_network and small and share < _MIN_POWER_SHARE_OF_OSCILLATION:
         return  # noise of the sensor
     ledger = ", or increase passivity.ledger.initial with ledger" if over_network else ""
     yield (
         f"the rendered force oscillates at {frequency:.2g} Hz with up to"
-        f" {_maximum_within_spans(t, rms, spans):.2g} N rms while the hand rests",
+        f" {largest_rms:.2g} N rms while the hand rests",
         spans,
         f"{_REDUCE_FORCE_ADVICE}{ledger}",
     )
