@@ -285,9 +285,10 @@ def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
         return None
     log = replace(log, posed=None, R_WS=None, gravity=None, gravity_W=None)
     why = explained_log.explain_log(log, delay_s, None)
-    if why is None or not why.is_misfit:
+    if why is None or not (why.is_misfit and why.is_residual_large):
         return None
-    return replace(why, causes=()) if _clock_rate_causes(why) else why
+    correctable = [x for x in why.causes if x.name not in CAUSES_WITHOUT_CORRECTION]
+    return why if correctable and not _clock_rate_causes(why) else None
 
 
 def _clock_rate_causes(why: MisfitExplanation | None) -> tuple[Finding, ...]:

@@ -43,6 +43,7 @@ _MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.
 _MIN_GRAVITY_TILT_DEG, _MAX_GRAVITY_ERROR_TILTED, _MAX_GRAVITY_ERROR_UPRIGHT = 0.25, 0.05, 0.02
 _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
 _TRIED_CLOCK_RATE_FACTORS, _MIN_CLOCK_RATE_ERROR = np.geomspace(1e-3, 1e4, 71), 0.005
+_MAX_CLOCK_RATE_STD_OVER_ERROR = 0.1
 _MIN_CHANNEL_GAIN_ERROR, _MAX_CHANNEL_GAIN_ERROR = 0.003, 0.25
 _MIN_POSE_SHIFT_M, _MAX_POSE_SHIFT_M = 0.010, 1.5
 _MIN_SENSOR_ROTATION_DEG, _MIN_LOAD_MASS_OVER_DEVIATION = 1.0, 10.0
@@ -150,8 +151,10 @@ def _is_extension_effect_large(state: FittedModel, name: str) -> bool:
         case "frame":
             return bool(np.linalg.norm(x) > _MIN_POSE_SHIFT_M)
         case _ if name in CLOCK_RATE_POWER:
-            ratio = clock_rate_ratio_and_std(state, name)[0]
-            return bool(abs(ratio - 1.0) > _MIN_CLOCK_RATE_ERROR)
+            ratio, deviation = clock_rate_ratio_and_std(state, name)
+            # Without any weight in the wrench the ratio of poses is infinite.
+            precise = deviation < _MAX_CLOCK_RATE_STD_OVER_ERROR * abs(ratio - 1.0)
+            return bool(precise and abs(ratio - 1.0) > _MIN_CLOCK_RATE_ERROR)
         case "rotation":
             return bool(np.linalg.norm(x) > np.radians(_MIN_SENSOR_ROTATION_DEG))
         case "linear drift" | "drift":
