@@ -29,7 +29,7 @@ _NUM_PARAMETERS_OF_EXTENSION = {
 CLOCK_RATE_POWER = {
     "clock rate of poses": 2, "clock rate of orientations": 2, "clock rate of gyroscope": 1,
 }  # fmt: skip
-"""Extensions 1 + x = r**power, with time step r times the true one; x scales accelerations."""
+"""Power p: for time steps r times the true ones, accelerations have the factor 1 + x = r**p."""
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _ROTATION_COLUMNS_OF_STEP_CHANGE = slice(16, 25)
