@@ -36,6 +36,14 @@ def test_channel_with_opposite_sign_is_named(tmp_path: Path, channel: int, imu: 
     assert finding.values["part"] == CHANNELS[channel]
 
 
+@pytest.mark.parametrize("channel", [1, 5])
+def test_correction_that_implies_a_negative_mass_is_not_named(tmp_path: Path, channel: int) -> None:
+    columns = negate(record(None), channel)
+    columns |= {name: -columns[name] for name in ("force", "torque")}
+    path = written(tmp_path, columns, imu=False)
+    assert wrench_channel_finding(read_log(path, bandwidth_hz=15.0), None, 0.0) is None
+
+
 @pytest.mark.parametrize("part", ["force", "torque"])
 def test_part_in_base_axes_is_named(tmp_path: Path, part: str) -> None:
     path = written(tmp_path, turn_into_base_axes(record(None), part), imu=False)
