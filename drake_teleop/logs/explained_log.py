@@ -291,6 +291,12 @@ def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> I
     return _replace_covariance_of_load(load, load.covariance + np.diag(extra**2))
 
 
+def add_errors_of_load(load: Identification, errors: Array) -> Identification:
+    """Return `load` with intervals widened by likely `errors` (10,) of phi."""
+    variances = np.append(np.zeros(6), errors**2)
+    return _replace_covariance_of_load(load, load.covariance + np.diag(variances))
+
+
 def _replace_covariance_of_load(load: Identification, covariance: Array) -> Identification:
     known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)

@@ -19,7 +19,12 @@ from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_ba
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales, statistic_index
-from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
+from drake_teleop.load.identification import (
+    PARAMETER_NAMES,
+    Identification,
+    load_of_object,
+    natural_scales,
+)
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import explained_log
@@ -48,6 +53,7 @@ from drake_teleop.logs.check.conventions import (
 )
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
+from drake_teleop.logs.check.nonlinear_sensor import error_of_load_by_nonlinear_sensor
 from drake_teleop.logs.check.sensor_filter import sensor_filter_finding
 from drake_teleop.logs.check.wrench_channels import wrench_channel_finding
 from drake_teleop.logs.contact import (
@@ -71,8 +77,10 @@ from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
+_CAUSES_LIKE_NONLINEAR_SENSOR = (*CAUSES_AT_REST, "load change", "gain")
 _FINDINGS_PREVENTING_IDENTIFICATION = (
     *("left-handed", "high-pass", "low-pass", "clock rate", "channel sign", "mixed axes"),
+    *("dead band", "curvature", "hysteresis"),
 )
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
@@ -193,6 +201,10 @@ def identify_log(
         fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
     errors = _findings_that_invalidate_load(raw, fitted, frame_findings, why, too_still, check)
     errors = errors if mirrored is None else (mirrored,)
+    load_errors = np.zeros(10)
+    if not errors and why is not None and _may_sensor_be_nonlinear(raw, why):
+        sensor = error_of_load_by_nonlinear_sensor(fitted.log, fitted.fit.identification)
+        load_errors, errors = sensor[0], () if sensor[1] is None else (sensor[1],)
     causes: tuple[Finding, ...] = ()
     result, note = fitted.fit.identification, fitted.fit.note
     accepted = None if errors else why
@@ -203,6 +215,11 @@ def identify_log(
         result, causes, note = _apply_explanation(result, raw, accepted, frame_findings, note)
     log = replace(fitted.log, notes=(*fitted.log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
+    unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
+    if accepted is not None and accepted.is_misfit and not causes:
+        # Errors of the motion with this share of its variance reduce the load by this share.
+        load_errors = np.hypot(load_errors, unexplained * natural_scales(result.phi)[6:])
+    result = explained_log.add_errors_of_load(result, load_errors)
     findings = errors or causes
     if not findings and not raw.estimated:
         known_delay = None if fitted.delay_source == "undetermined" else fitted.delay_s
@@ -211,7 +228,6 @@ def identify_log(
         if accepted and accepted.is_acceleration_missing and not result.identifiable.all():
             findings = (*findings, explained_log.missing_acceleration_finding(accepted))
     corrections = [x for x in causes if x.name not in CAUSES_WITHOUT_CORRECTION]
-    unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     misfit = _unexplained_misfit(why, result, corrections, unexplained)
     if misfit is not None and (corrections or not findings):
         findings, causes = (explained_log.misfit_finding(misfit, corrections),), ()
@@ -289,6 +305,11 @@ def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
         return None
     correctable = [x for x in why.causes if x.name not in CAUSES_WITHOUT_CORRECTION]
     return why if correctable and not _clock_rate_causes(why) else None
+
+
+def _may_sensor_be_nonlinear(raw: Log, why: MisfitExplanation) -> bool:
+    similar = all(cause.name in _CAUSES_LIKE_NONLINEAR_SENSOR for cause in why.causes)
+    return similar and not (why.explained or raw.static or why.is_acceleration_missing)
 
 
 def _clock_rate_causes(why: MisfitExplanation | None) -> tuple[Finding, ...]:

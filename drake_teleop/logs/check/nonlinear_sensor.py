@@ -1,0 +1,87 @@
+"""Test whether the sensor's error depends on its reading: dead band, curvature or hysteresis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_teleop.common.numeric import Array
+from drake_teleop.load.identification import Identification, natural_scales
+from drake_teleop.load.regressor import regressor
+from drake_teleop.logs.causes.cause import Finding
+from drake_teleop.logs.read.canonical import Log
+
+_MAX_COMPARED_SAMPLES, _COMPARED_RATE_HZ = 2000, 50.0
+_DEAD_BAND_OVER_LARGEST_WRENCH, _PLAY_OVER_RANGE = 0.05, 0.01
+_LEAST_EXPLAINED_SHARE, _CERTAIN_EXPLAINED_SHARE, _LEAST_RELATIVE_ERROR = 0.12, 0.3, 0.01
+_MESSAGES = {
+    "dead band": "the sensor shows too little near zero (dead band); turn that off",
+    "curvature": "the gain of the sensor depends on the wrench; calibrate the sensor",
+    "hysteresis": "the reading depends on the direction of its change (hysteresis); look for"
+    " friction or play between sensor and load, and calibrate the sensor",
+}
+
+
+def error_of_load_by_nonlinear_sensor(
+    log: Log, load: Identification
+) -> tuple[Array, Finding | None]:
+    """Return likely errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
+
+    The errors are 0 if no function of the load's wrench in each channel explains the residual. The
+    log is without delay.
+    """
+    step = max(1, round(1.0 / (_COMPARED_RATE_HZ * log.dt)), -(-len(log) // _MAX_COMPARED_SAMPLES))
+    few = log.select_rows(slice(None, None, step))
+    V = regressor(*few.motion)
+    wrench = load.offsets + V @ load.phi
+    scale = np.linalg.norm(few.wrench.std(axis=0).reshape(2, 3), axis=1).repeat(3) + 1e-12
+    unit = (wrench - wrench.mean(axis=0)) / (np.ptp(wrench, axis=0) + 1e-12)
+    dead_band = _DEAD_BAND_OVER_LARGEST_WRENCH * np.abs(wrench).max(axis=0) + 1e-12
+    functions = {
+        "dead band": [np.tanh(wrench / dead_band)],
+        "curvature": [unit**2, unit**3],
+        "hysteresis": [_play(unit)],
+    }
+    offsets = np.broadcast_to(np.eye(6), (len(V), 6, 6))
+    load_columns = np.concatenate([offsets, V], axis=2) / scale[:, None]
+    gains = _one_column_per_channel(unit)
+    measured = few.wrench / scale
+    plain, _ = _fit(measured, load_columns)
+    _, residual = _fit(measured, load_columns, gains)
+    shares, errors = {}, {}
+    for name, columns in functions.items():
+        own = [_one_column_per_channel(x) for x in columns]
+        shares[name] = 1.0 - _fit(measured, load_columns, gains, *own)[1] / residual
+        errors[name] = _fit(measured, load_columns, *own)[0][6:16] - plain[6:16]
+    name = max(shares, key=lambda x: shares[x])
+    if not shares[name] > _LEAST_EXPLAINED_SHARE:
+        return np.zeros(10), None
+    scales = natural_scales(load.phi)[6:]
+    if name == "hysteresis":  # its part in phase with the wrench, which no fit shows, is as large
+        total = float(np.sum((measured - measured.mean(axis=0)) ** 2))
+        errors[name] = np.sqrt(shares[name] * residual / total) * scales
+    worst = float(np.max(np.abs(errors[name]) / scales, initial=0.0, where=np.arange(10) < 4))
+    if shares[name] < _CERTAIN_EXPLAINED_SHARE or worst < _LEAST_RELATIVE_ERROR:
+        return errors[name], None
+    text = f"{_MESSAGES[name]}; error of the load about {100.0 * worst:.2g} %"
+    text = f"payload not identifiable: {text}"
+    return errors[name], Finding(name, text, values={"relative_error": worst})
+
+
+def _one_column_per_channel(x: Array) -> Array:
+    return np.asarray(x[:, :, None] * np.eye(6))
+
+
+def _fit(wrench: Array, *columns: Array) -> tuple[Array, float]:
+    """Return the parameters of all columns (N, 6, p), and the squared residual."""
+    A, b = np.concatenate(columns, axis=2).reshape(wrench.size, -1), wrench.ravel()
+    theta = np.linalg.lstsq(A, b, rcond=1e-9)[0]
+    return theta, float(np.sum((b - A @ theta) ** 2))
+
+
+def _play(x: Array) -> Array:
+    """Return the lag (N, 6) of a reading behind x (N, 6) with play, divided by half the play."""
+    out, reading = np.zeros_like(x), x[0]
+    for n in range(1, len(x)):
+        reading = np.clip(reading, x[n] - _PLAY_OVER_RANGE, x[n] + _PLAY_OVER_RANGE)
+        out[n] = (reading - x[n]) / _PLAY_OVER_RANGE
+    return out
