@@ -11,16 +11,16 @@ from rich.table import Table
 
 _HEAD = """# Arms tried
 
-Published arm files, unchanged. Each was tried with one command, with file and frame of its row:
-`drake-teleop new FOLDER --arm FILE --sensor-frame FRAME`.
+The table lists published arm files, unchanged. Each was tried with one command, with the file and
+the frame of its row: `drake-teleop new FOLDER --arm FILE --sensor-frame FRAME`.
 
-`benchmarks/arms.py` makes this page. It takes the files from packages of the Python Package Index;
-their licences differ, so they are not included here. It compares kinematics, masses and limits with
-an independent reader: MuJoCo for MJCF, yourdfpy for URDF. The column "assumed" has what the command
-prints about missing or impossible values. The columns σ, margin and overlaps are of the start that
-the command chooses: least singular value of the Jacobian over L, with rotations times L, a fifth of
-the arm's length; smallest distance to a joint limit over half the range; number of overlapping
-pairs of shapes.
+`benchmarks/arms.py` makes this page from packages of the Python Package Index. Their licences
+differ, so the files are not included here. An independent reader checks kinematics, masses and
+limits: MuJoCo for MJCF, yourdfpy for URDF. "assumed" contains the messages of the command about
+missing or impossible values. Three columns describe the start that the command chooses. σ is the
+least singular value of the Jacobian over L, with rotations times L; L is a fifth of the arm's
+length. "margin" is the smallest distance to a joint limit over half the range. "overlaps" is the
+number of overlapping pairs of shapes.
 
 | file | package | joints | sensor frame | σ | margin | overlaps | assumed | first run |
 |---|---|---|---|---|---|---|---|---|

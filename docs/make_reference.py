@@ -23,21 +23,22 @@ DOCS = Path(__file__).parent
 _SCENARIO_PAGE_HEAD = """\
 # Every field of a scenario
 
-A scenario is a YAML file; what it leaves out keeps the default that stands here. This page is made
-from the code (`python docs/make_reference.py`).
+A scenario is a YAML file; a field that is not in the file has its default. This page is made from
+the code (`python docs/make_reference.py`).
 
 - `drake-teleop scenario press > mine.yaml` writes the shipped scenario `press` with every field,
-  its range and its meaning, as a starting point; `drake-teleop run mine.yaml` runs it.
-- Files are read as YAML 1.2: `1e-3` is a number, `yes` and `1:30` are words. A field that stands
-  there twice, or that nothing reads, is an error, and so is `010`.
-- [scenario.schema.json](scenario.schema.json) is the JSON schema: an editor that knows it (for
-  instance by a first line `# yaml-language-server: $schema=scenario.schema.json`) completes and
-  checks the fields. Configure such an editor for tags like `!Touch`, which say what kind of
-  block follows: in VS Code `"yaml.customTags": ["!Touch mapping", ...]`.
+  its range and its meaning, as a template; `drake-teleop run mine.yaml` runs the file.
+- Files are read as YAML 1.2: `1e-3` is a number, `yes` and `1:30` are words. A repeated field, an
+  unknown field, and a number such as `010` are errors.
+- [scenario.schema.json](scenario.schema.json) is the JSON schema. Copy it beside your scenario: an
+  editor with this schema completes and checks the fields, for instance with the first line
+  `# yaml-language-server: $schema=scenario.schema.json`. Configure the editor for tags like
+  `!Touch`, which select the kind of a block: in VS Code
+  `"yaml.customTags": ["!Touch mapping", ...]`.
 
-Frames: W is the world, z up; B the base of the master, E its end; S the wrist sensor, A its
+Frames: W is the world, z up; B the base of the master, E its stylus; S the wrist sensor, A its
 accelerometers. `p_WS` is the position of S's origin in W, `R_SA` the rotation of A in S. Equations
-and sections are those of the paper; (E) marks an estimate of ours, where the paper gives no figure.
+and sections are those of the paper; (E) marks an estimate of this project, not of the paper.
 """
 
 

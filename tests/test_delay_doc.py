@@ -86,13 +86,3 @@ def test_what_an_adversary_left_of_ledgers_energy_is_what_the_record_says():
     found = figures_of_record("adversary")["ledger"]
     least = ", ".join(f"{found[part]['actual']:.4f}" for part in ("random", "searched"))
     assert table("docs/delay.md", "| method | between the hand and |")["ledger"][-1] == least
-
-
-def test_how_to_choose_is_told_the_same_figures():
-    holds = table("docs/delay.md", "| method | stable of 162 |")
-    least = table("docs/delay.md", "| method | between the hand and |")
-    assert table("docs/choose.md", "| method | stable |") == {
-        method: [stable, good, felt, least[method][-1].rpartition(" ")[2]]
-        for method, (stable, good, _, _, felt) in holds.items()
-        if method not in ("two_layer", "pspm", "four_channel", "force_limit")
-    }

@@ -81,8 +81,8 @@ def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch)
     (tmp_path / "models").symlink_to(ARM.parent)
     monkeypatch.chdir(tmp_path)
     type_in("docs/start.md", ".venv/bin/drake-teleop new")
-    assert LoadScenario("out/mine/station.yaml").master.model == "omega_6"
-    assert runs == [(Path("out/mine/station.yaml"), Path("out/mine/first_run"), {"quiet": False})]
+    assert LoadScenario("out/own/station.yaml").master.model == "omega_6"
+    assert runs == [(Path("out/own/station.yaml"), Path("out/own/first_run"), {"quiet": False})]
 
 
 @pytest.mark.long

@@ -349,12 +349,12 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
 
-    SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC, - for
-    lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT, ros2://TOPIC,
-    zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
-    An invalid wrench is replaced by zero, with a flag. --cutoff is causal here. --delay is the
-    delay of the motion behind the wrench; auto starts with the value in the load file.
-    The command ends with the source or with Ctrl-C.
+    SOURCE is udp://[HOST]:PORT, posed://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC,
+    zenoh://HOST/TOPIC, - for lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT,
+    ros2://TOPIC, zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
+    Invalid wrenches are zero, with a flag. --cutoff is causal here. --delay is the delay of the
+    motion behind the wrench; auto starts with the value in the load file. The command ends with
+    the source or with Ctrl-C.
 
     Options:
         --out: Destination.  [default: stdout]
@@ -619,7 +619,7 @@ def study(study: Path, out: Path, **options: Any) -> None:
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
-    Simulates the operator's tasks for combinations of sigma, gamma and eta, in about 1000 runs.
+    Simulates the operator's tasks for combinations of sigma, gamma and eta, in 1200 runs.
     After an interruption, repeat the command.
 
     Options:

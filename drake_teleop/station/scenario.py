@@ -93,7 +93,7 @@ class Simulation:
 class Scenario:
     """Complete configuration of the station in the paper's Fig. 4."""
 
-    description: str = plain("", "what the scenario is about")
+    description: str = plain("", "subject of the scenario")
     simulation: Simulation = field(default_factory=Simulation)
     rates: Rates = field(default_factory=Rates)
     operator: OperatorConfig = field(default_factory=OperatorConfig)
