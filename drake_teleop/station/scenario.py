@@ -136,11 +136,12 @@ class Scenario:
 
     @property
     def has_no_network_or_passivity(self) -> bool:
-        """True if the channel has neither network effects nor a passivity method."""
-        return (
-            self.passivity.method == "none"
-            and self.channel.networks_of_directions() == (NetworkConfig(),) * 2
-        )
+        """True if the channel has no network, passivity method or own wrench limits."""
+        own, default = self.passivity, PassivityConfig()
+        names = ("method", "force_limit", "torque_limit")
+        if any(getattr(own, name) != getattr(default, name) for name in names):
+            return False
+        return self.channel.networks_of_directions() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
@@ -304,8 +305,9 @@ def _check_integration_step(scenario: Scenario, where: str) -> None:
 
 
 def _check_channel_and_passivity(scenario: Scenario, where: str) -> None:
-    for line in scenario.channel.networks_of_directions(f"{where}:channel"):
-        line.check(f"{where}:channel")
+    lines = scenario.channel.networks_of_directions(f"{where}:channel")
+    for line, name in zip(lines, ("channel", "channel.backward"), strict=True):
+        line.check(f"{where}:{name}")
         timeout = scenario.channel.timeout or MAX_TIMEOUT_S
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
             raise DrakeTeleopError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from drake_teleop.station.channel.channel import Channel, TeleopChannel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.estimation import contact_detection, load_estimator
 from drake_teleop.station.master.force_display import initial_display_state, step_display
+from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.scaling.force_scaling import ForceScaling, ForceScalingConfig
@@ -245,6 +247,46 @@ def test_contact_detector_equals_that_of_the_station():
     assert not found[:25].any() and found[-1] == 1.0
 
 
+@pytest.mark.parametrize("method", ["rls", "rtls"])
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e9])
+@pytest.mark.parametrize("name", ["measured_wrench_S", "angular_velocity_S"])
+def test_load_estimator_skips_an_invalid_sample(method, bad, name):
+    """The estimate is that without this sample."""
+    _, _, rows, _ = samples(np.random.default_rng(4), 30)
+    found = []
+    for row in (rows[20] | {"saturated": [1.0]}, rows[20] | {name: [bad, *rows[20][name][1:]]}):
+        config = load_estimator.LoadEstimatorConfig(enabled=True, method=method)
+        block = blocks.LoadEstimator(np.ones(6), T, motion_std=np.full(9, 0.01), config=config)
+        found.append(stepped(block, [*rows[:20], row, *rows[21:]], "load_estimate"))
+    assert np.isfinite(found[0]).all() and np.ptp(found[0][20:], axis=0).any()
+    np.testing.assert_array_equal(found[1], found[0])
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e9])
+@pytest.mark.parametrize("name", ["R_WS", "specific_force_S", "load_estimate"])
+def test_contact_detector_skips_an_invalid_sample(bad, name):
+    _, _, rows, _ = samples(np.random.default_rng(5), 60)
+    rows = [row | {"load_estimate": [*OFFSETS, *PHI], "R_WS": np.eye(3).ravel()} for row in rows]
+    flags = []
+    for port in ("measured_wrench_S", name):
+        row = rows[27] | {port: np.full(np.size(rows[27][port]), bad)}
+        block = blocks.ContactDetector(replace(floor(), per_acceleration=np.full((6, 2), 0.01)), T)
+        flags.append(stepped(block, [*rows[:27], row, *rows[28:]], "contact"))
+    np.testing.assert_array_equal(flags[1], flags[0])
+    assert not flags[1][:25].any() and flags[1][-1] == 1.0
+
+
+def test_wrench_scaling_keeps_the_settings_with_which_it_was_built():
+    config = ForceScalingConfig(sigma=0.5, force_scale=0.1, gripper_phi=list(0.5 * PHI))
+    block = blocks.WrenchScaling(config)
+    values = random_inputs(np.random.default_rng(8), np.eye(3))
+    before = output(block, fixed(block, **values), "wrench_to_master")
+    config.sigma, config.force_scale, config.gripper_phi[0] = 0.0, 1.0, 0.0
+    for each in (block, block.ToAutoDiffXd()):
+        found = output(each, fixed(each, **values), "wrench_to_master")
+        np.testing.assert_allclose(numbers(found), before, rtol=1e-12)
+
+
 def test_force_display_equals_the_display_of_the_station():
     master, rng = Scenario().master, np.random.default_rng(6)
     device = master.device(0.0, 0.0)
@@ -297,6 +339,39 @@ def test_impossible_conversion_raises_one_line(name):
     for convert in (block.ToAutoDiffXd, block.ToSymbolic):
         with pytest.raises(DrakeTeleopError, match=rf"^{name}: .* for double only; .*$"):
             convert()
+
+
+def packet_of_slave(force: float, **changed: float) -> np.ndarray:
+    packet = np.zeros(PACKET_SIZE + 1)
+    packet[fields.POSE], packet[fields.WRENCH.start] = START, force
+    packet[fields.SENDER_INPUTS_FINITE] = packet[-1] = 1.0
+    for name, value in changed.items():
+        packet[getattr(fields, name)] = value
+    return packet
+
+
+@pytest.mark.parametrize("field", ["CONTACT_FLAG", "WRENCH", "POSE"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_packet_that_is_not_finite_starts_the_safe_state(field, bad):
+    """The force is 0 at once, and then grows by at most 37.5 N in 0.5 s."""
+    block = blocks.PassivityAtMaster(PassivityConfig(), T, START)
+    rows = [{"received": packet_of_slave(10.0), "pose_command": START}] * 700
+    rows[600] = rows[600] | {"received": packet_of_slave(10.0, **{field: bad})}
+    force = stepped(block, rows, "wrench_to_master")[:, 0]
+    told = np.flatnonzero(force[550:] == 0.0) + 550
+    assert force[550] == 10.0 and len(told) > 0
+    # The output between two updates is one step ahead.
+    assert np.diff(force[told[0] :]).max() < 2 * 37.5 * T / 0.5 + 1e-12
+    assert 5.0 < force[-1] < 10.0
+
+
+@pytest.mark.parametrize(("contact", "flag"), [(np.nan, 0.0), (0.0, 0.0), (1.0, 1.0)])
+def test_contact_flag_of_a_packet_is_0_or_1(contact, flag):
+    block = blocks.PassivityAtSlave(PassivityConfig(), T, START)
+    zeros = {"received": np.zeros(PACKET_SIZE + 1), "wrench_B": np.zeros(6)}
+    context = fixed(block, **zeros, pose_slave=START, contact=[contact])
+    packet = output(block, context, "packet")
+    assert packet[fields.CONTACT_FLAG] == flag and packet[fields.SENDER_INPUTS_FINITE] == 1.0
 
 
 @pytest.mark.parametrize("method", METHODS)

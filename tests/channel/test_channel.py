@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
@@ -25,7 +26,7 @@ from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -124,6 +125,22 @@ def test_ideal_network_without_method_changes_no_signal(channel):
     assert not side.HasInputPort("hand_wrench_E") and not side.HasOutputPort("ports")
 
 
+@pytest.mark.parametrize(("name", "limit"), [("force_limit", 2.0), ("torque_limit", 0.01)])
+def test_own_limit_holds_with_an_ideal_network_and_without_method(name, limit):
+    scenario = moving(**{f"passivity__{name}": limit})
+    assert not scenario.has_no_network_or_passivity
+    side, wrench = MakeChannel(scenario), [0.0, 6.0, 0.0, 0.0, 0.05, 0.0]
+    simulator = Simulator(side)
+    start = start_pose(scenario.slave)
+    values = {"pose_command": start, "pose_slave": start, "wrench_B": wrench, "saturated": [0.0]}
+    for port, value in (values | {"hand_wrench_E": np.zeros(6)}).items():
+        side.GetInputPort(port).FixValue(simulator.get_mutable_context(), value)
+    simulator.AdvanceTo(0.6)
+    rendered = side.GetOutputPort("wrench_to_master").Eval(simulator.get_context())
+    assert rendered[1] == pytest.approx(min(wrench[1], scenario.passivity.force_limit))
+    assert rendered[4] == pytest.approx(min(wrench[4], scenario.passivity.torque_limit))
+
+
 def test_ports_contain_the_work_of_the_hand(load_estimate):
     """Compare with the sum over the logged force and motion of the stylus."""
     result = run(moving(channel__delay=0.01), load_estimate)
@@ -201,7 +218,14 @@ def test_directions_may_differ():
             {"channel": Channel(rate_hz=10.0, timeout=0.15)},
             r"channel\.timeout.*below two packet intervals",
         ),
-        ({"channel": Channel(backward=NetworkConfig(loss=0.9, burst_loss=0.5))}, r"loss"),
+        (
+            {"channel": Channel(backward=NetworkConfig(loss=0.9, burst_loss=0.5))},
+            r"channel\.backward\.loss: mean loss 0\.9 is above",
+        ),
+        (
+            {"channel": Channel(loss=0.8, burst_loss=0.3, backward=NetworkConfig())},
+            r"channel\.loss: mean loss 0\.8 is above",
+        ),
     ],
 )
 def test_invalid_channel_is_rejected(changes, message, load_estimate):

@@ -86,8 +86,9 @@ def test_masking_fades_with_its_time_constant():
 def test_record_of_wrong_shape_is_rejected():
     with pytest.raises(DrakeTeleopError, match="velocity"):
         perceive_contact(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
-    for times in (T[:1], T[::-1]):
-        with pytest.raises(DrakeTeleopError, match="t: times do not increase"):
+    gap, two_rates = T[(T < 4.0) | (T > 4.5)], np.concatenate([T[T < 4.0], T[T >= 4.0][::2]])
+    for times in (T[:1], T[::-1], gap, two_rates):
+        with pytest.raises(DrakeTeleopError, match="t: times do not increase in even steps"):
             perceive_contact(
                 times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0
             )

@@ -84,3 +84,6 @@ def test_arrays_of_wrong_shape_are_rejected():
         port_work(np.zeros((3, 6)), np.zeros((3, 7)), "forward")
     with pytest.raises(DrakeTeleopError, match=r"expected shapes \(N, 6\) and \(N, 7\)"):
         port_work(np.zeros((3, 6)), np.zeros((2, 7)))
+    for wrench in ([[1.0, 2.0], [3.0]], [["a"] * 6]):
+        with pytest.raises(DrakeTeleopError, match="wrench: contains no real numbers"):
+            port_work(wrench, np.zeros((1, 7)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -118,7 +119,7 @@ def WrenchScaling_(T: Any) -> Any:
             converter: Any = None,
         ) -> None:
             LeafSystem_[T].__init__(self, converter)
-            self._config = config = ForceScalingConfig() if config is None else config
+            self._config = config = copy.deepcopy(config or ForceScalingConfig())
             self._R_WB = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
             self._gravity_W, self._scales = finite_array("gravity_W", gravity_W, 3), config.scales()
             ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION_PORT_NAMES)]

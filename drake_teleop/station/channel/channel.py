@@ -86,7 +86,7 @@ _WORK_OF_HAND_WRENCH, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(
 _SILENCE_TIMES_OF_ENDS, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
 _layout = slots.SlotAllocator(7)
-_RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
+_RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.vector(1)
 _ZERO_LOAD_WRENCH = np.zeros(6)
 
 
@@ -174,6 +174,7 @@ def step_master_end(
     else:
         valid = False
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
+    healthy = healthy and fields.are_vectors_finite((received,))
     fault = (fresh and not healthy) or not valid
     safe_state.master_wrench_limits_into(
         healthy, fault, T, timeout, parameters[slots.WRENCH_LIMIT], held, monitor, limits
@@ -220,13 +221,14 @@ def step_slave_end(
         ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
+    healthy = healthy and fields.are_vectors_finite((received,))
     methods.slave_step(
         steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
         packet,
     )  # fmt: skip
     if not valid:
         packet[fields.SENDER_INPUTS_FINITE] = 0.0
-    packet[fields.CONTACT_FLAG] = contact
+    packet[fields.CONTACT_FLAG] = 1.0 if contact > 0.5 else 0.0
     fault, requested = (fresh and not healthy) or not valid, command[:7]
     safe_state.slave_command_into(healthy, fault, T, timeout, requested, monitor, pose_received)
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
@@ -327,8 +329,7 @@ class TeleopChannel(SteppedBlock):
         for name, state in (("pose_received", 3), ("ports", 4)):
             self.DeclareStateOutputPort(name, DiscreteStateIndex(self._states[state]))
         self._declare_output("wrench_received", 5, _RECEIVED_WRENCH)
-        flag = slice(_RECEIVED_CONTACT_FLAG, _RECEIVED_CONTACT_FLAG + 1)
-        self._declare_output("contact_at_hand", 5, flag)
+        self._declare_output("contact_at_hand", 5, _RECEIVED_CONTACT_FLAG)
 
     def Restart(self, context: Context, command: Array, slave: Array, fill_time_s: float) -> None:
         """Start this channel, newly built, in a running station at the slave's present command.

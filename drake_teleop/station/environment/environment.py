@@ -62,7 +62,7 @@ class Environment(ABC):
     def moving_part(self) -> tuple[float, float, float] | None:
         """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a prismatic spring, or None.
 
-        The position of its joint is 0 at rest.
+        The position of its joint is 0 without load.
         """
         return None
 

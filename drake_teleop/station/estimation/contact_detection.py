@@ -47,7 +47,8 @@ def update_contact_flag_with_sample(memory, sample, estimate, acceleration, sett
     `sample` is that of `load.regressor`, `estimate` (16,) [offsets; phi], `acceleration` (3,) of So
     in S [m/s^2]; `settings` is `ContactDetector.settings`.
     """
-    if not (are_valid_port_values(sample) and are_valid_port_values(estimate)):
+    valid = are_valid_port_values(sample) and are_valid_port_values(estimate)
+    if not (valid and are_valid_port_values(acceleration)):
         return memory[CONTACT_INDEX] != 0.0
     contact = np.empty(6)
     s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
+from drake_teleop.common.blocks import NO_EXTRA_SLOTS, are_valid_port_values, weak_callback
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -110,7 +110,8 @@ class LoadEstimator(LeafSystem):
 
     def _estimate_or_monitor_load(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
-        if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
+        # The wrench contains more than the load's, or the sample would spoil the memory for ever.
+        if sample[SATURATION_FLAG_INDEX] > 0.0 or not are_valid_port_values(sample):
             return
         estimate = discrete_state.get_mutable_value(0)
         if self._read_load_state_code(discrete_state) != STATE_LEARNING:

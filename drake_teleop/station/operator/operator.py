@@ -165,10 +165,8 @@ def intended_motion_into(packed, start, t, pose, twist):
         orientation = vectors.quaternion_product(turn, orientation)
         omega = vectors.rotate_vector(turn, omega)
         omega = vectors.plus(omega, vectors.scale_vector(rate, rotation))
-    for k in range(4):
-        pose[k] = orientation[k]
-    for k in range(3):
-        twist[3 + k] = omega[k]
+    vectors.copy_into(pose, 0, orientation, 0, 4)
+    vectors.copy_into(twist, 3, omega, 0, 3)
 
 
 @njit(cache=True)

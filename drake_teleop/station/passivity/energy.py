@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, float_array
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
 #: Value of `pair` -> weight of f_k; the weight of f_(k-1) is the rest to 1.
@@ -24,7 +24,8 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     if pair not in WEIGHT_OF_PRESENT_WRENCH:
         remedy = f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}"
         raise DrakeTeleopError(f"'{pair}' is unknown", where="pair", remedy=remedy)
-    wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
+    wrench = np.ascontiguousarray(float_array("wrench", wrench))
+    pose = np.ascontiguousarray(float_array("pose", pose))
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
         what = f"expected shapes (N, 6) and (N, 7), found {wrench.shape} and {pose.shape}"
         remedy = "give one wrench and one pose for each of the N samples"

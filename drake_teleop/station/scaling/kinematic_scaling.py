@@ -107,8 +107,7 @@ class KinematicScaling(DoubleOnlySystem, LeafSystem):
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
         # X_WS and X_BE at the last change of the clutch, and whether it is closed.
-        identity = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        self.DeclareDiscreteState(np.concatenate([start, identity, [0.0]]))
+        self.DeclareDiscreteState(np.concatenate([start, [1.0, *np.zeros(6)], [0.0]]))
         sources = {self._pose.ticket(), self.xd_ticket()}
         self.DeclareVectorOutputPort("pose_command", 7, weak_callback(self._calc_command), sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_clutch_references)
@@ -162,8 +161,7 @@ class JointCoupling(LeafSystem):
     def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
         super().__init__()
         if len(home) != len(start):
-            numbers = f"{len(home)} joints, but the slave {len(start)}"
-            what = f"the leader has {numbers} (they must agree)"
+            what = f"the leader has {len(home)} joints, but the slave {len(start)} (must agree)"
             remedy = "set leads: pose, or choose arms of the same kinematics"
             raise DrakeTeleopError(what, where="master.leader.leads", remedy=remedy)
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
@@ -171,10 +169,7 @@ class JointCoupling(LeafSystem):
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
         self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
         sources = {self._state.ticket(), self.xd_ticket()}
-        joints, pose = (
-            weak_callback(self._calc_joint_command),
-            weak_callback(self._calc_commanded_pose),
-        )
+        joints, pose = map(weak_callback, (self._calc_joint_command, self._calc_commanded_pose))
         self.DeclareVectorOutputPort("leader_joints", n, joints, sources)
         self.DeclareVectorOutputPort("pose_command", 7, pose, sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_joints_and_clutch)
