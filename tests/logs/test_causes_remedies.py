@@ -281,6 +281,23 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     assert read_log(path).wrench == pytest.approx(right, rel=1e-5, abs=1e-4)
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.004, 0.0015])
+@pytest.mark.parametrize("ratio", [1.02, 0.97, 30.0])
+def test_line_of_a_wrong_clock_rate_has_six_digits(
+    scale: float, ratio: float, tmp_path: Path
+) -> None:
+    record = Record.simulate(seconds=1.0)
+    lines = {"time": {"column": "t", "scale": scale}}
+    record.wrench_lines = record.pose_lines = record.imu_lines = lines
+    log = read_log(record.write(tmp_path))
+    [cause] = add_description_lines(
+        [Finding("clock rate", "c", values={"ratio": ratio})], log, by_pose=True
+    )
+    assert set(cause.fields) == {f"{name}.time.scale" for name in ("wrench", "imu", "pose")}
+    for value in cause.fields.values():
+        assert value == pytest.approx(scale / ratio, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("force", "torque", "factor", "name", "value"),
     [
