@@ -313,9 +313,8 @@ def _inspect_clock_and_flag_usable_rows(
         figures |= {"rate_hz": time.rate, "duration_s": float(np.ptp(t)) if num_rows else 0.0}
         return [], np.ones(num_rows, bool)
     stamps, figures["episodes"] = time_stamps_and_num_episodes(time, table, at)
-    highest = np.fmax.accumulate(stamps)
-    usable = np.isfinite(stamps)
-    usable[1:] &= stamps[1:] > highest[:-1]
+    before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps[:-1]]))
+    usable = np.isfinite(stamps) & (stamps > before)
     t = stamps[np.isfinite(stamps)]
     steps = np.diff(t)
     forward = steps[steps > 0]
