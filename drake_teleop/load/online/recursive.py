@@ -175,7 +175,7 @@ class RecursiveEstimator(ABC):
         sample = np.concatenate(parts, dtype=np.float64)
         if not np.abs(sample).max() <= numeric.MAX_ARRAY_VALUE:
             for name, part in zip(("wrench", "s", "omega", "alpha"), parts, strict=True):
-                numeric.finite_array(name, part, len(part))
+                numeric.finite_array(name, part, *np.shape(part))
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 
