@@ -72,14 +72,14 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected_fields_and_names_by_cause(causes, log, by_pose=True)[0]
-    ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
-    text = _yaml_value("wrench.torque.scale", ratio)
+    force, torque = fields["wrench.force.scale"], fields["wrench.torque.scale"]
+    likely = force * 10.0 ** -round(np.log10(abs(mass)))
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
         f" {log.described.wrench.force.unit}; set wrench.force.scale to the value of one unit of"
-        " the file (a power of ten that gives a load of a few kg:"
-        f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and wrench.torque.scale to {text} times that"
+        f" the file (a load of a few kg is given by {_yaml_value('wrench.force.scale', likely)})"
+        f" and wrench.torque.scale to {_yaml_value('wrench.torque.scale', torque / force)} times"
+        " that"
         f"{note_that_table_needs_description(log.source)}"
     )
 
