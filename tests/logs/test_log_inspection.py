@@ -102,15 +102,25 @@ def test_two_errors_at_once_are_both_named(tmp_path: Path) -> None:
 def test_repeated_rows_are_named(tmp_path: Path) -> None:
     found = findings(tmp_path, {key: np.repeat(x, 2, axis=0) for key, x in good().items()})
     assert set(found) == {"clock jump", "repeated rows"}
-    assert "every value is held for 2 rows" in found["repeated rows"]
+    expected = "every value is held for 2 rows: new values come at 500 Hz, not 1000 Hz"
+    assert expected in found["repeated rows"]
+
+
+@pytest.mark.parametrize("rows_per_stamp", [1, 2, 5])
+def test_rate_counts_rows_that_share_a_time_stamp(rows_per_stamp: int) -> None:
+    t, figures = 10.0 + 0.01 * np.repeat(np.arange(50.0), rows_per_stamp), dict[str, Any]()
+    time = SimpleNamespace(column="t", unit="s", nanoseconds=None)
+    table = Table(Path("log.csv"), {"t": t})
+    _inspect_clock_and_flag_usable_rows("log", time, table, len(t), figures)
+    assert figures["rate_hz"] == pytest.approx(100.0 * rows_per_stamp)
 
 
 @pytest.mark.parametrize(("empty", "rows"), [([], 6), ([0], 5), ([0, 1], 4), ([0, 3, 5], 3)])
 def test_row_after_an_empty_time_stamp_is_usable(empty: list[int], rows: int) -> None:
     t = np.arange(6.0)
     t[empty] = np.nan
-    table, time = Table(Path("log.csv"), {"t": t}), SimpleNamespace(column="t", unit="s")
-    time.nanoseconds = None
+    time = SimpleNamespace(column="t", unit="s", nanoseconds=None)
+    table = Table(Path("log.csv"), {"t": t})
     usable = _inspect_clock_and_flag_usable_rows("log", time, table, 6, {})[1]
     assert usable.sum() == rows and not usable[empty].any()
 
