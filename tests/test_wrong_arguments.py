@@ -17,6 +17,7 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.scenario import replace
@@ -96,6 +97,10 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "identify": (lambda: dt.identify(N3, N3, N3, N3), "wrench"),
     "a delay": (lambda: dt.identify(N6, N3, N3, N3, delay_s=HALF), "delay_s"),
     "noise": (lambda: identify_batch(N6, N3, N3, N3, noise=HALF), "noise"),
+    "two axes of noise": (lambda: NoiseStd(s=[0.1, 0.2]), "noise.s"),
+    "noise in words": (lambda: NoiseStd(alpha=HALF), "noise.alpha"),
+    "a table of walks": (lambda: NoiseStd(walk=N3), "noise.walk"),
+    "negative noise": (lambda: NoiseStd(omega=-0.1), "noise.omega"),
     "a plant": (lambda: dt.AddWristSensor(None, 7, None), "AddWristSensor"),
     "a hand": (lambda: dt.tune("contact_transition", hands=("strong",)), "hands"),
     "a wall": (lambda: dt.tune("contact_transition", walls=(-1.0, 20.0)), "walls"),

@@ -116,14 +116,13 @@ def scaled_wrench(
     if weights != inertias and gravity is None:
         raise unknown_gravity_error("gravity", "pass gravity, g in S, for each sample")
     phis = finite_array("phi_gripper", phi_gripper, 10), finite_array("phi_object", phi_object, 10)
-    leading, rows = broadcast_to_rows(
-        wrench=(wrench, 6), offsets=(offsets, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
-    )
-    out, down = np.empty_like(rows[0]), np.empty((0, 3))
-    excess = weights[0] - inertias[0], weights[1] - inertias[1]
+    named = {"wrench": (wrench, 6), "offsets": (offsets, 6)}
+    named |= {"s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
     if weights != inertias and gravity is not None:
-        wrenches = rows[0].reshape(*leading, 6)
-        _, (down, _) = broadcast_to_rows(gravity=(gravity, 3), wrench=(wrenches, 6))
+        named["gravity"] = gravity, 3
+    leading, rows = broadcast_to_rows(**named)
+    down = rows.pop() if "gravity" in named else np.empty((0, 3))
+    out, excess = np.empty_like(rows[0]), (weights[0] - inertias[0], weights[1] - inertias[1])
     _scaled_wrenches_of_rows(*rows, phis, scales, down, excess, out)
     return out.reshape(*leading, 6)
 

@@ -307,8 +307,10 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
         what = f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)"
         remedy = "give the gripper alone as gripper, and the record with the object as the load"
         raise DrakeTeleopError(what, where="gripper", remedy=remedy)
+    precise = is_precise_enough(gripper.standard_deviations, gripper.phi)
+    withdrawn = precise & ~gripper.identifiable & ~gripper.prior_dominated
     identifiable = is_precise_enough(deviations, phi) & ~undetermined
-    identifiable[6:] &= total.identifiable[6:]
+    identifiable[6:] &= total.identifiable[6:] & ~withdrawn[6:].any()
     return replace(
         total,
         phi=phi,

@@ -70,12 +70,12 @@ class NoiseStd:
     motion: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        nonnegative_array("noise.walk", np.broadcast_to(self.walk, 12), 12)
-        rows = [
-            nonnegative_array(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
-            for name in ("s", "omega", "alpha")
-        ]
-        object.__setattr__(self, "motion", np.stack(rows))
+        rows = []
+        for name, size in (("s", 3), ("omega", 3), ("alpha", 3), ("walk", 12)):
+            value = getattr(self, name)
+            rows.append(value if np.ndim(value) else np.full(size, value))
+            nonnegative_array(f"noise.{name}", rows[-1], size)
+        object.__setattr__(self, "motion", np.stack(rows[:3]))
         if self.wrench is not None:
             positive_array("noise.wrench", self.wrench, 6)
 

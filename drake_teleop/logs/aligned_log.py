@@ -103,7 +103,7 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: aligned log; if the robot has removed the weight, `specific_force` is the acceleration.
+        log: if the robot has removed the weight, `specific_force` is the acceleration, `gravity` 0.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
         log_with_differentiated_motion: the same with differentiated motion, if requested.
@@ -183,10 +183,11 @@ def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:
 
 
 def replace_specific_force_by_acceleration(log: Log) -> Log:
-    """Return the log with the acceleration, specific force + gravity, as its `specific_force`."""
+    """Return the log with the acceleration as its `specific_force`, and a `gravity` of zero."""
     if log.gravity is None:
         raise removed_weight_needs_orientation_error(log.source)
-    return replace(log, specific_force=log.specific_force + log.gravity)
+    s = log.specific_force + log.gravity
+    return replace(log, specific_force=s, gravity=np.zeros_like(s))
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, find_runs_of_true, width_and_centre_of_narrowest_half
 from drake_teleop.load.contact import detection
-from drake_teleop.load.contact.detection import fit_noise_floor
+from drake_teleop.load.contact.detection import MIN_NOISE_FLOOR_SAMPLES, MIN_WRENCH_NOISE_STD
 from drake_teleop.load.contact.noise_floor import (
     THRESHOLD_MARGIN,
     DetectorSamples,
@@ -21,9 +22,7 @@ from drake_teleop.load.contact.noise_floor import (
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
-MIN_NOISE_FLOOR_SAMPLES = 100
-# Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
-_MIN_NOISE_FLOOR = np.repeat([1e-3, 1e-4], 3)
+_MAX_RATE_RATIO_OF_SUMS = 1.25  # of log and free motion, for statistics of several samples
 # Without orientation, gravity is the specific force below this frequency.
 _GRAVITY_LOW_PASS_CUTOFF_HZ = 0.5
 _MAX_QUIET_WRENCH_OVER_NOISE = 4.0
@@ -98,23 +97,29 @@ def detect_contact(
     judged = rows.select_rows(inner)
     if len(judged.contact) < MIN_NOISE_FLOOR_SAMPLES:
         return None
-    hold = round(period / dt)
-    # A held value decays by the factor e within a period.
+    hold, column = round(period / dt), statistic_index(statistic)
+    fade = math.exp(-dt / period)  # a held value decays by the factor e within a period
     if free is None:
-        fade = math.exp(-dt / period)
         floor, threshold, train = _fit_noise_floor_and_threshold(
             judged, dt, hold, fade, covariance, statistic
         )
     else:
+        ratio = max(dt, free[1]) / min(dt, free[1])
+        if column > 0 and ratio > _MAX_RATE_RATIO_OF_SUMS:
+            what = f"{1.0 / free[1]:.4g} Hz is not the rate of the log, {1.0 / dt:.4g} Hz, as the"
+            what += f" sums of statistic {statistic!r} require"
+            remedy = "use statistic `level`, or free motion with the rate of the log"
+            raise DrakeTeleopError(what, where="free", remedy=remedy)
         train = free[0].select_rows(_rows_far_from_ends_and_edges(free[0], free[1], period))
-        floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
+        floor = detection.fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
         threshold = max(detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(statistic))
+        floor = replace(floor, fade=fade)
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
     detector = detection.ContactDetector(floor, threshold, statistic=statistic, hold=hold)
     values[inner] = detection.statistics_of_log(floor, *judged)
     touched[inner] = _remove_hold_after_contact(detector.detect(*judged), hold)
     if free is None:
-        _remove_brief_weak_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
+        _remove_brief_weak_contacts(touched, values[:, column], threshold, hold)
     return Detection(
         noise_floor=floor,
         statistic=statistic,
@@ -153,7 +158,9 @@ def _fit_noise_floor_and_threshold(
         quiet = selected = np.ones(n, bool)
     block_of_row = np.minimum(np.arange(n) // block, n // block - 1)
     for _ in range(_QUIET_HALF_ITERATIONS if n >= _MIN_FLOOR_BLOCKS * block else 0):
-        floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
+        floor = detection.fit_noise_floor(
+            *rows.select_rows(quiet & selected), covariance, fade=fade
+        )
         level = detection.statistics_of_log(floor, *rows)[:, 0]
         power = np.bincount(block_of_row, level**2) / np.bincount(block_of_row)
         half = (power <= np.median(power))[block_of_row]
@@ -162,7 +169,7 @@ def _fit_noise_floor_and_threshold(
         quiet = half
     for attempt in range(_NUM_CONTACT_REMOVAL_ROUNDS):
         train = rows.select_rows(quiet & selected)
-        floor = fit_noise_floor(*train, covariance, fade=fade)
+        floor = detection.fit_noise_floor(*train, covariance, fade=fade)
         values = detection.statistics_of_log(floor, *train)[:, statistic_index(statistic)]
         reached = _expected_maximum_in_free_motion(values, block, n)
         if attempt > 0:
@@ -213,7 +220,7 @@ def _notes_if_mostly_contact(
             f"{100 * touched.mean():.0f} % of the record are contact: the rest is too short to"
             f" determine the noise floor{remedy}",
         )
-    noise_ratio = float((floor.noise / np.maximum(residual_rms, _MIN_NOISE_FLOOR)).max())
+    noise_ratio = float((floor.noise / np.maximum(residual_rms, MIN_WRENCH_NOISE_STD)).max())
     if noise_ratio > _MAX_NOISE_FLOOR_OVER_FIT_RESIDUAL:
         return (
             f"the noise floor at rest is {noise_ratio:.0f} times the residual of the"
@@ -255,12 +262,12 @@ def noise_floor(contact: Array) -> Array:
     floor = width_and_centre_of_narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
-        before = quiet
-        quiet = _find_quiet_samples(contact, np.maximum(floor, _MIN_NOISE_FLOOR))
+        floor = np.maximum(floor, MIN_WRENCH_NOISE_STD)
+        before, quiet = quiet, _find_quiet_samples(contact, floor)
         if np.array_equal(before, quiet) or not quiet.any():
             break
         floor = np.sqrt(np.mean(contact[quiet] ** 2, axis=0))
-    return np.maximum(floor, _MIN_NOISE_FLOOR)
+    return np.maximum(floor, MIN_WRENCH_NOISE_STD)
 
 
 def _find_quiet_samples(contact: Array, floor: Array) -> NDArray[np.bool_]:

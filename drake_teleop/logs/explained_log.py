@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
@@ -21,7 +21,7 @@ from drake_teleop.logs.causes.explain import (
     explain_misfit,
     fit_with_missing_acceleration,
 )
-from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
+from drake_teleop.logs.causes.instants import MAX_NOISE_LAG, BlockMeans, block_means_of_record
 from drake_teleop.logs.causes.intervals import bias_of_load_by_alpha_noise
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
@@ -72,14 +72,14 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected_fields_and_names_by_cause(causes, log, by_pose=True)[0]
-    ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
-    text = _yaml_value("wrench.torque.scale", ratio)
+    force, torque = fields["wrench.force.scale"], fields["wrench.torque.scale"]
+    likely = force * 10.0 ** -round(np.log10(abs(mass)))
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
         f" {log.described.wrench.force.unit}; set wrench.force.scale to the value of one unit of"
-        " the file (a power of ten that gives a load of a few kg:"
-        f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and wrench.torque.scale to {text} times that"
+        f" the file (a load of a few kg is given by {_yaml_value('wrench.force.scale', likely)})"
+        f" and wrench.torque.scale to {_yaml_value('wrench.torque.scale', torque / force)} times"
+        " that"
         f"{note_that_table_needs_description(log.source)}"
     )
 
@@ -141,8 +141,8 @@ def _yaml_value(name: str, value: Any) -> str:
         return str(value)
     if name in ("wrench.frame", "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
         return "sensor"
-    if name in ("wrench.force.scale", "wrench.torque.scale"):
-        factors = [f"{x:.6g}" for x in value]
+    if name.endswith(".scale"):
+        factors = [f"{x:.6g}" for x in np.atleast_1d(value)]
         return factors[0] if len(set(factors)) == 1 else f"[{', '.join(factors)}]"
     exact = np.round(value, _DECIMALS_OF_FIELD.get(name, 6)) + 0.0
     return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
@@ -224,7 +224,8 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitE
         return block_means_of_log(remove_delay(log, delay_s + more_s))
 
     data = means_at_additional_delay(0.0)
-    if data.used.sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
+    lengths = np.diff(find_runs_of_true(data.used)) - MAX_NOISE_LAG  # rows with predecessors
+    if lengths[lengths > 0].sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
         return None
     why = explain_misfit(data, means_at_additional_delay, log.estimated)
     why = fit_with_missing_acceleration(why) if why.is_acceleration_missing else why

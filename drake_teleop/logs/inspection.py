@@ -313,9 +313,8 @@ def _inspect_clock_and_flag_usable_rows(
         figures |= {"rate_hz": time.rate, "duration_s": float(np.ptp(t)) if num_rows else 0.0}
         return [], np.ones(num_rows, bool)
     stamps, figures["episodes"] = time_stamps_and_num_episodes(time, table, at)
-    highest = np.fmax.accumulate(stamps)
-    usable = np.isfinite(stamps)
-    usable[1:] &= stamps[1:] > highest[:-1]
+    before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps[:-1]]))
+    usable = np.isfinite(stamps) & (stamps > before)
     t = stamps[np.isfinite(stamps)]
     steps = np.diff(t)
     forward = steps[steps > 0]
@@ -325,9 +324,9 @@ def _inspect_clock_and_flag_usable_rows(
     median = float(np.median(forward))
     between = figures["episodes"] - 1
     gaps = int((steps > min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum()) - between
-    back = int((steps <= 0).sum())
-    longest = float(forward.max())
-    figures |= {"rate_hz": 1 / median, "duration_s": float(t[-1] - t[0]), "longest_gap_s": longest}
+    back, longest = int((steps <= 0).sum()), float(forward.max())
+    rate = len(t) / len(np.unique(t)) / median  # of rows, which may share time stamps
+    figures |= {"rate_hz": rate, "duration_s": float(t[-1] - t[0]), "longest_gap_s": longest}
     figures |= {"gaps": gaps, "clock_jumps": back}
     findings = []
     if gaps:

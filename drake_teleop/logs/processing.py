@@ -18,6 +18,7 @@ from drake_teleop.load import compensation
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.contact.detection import MIN_NOISE_FLOOR_SAMPLES
 from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales, statistic_index
 from drake_teleop.load.identification import (
     PARAMETER_NAMES,
@@ -57,7 +58,6 @@ from drake_teleop.logs.check.nonlinear_sensor import error_of_load_by_nonlinear_
 from drake_teleop.logs.check.sensor_filter import sensor_filter_finding
 from drake_teleop.logs.check.wrench_channels import wrench_channel_finding
 from drake_teleop.logs.contact import (
-    MIN_NOISE_FLOOR_SAMPLES,
     Detection,
     detect_contact,
     noise_floor,
@@ -408,7 +408,9 @@ def _fit_load_to_filtered_log(
 ) -> LoadFitOfLog:
     delay_s, source = choose_delay(log, cutoff_hz, delay)
     log = remove_delay(log, delay_s)
-    log = low_pass_log(log, cutoff_hz).select_rows(is_far_from_gaps(log, cutoff_hz))
+    known = is_far_from_gaps(log, cutoff_hz)
+    _require_any_sample(log, known)
+    log = low_pass_log(log, cutoff_hz).select_rows(known)
     fit = identify_batch(
         log.wrench,
         *log.motion,
@@ -419,6 +421,12 @@ def _fit_load_to_filtered_log(
         gain_std=log.gain_std,
     )
     return LoadFitOfLog(log, fit, delay_s, source)
+
+
+def _require_any_sample(log: Log, usable: NDArray[np.bool_]) -> None:
+    if not usable.any():
+        what = "all samples are near gaps or ends of the record, within the reach of the low-pass"
+        raise DrakeTeleopError(what, where=log.source, remedy="raise the cut-off, or avoid gaps")
 
 
 def _is_misfit_explainable(log: Log, by_splines: bool) -> bool:
@@ -592,6 +600,7 @@ def _read_and_eliminate_log(
         raise DrakeTeleopError(what, where="causal", remedy="remove it")
     known = is_far_from_gaps(log, cutoff_hz)
     shown, edge = log.select_rows(known), aligned.edge[known]
+    _require_any_sample(log, ~edge)
     parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
 
@@ -623,8 +632,7 @@ def _read_and_eliminate_log(
         raise compensation.unknown_gravity_error(where, "add an orientation, or use sigma alone")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
-        gravity = rest if removed else log.gravity
-        weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
+        weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
         weightless = low_pass_outside_gaps(weightless)
         gravity_only = weightless - choose_offsets(weightless)[0]
     contact, scaled = map(low_pass_outside_gaps, contact_and_scaled(offsets, log.motion))
@@ -634,7 +642,8 @@ def _read_and_eliminate_log(
         motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            causal_offsets = untouched[_rows_of_contact_free_start(log, causal_tare_s)].mean(axis=0)
+            rows = _contact_free_rows(log, known, causal_tare_s)
+            causal_offsets = untouched[rows].mean(axis=0)
         both = contact_and_scaled(causal_offsets, motion)
         options: dict[str, Any] = {"delay_s": aligned.delay_s, "mode": causal}
         late = compute_causal_wrench(*both, log.dt, cutoff_hz=cutoff_hz, **options)
@@ -677,10 +686,10 @@ def _rows_in_tare_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bo
     return rows
 
 
-def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
-    rows = log.t - log.t[0] < length_s
-    if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
-        what = f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples"
+def _contact_free_rows(log: Log, known: NDArray[np.bool_], length_s: float) -> NDArray[np.bool_]:
+    rows = known & (log.t - log.t[0] < length_s)
+    if (rows == known).all() or rows.sum() < _MIN_TARE_SAMPLES:
+        what = f"the first {length_s:g} s contain {rows.sum()} of {known.sum()} samples"
         what += f" ({_MIN_TARE_SAMPLES} or more are required, but not all)"
         remedy = "give another duration of the contact-free start [s]"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)

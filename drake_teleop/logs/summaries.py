@@ -73,7 +73,7 @@ def summarize_grasped_object(alone: Identification) -> dict[str, Any]:
 
 def notes_on_grasped_object(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < identification.MIN_SIGNIFICANT_STDS * deviation:
+    if alone.mass < identification.MIN_SIGNIFICANT_STDS * deviation < np.inf:
         excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
         return [f"no object: the total mass exceeds the gripper's by {excess}"]
     if not alone.identifiable[6:].all() or alone.physically_consistent:

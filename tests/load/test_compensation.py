@@ -154,6 +154,17 @@ def test_equal_shares_are_sigma_to_the_last_bit(gravity):
     assert sigma.tobytes() == apart.tobytes()
 
 
+@pytest.mark.parametrize("shape", [(3,), (1, 3), (4, 3), (2, 4, 3)])
+def test_one_sample_with_several_gravities_is_scaled_for_each(shape):
+    gravity = np.random.default_rng(1).normal(size=shape)
+    found = scaled_wrench(
+        np.zeros(6), np.zeros(6), *np.zeros((3, 3)), TOOL, 0 * TOOL, **named(0.0, 0.0, 1.0),
+        sigma_weight=0.5, sigma_inertia=0.0, gravity=gravity,
+    )  # fmt: skip
+    expected = 0.5 * non_contact_wrench(-gravity, np.zeros(3), np.zeros(3), TOOL)
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
 def test_different_shares_need_gravity():
     with pytest.raises(DrakeTeleopError, match=r"gravity: is unknown.*; pass gravity"):
         scaled_wrench(

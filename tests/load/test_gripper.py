@@ -68,6 +68,28 @@ def test_parameters_undetermined_for_the_gripper_are_undetermined_for_the_object
     assert consistency_margin(found)[1] == np.inf
 
 
+@pytest.mark.parametrize(
+    ("withdrawn", "identified"), [((6, 16), 6), ((6, 7), 6), ((8, 9), 6), ((0, 6), 16)]
+)
+def test_object_is_not_identified_if_the_gripper_is_withdrawn(
+    withdrawn: tuple[int, int], identified: int
+) -> None:
+    """Findings about a record withdraw its precise load; the offsets are those of the total."""
+    total, gripper = estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2)
+    known = gripper.identifiable.copy()
+    known[slice(*withdrawn)] = False
+    found = load_of_object(total, replace(gripper, identifiable=known))
+    assert found.identifiable.tolist() == [True] * identified + [False] * (16 - identified)
+    assert set(found.verdicts[identified:]) <= {"weakly"}
+
+
+def test_an_imprecise_gripper_does_not_withdraw_a_precise_object() -> None:
+    gripper = estimate(0.05 * GRIPPER, 2)
+    uncertain = replace(gripper, covariance=900.0 * gripper.covariance)
+    uncertain = replace(uncertain, identifiable=np.zeros(16, bool))
+    assert load_of_object(estimate(0.05 * GRIPPER + OBJECT, 1), uncertain).identifiable[6]
+
+
 def test_exchanged_files_are_an_error() -> None:
     total, gripper = estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2)
     with pytest.raises(DrakeTeleopError, match=r"-0\.7\d* kg for the object.*gripper alone"):

@@ -189,8 +189,12 @@ def test_error_names_the_invalid_input_and_keeps_the_estimate():
     F, motion = noisy_record(5)
     estimator = run_estimator(F, motion)
     before = estimator.phi
-    with pytest.raises(DrakeTeleopError, match=r"^wrench: contains NaN or infinity"):
-        estimator.update(np.full(6, np.nan), REST, REST, REST)
+    for value, what in ((np.nan, "is not finite"), (np.inf, "is not finite"), (-1e200, "is -1e")):
+        for name, place in (("wrench", 0), ("s", 6), ("omega", 9), ("alpha", 14)):
+            sample = np.zeros(15)
+            sample[place] = value
+            with pytest.raises(DrakeTeleopError, match=f"^{name}: {what}.* at index"):
+                estimator.update(*np.split(sample, [6, 9, 12]))
     with pytest.raises(
         DrakeTeleopError, match=r"^sample: wrench, s, omega, alpha of one sample have shapes"
     ):

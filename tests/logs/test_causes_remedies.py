@@ -18,7 +18,11 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.logs.causes.cause import Finding
-from drake_teleop.logs.explained_log import _correct_unit_or_torque_scale, add_description_lines
+from drake_teleop.logs.explained_log import (
+    _correct_unit_or_torque_scale,
+    add_description_lines,
+    implausible_mass_message,
+)
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
 
@@ -281,6 +285,23 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     assert read_log(path).wrench == pytest.approx(right, rel=1e-5, abs=1e-4)
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.004, 0.0015])
+@pytest.mark.parametrize("ratio", [1.02, 0.97, 30.0])
+def test_line_of_a_wrong_clock_rate_has_six_digits(
+    scale: float, ratio: float, tmp_path: Path
+) -> None:
+    record = Record.simulate(seconds=1.0)
+    lines = {"time": {"column": "t", "scale": scale}}
+    record.wrench_lines = record.pose_lines = record.imu_lines = lines
+    log = read_log(record.write(tmp_path))
+    [cause] = add_description_lines(
+        [Finding("clock rate", "c", values={"ratio": ratio})], log, by_pose=True
+    )
+    assert set(cause.fields) == {f"{name}.time.scale" for name in ("wrench", "imu", "pose")}
+    for value in cause.fields.values():
+        assert value == pytest.approx(scale / ratio, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("force", "torque", "factor", "name", "value"),
     [
@@ -358,6 +379,24 @@ def test_counts_of_two_scales_give_both_scales(tmp_path: Path) -> None:
     [units] = [finding.message for finding in found.findings if finding.name == "units"]
     assert "1.37e+04 kg is implausible" in units
     assert "give" in units and "0.0001)" in units and "torque.scale to 0.1 times that" in units
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0, -1e-3, [1e-3, 2e-3, -1e-3]])
+@pytest.mark.parametrize("mass", [1370.0, -1.37e6])
+def test_scale_for_a_load_of_a_few_kg_includes_the_given_scale(
+    scale: Any, mass: float, tmp_path: Path
+) -> None:
+    record = Record.simulate(seconds=1.0)
+    record.described(1, np.eye(3), scale, 1.0)
+    message = implausible_mass_message(mass, [], read_log(record.write(tmp_path)))
+    assert message is not None
+    stated = yaml.safe_load(message.partition("is given by ")[2].partition(")")[0])
+    np.testing.assert_allclose(float_list(stated), float_list(scale) * 1.37 / abs(mass), rtol=1e-5)
+
+
+def float_list(value: Any) -> np.ndarray:
+    """Return numbers (3,); PyYAML reads 1e-06 as a text."""
+    return np.array(value, float) + np.zeros(3)
 
 
 def test_inspect_and_repeated_fits_accept_a_removed_weight(tmp_path: Path) -> None:

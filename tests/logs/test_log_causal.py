@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from known_motion import motion_at
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass, compute_causal_wrench, filter_lag
+from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.read.canonical import Log, write_log
 
 DT, CUTOFF = 1e-3, 30.0
 
@@ -65,3 +74,57 @@ def test_unusable_options_raise() -> None:
         compute_causal_wrench(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="soon")
     same = compute_causal_wrench(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="delayed")
     assert same.lag_s == 0.0
+
+
+PHI = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
+OFFSETS = np.array([1.0, 2.0, -1.0, 0.1, 0.0, 0.2])
+LOAD = Identification(
+    PHI, np.zeros(6), 1e-8 * np.eye(16), np.ones(16, bool), 1.0, 0.0, np.full(6, 0.01), "true", 999
+)
+
+
+def log_with_gaps(path: Path, period: float, recorded: float, seconds: float = 12.0) -> Path:
+    """Write a log at 500 Hz that lacks the end of each `period` [s], after `recorded` [s]."""
+    t = np.arange(0.0, seconds, 2e-3)
+    at = motion_at(t)
+    motion = at.specific_force, at.omega, at.alpha
+    wrench = non_contact_wrench(*motion, PHI) + OFFSETS
+    wrench += np.random.default_rng(1).normal(size=wrench.shape) * np.repeat([0.02, 0.002], 3)
+    log = Log(t, wrench, *motion)
+    log = replace(log.select_rows(t % period < recorded), source=str(path))
+    write_log(log, path)
+    return path
+
+
+@pytest.mark.parametrize(("period", "recorded"), [(12.0, 12.0), (0.6, 0.4), (0.9, 0.6)])
+def test_contact_free_start_excludes_gaps(period: float, recorded: float, tmp_path: Path) -> None:
+    log = log_with_gaps(tmp_path / "log.parquet", period, recorded, 6.0)
+    options = {"delay": 0.0, "causal": "delayed", "causal_tare_s": 1.5}
+    found = eliminate_log(log, LOAD, **options).causal
+    assert found is not None
+    np.testing.assert_allclose(found.offsets, OFFSETS, atol=0.012)
+
+
+@pytest.mark.parametrize(
+    ("period", "recorded", "identifies"), [(3.0, 2.5, False), (2.8, 2.2, False), (4.0, 3.4, True)]
+)
+def test_low_pass_that_reaches_from_gap_to_gap_is_an_error(
+    period: float, recorded: float, identifies: bool, tmp_path: Path
+) -> None:
+    """`eliminate` needs samples that are far from the ends, too."""
+    log = log_with_gaps(tmp_path / "log.parquet", period, recorded, 6.0)
+    message = r"log.*: all samples are near gaps.*cut-off"
+    with pytest.raises(DrakeTeleopError, match=message):
+        eliminate_log(log, LOAD, delay=0.0, cutoff_hz=1.0)
+    if not identifies:
+        with pytest.raises(DrakeTeleopError, match=message):
+            identify_log(log, delay=0.0, cutoff_hz=1.0)
+
+
+@pytest.mark.parametrize("recorded", [0.12, 0.15])
+def test_bursts_that_are_too_short_for_the_noise_model_have_no_causes(
+    recorded: float, tmp_path: Path
+) -> None:
+    """Block means of 20 ms have no four predecessors in a burst."""
+    found = identify_log(log_with_gaps(tmp_path / "log.parquet", 0.25, recorded, 24.0), delay=0.0)
+    assert found.causes == () and found.identification.mass == pytest.approx(1.2, rel=0.01)

@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs.aligned_log import replace_specific_force_by_acceleration
 from drake_teleop.logs.contact import (
     Detection,
     DetectorSamples,
     detect_contact,
     noise_floor,
+    samples_for_detector,
     summarize_contacts,
 )
 from drake_teleop.logs.read.alignment import low_pass
+from drake_teleop.logs.read.canonical import Log
 
 DT, CUTOFF = 2e-3, 30.0
 STD = np.array([0.2, 0.3, 0.4, 0.02, 0.03, 0.04])
@@ -24,7 +28,11 @@ def noise_of(seed: int, n: int = 6000) -> np.ndarray:
 
 
 def detect(
-    contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None, free_dt: float = DT
+    contact: np.ndarray,
+    dt: float = DT,
+    free: np.ndarray | None = None,
+    free_dt: float = DT,
+    statistic: str = "level",
 ) -> Detection:
     """Return the detection for a contact wrench of a sensor at rest."""
 
@@ -33,7 +41,8 @@ def detect(
         return DetectorSamples(wrench, up, still, still, still)
 
     calm = None if free is None else (samples_at_rest(free), free_dt)
-    found = detect_contact(samples_at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, free=calm)
+    options = {"free": calm, "statistic": statistic}
+    found = detect_contact(samples_at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, **options)
     assert found is not None
     return found
 
@@ -46,12 +55,41 @@ def test_noise_floor_excludes_contact() -> None:
     assert (noise_floor(np.zeros((100, 6))) == np.repeat([1e-3, 1e-4], 3)).all()
 
 
-def test_log_of_free_motion_may_have_another_rate() -> None:
-    free_dt = 0.5 * DT
+@pytest.mark.parametrize("ratio", [0.25, 0.5, 1.0, 3.0])
+def test_log_of_free_motion_may_have_another_rate(ratio: float) -> None:
+    free_dt = ratio * DT
     found = detect(noise_of(1, 1000), free=noise_of(2, 2000), free_dt=free_dt)
-    assert found.noise_floor.fade == pytest.approx(np.exp(-free_dt * CUTOFF))
+    # The fade is per sample of the judged log.
+    assert found.noise_floor.fade == pytest.approx(np.exp(-DT * CUTOFF))
     judged = 2000 - 2 * round(1.0 / (CUTOFF * free_dt))
     assert found.free_duration_s == pytest.approx(judged * free_dt)
+
+
+@pytest.mark.parametrize("statistic", ["cusum", "glr"])
+@pytest.mark.parametrize("step", [1, 2, 8])
+def test_sums_are_refused_for_free_motion_of_another_rate(statistic: str, step: int) -> None:
+    """Noise that is correlated over samples of 2 ms is not correlated over steps of 16 ms."""
+    wrench, free = (low_pass(noise_of(seed, 8000), DT, CUTOFF) for seed in (1, 2))
+    rates = ({"dt": DT, "free_dt": step * DT}, {"dt": step * DT, "free_dt": DT})
+    for now, calm, rate in zip((wrench, wrench[::step]), (free[::step], free), rates, strict=True):
+        if step == 1:
+            assert not detect(now, free=calm, statistic=statistic, **rate).touched.any()
+            continue
+        with pytest.raises(DrakeTeleopError, match=f"^free: .* is not the rate.*'{statistic}'"):
+            detect(now, free=calm, statistic=statistic, **rate)
+        assert not detect(now, free=calm, **rate).touched.any()
+
+
+@pytest.mark.parametrize("size", [0.0, 2.0, 7.5])
+def test_a_removed_weight_is_no_acceleration_of_the_detector(size: float) -> None:
+    n = 500
+    rng = np.random.default_rng(2)
+    gravity = rng.normal(size=3) + np.zeros((n, 3))
+    a = size * np.tile([0.6, 0.0, -0.8], (n, 1))
+    log = Log(DT * np.arange(n), np.zeros((n, 6)), a - gravity, 0 * a, 0 * a, gravity=gravity)
+    for given in (log, replace_specific_force_by_acceleration(log)):
+        found = samples_for_detector(given, np.zeros((n, 6)), CUTOFF).acceleration
+        np.testing.assert_allclose(found, a, atol=1e-9)
 
 
 def test_contacts_have_their_times_and_peaks() -> None:

@@ -18,6 +18,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS, Log, write_log
+from drake_teleop.logs.summaries import notes_on_grasped_object
 
 GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
 DESCRIPTION = """
@@ -122,6 +123,21 @@ def test_note_reports_a_gripper_without_object(files: Path, tmp_path: Path) -> N
     summary = identify_command(log, tmp_path / "out", gripper=gripper, delay=0.0, quiet=True)
     assert any("no object" in note for note in summary["notes"])
     assert summary["object"]["identifiable"] == []
+
+
+@pytest.mark.parametrize(
+    ("mass", "std", "is_absent"),
+    [(0.7, np.inf, False), (0.7, 0.2, False), (0.001, 0.002, True), (-0.001, 0.002, True)],
+)
+def test_object_with_unknown_mass_is_not_reported_as_absent(
+    mass: float, std: float, is_absent: bool
+) -> None:
+    phi = phi_from_mass_com_inertia(mass, [0.0, 0.0, 0.1], 0.001 * mass * np.eye(3))
+    covariance = np.diag(np.where(np.arange(16) == 6, std**2, 1e-6))
+    load = Identification(
+        phi, np.zeros(6), covariance, np.zeros(16, bool), 1.0, 0.0, np.ones(6), "method", 100
+    )
+    assert any("no object" in note for note in notes_on_grasped_object(load)) == is_absent
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from collections import UserDict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs import processing
 from drake_teleop.logs.check.draft import draft_description
-from drake_teleop.logs.inspection import inspect_command
+from drake_teleop.logs.inspection import _inspect_clock_and_flag_usable_rows, inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
@@ -101,7 +102,27 @@ def test_two_errors_at_once_are_both_named(tmp_path: Path) -> None:
 def test_repeated_rows_are_named(tmp_path: Path) -> None:
     found = findings(tmp_path, {key: np.repeat(x, 2, axis=0) for key, x in good().items()})
     assert set(found) == {"clock jump", "repeated rows"}
-    assert "every value is held for 2 rows" in found["repeated rows"]
+    expected = "every value is held for 2 rows: new values come at 500 Hz, not 1000 Hz"
+    assert expected in found["repeated rows"]
+
+
+@pytest.mark.parametrize("rows_per_stamp", [1, 2, 5])
+def test_rate_counts_rows_that_share_a_time_stamp(rows_per_stamp: int) -> None:
+    t, figures = 10.0 + 0.01 * np.repeat(np.arange(50.0), rows_per_stamp), dict[str, Any]()
+    time = SimpleNamespace(column="t", unit="s", nanoseconds=None)
+    table = Table(Path("log.csv"), {"t": t})
+    _inspect_clock_and_flag_usable_rows("log", time, table, len(t), figures)
+    assert figures["rate_hz"] == pytest.approx(100.0 * rows_per_stamp)
+
+
+@pytest.mark.parametrize(("empty", "rows"), [([], 6), ([0], 5), ([0, 1], 4), ([0, 3, 5], 3)])
+def test_row_after_an_empty_time_stamp_is_usable(empty: list[int], rows: int) -> None:
+    t = np.arange(6.0)
+    t[empty] = np.nan
+    time = SimpleNamespace(column="t", unit="s", nanoseconds=None)
+    table = Table(Path("log.csv"), {"t": t})
+    usable = _inspect_clock_and_flag_usable_rows("log", time, table, 6, {})[1]
+    assert usable.sum() == rows and not usable[empty].any()
 
 
 def test_a_wrong_clock_is_named_to_the_millisecond(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ _NORMAL_STD_OVER_MEDIAN_DEVIATION = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
 _MIN_SAMPLES_TO_REJECT, _MAX_HUBER_SAMPLES, _MAX_FIT_STD_GROWTH = 12, 50_000, 2.0
-_NOTHING_REJECTED_NOTE = (
+NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " are indistinguishable from motion errors: no sample was rejected; check delay, scale and"
     " mounting"
@@ -126,7 +126,7 @@ def _fit_robust_least_squares(record: SampleRecord, options: EstimatorOptions) -
         moments = SecondMoments()
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
-            return replace(whole, note=_NOTHING_REJECTED_NOTE)
+            return replace(whole, note=NOTHING_REJECTED_NOTE)
         fit = _fit_total_least_squares(record, options, moments)
         form = fit.form
         if (rejected == previous).all():

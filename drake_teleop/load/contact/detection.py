@@ -104,8 +104,7 @@ def update_statistics(
             break
         best = max(best, _square_of_innovation_sum(memory, count, n) / (n * widths[m] * widths[m]))
         n *= 2
-    for i in range(6):
-        memory[here + i] = memory[INNOVATION_SUM_START + i]
+    memory[here : here + 6] = memory[INNOVATION_SUM_START:RING_BUFFER_START]
     memory[SAMPLE_COUNT_INDEX] += 1.0
     memory[STATISTICS_START] = level
     memory[STATISTICS_START + 1] = length * shrink
@@ -239,8 +238,8 @@ def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 MIN_NOISE_FLOOR_SAMPLES = 100
-# Lower limit of a noise floor [N, N m], as in `logs.contact`.
-_MIN_WRENCH_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
+# Lower limit of a noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
+MIN_WRENCH_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
 _MAX_VARIANCE_FITS, _VARIANCE_FIT_TOLERANCE = 20, 1e-4
 _MAX_LAG_ONE_CORRELATION, _MIN_SUM_WIDTH, _RARE_SUM_SHARE = 0.999, 0.1, 1e-3
 
@@ -274,13 +273,13 @@ def fit_noise_floor(
     for c in range(6):
         square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
-        variance = np.full(len(square), max(float(square.mean()), _MIN_WRENCH_NOISE_STD[c] ** 2))
+        variance = np.full(len(square), max(float(square.mean()), MIN_WRENCH_NOISE_STD[c] ** 2))
         for _ in range(_MAX_VARIANCE_FITS):
             previous = fitted[c].copy()
             weighted = np.column_stack([terms, square - explained]) / variance[:, None]
             R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
             fitted[c] = nnls(R[:, :3], R[:, 3])[0]
-            fitted[c, 0] = max(fitted[c, 0], _MIN_WRENCH_NOISE_STD[c] ** 2)
+            fitted[c, 0] = max(fitted[c, 0], MIN_WRENCH_NOISE_STD[c] ** 2)
             variance = terms @ fitted[c] + explained
             if np.allclose(fitted[c], previous, rtol=_VARIANCE_FIT_TOLERANCE, atol=0.0):
                 break

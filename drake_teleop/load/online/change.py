@@ -24,7 +24,7 @@ from drake_teleop.common.vectors import cholesky, copy_into
 from drake_teleop.load import regressor
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.recursive import PRIOR_STD
+from drake_teleop.load.online.recursive import MIN_NOISE_TO_PRIOR_VARIANCE, PRIOR_STD
 
 STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the change detector, by index."""
@@ -65,9 +65,6 @@ KNOWN_LOAD_SLICE = slice(_KNOWN_LOAD_START, _KNOWN_LOAD_START + 16)
 NEW_LOAD_SLICE = slice(_NEW_FILTER_START, _NEW_FILTER_START + 16)
 """Parts of the memory: [offsets; phi] of the known and of the new load."""
 _NEW_LOAD_COVARIANCE_SLICE = slice(NEW_LOAD_SLICE.stop, MEMORY_SIZE)
-
-# Smallest variance of a row relative to the sum of its terms, as in `recursive`.
-_MIN_NOISE_TO_PRIOR_VARIANCE = 1e-10
 
 
 @njit(cache=True)
@@ -130,7 +127,7 @@ def update_estimate_by_block_mean(estimate, V, wrench, root):
             gain[i] = value
             predicted += row[i] * value
             uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, _MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated) + predicted
+        total = max(1.0, MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated) + predicted
         chi += innovation * innovation / total
         for i in range(16):
             theta[i] += gain[i] * innovation / total

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop.common import numeric
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
@@ -30,7 +31,7 @@ MAX_SETTLED_RELATIVE_STD = 0.05
 _MIN_RELATIVE_INFORMATION_EIGENVALUE = 1e-16
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
-_MIN_NOISE_TO_PRIOR_VARIANCE = 1e-10
+MIN_NOISE_TO_PRIOR_VARIANCE = 1e-10
 
 
 @njit(cache=True)
@@ -69,7 +70,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual
                 innovation -= v * theta[6 + j]
                 predicted += v * gain[6 + j]
                 uncorrelated += v * v * P[6 + j, 6 + j]
-            variance = max(noise_std[c] * noise_std[c], _MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated)
+            variance = max(noise_std[c] * noise_std[c], MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated)
             inverse = 1.0 / (variance + predicted)
             share = innovation * inverse
             residual_square_sums[c] += variance * innovation * share
@@ -172,11 +173,9 @@ class RecursiveEstimator(ABC):
             remedy = "pass shapes (6,), (3,), (3,), (3,)"
             raise DrakeTeleopError(what, where="sample", remedy=remedy)
         sample = np.concatenate(parts, dtype=np.float64)
-        if not math.isfinite(sample.sum()):
-            named = zip(("wrench", "s", "omega", "alpha"), parts, strict=True)
-            wrong = ", ".join(name for name, part in named if not np.isfinite(part).all())
-            what, remedy = "contains NaN or infinity", "leave this sample out"
-            raise DrakeTeleopError(what, where=wrong or "sample", remedy=remedy)
+        if not np.abs(sample).max() <= numeric.MAX_ARRAY_VALUE:
+            for name, part in zip(("wrench", "s", "omega", "alpha"), parts, strict=True):
+                numeric.finite_array(name, part, *np.shape(part))
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from drake_teleop.common.numeric import Array, search_minimum
+from drake_teleop.logs.read.alignment import white_noise_deviations
 
 MAX_NOISE_LAG = 4  # order of the autoregressive noise
 CONSTANT_COLUMN, SPECIFIC_FORCE_SIGNALS, GRAVITY_SIGNALS = 0, slice(1, 4), slice(4, 7)
@@ -169,13 +170,6 @@ def _smooth_noisy_alpha_and_get_noise_share(y: Array, used: NDArray[np.bool_]) -
         alpha = savgol_filter(y[used][:, ALPHA_SIGNALS], width, 2, axis=0)
     y[np.flatnonzero(used)[:, None], np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop)] = alpha
     return share
-
-
-def white_noise_deviations(x: Array) -> Array:
-    """Return the standard deviation (k,) of white noise in smooth signals x (N, k)."""
-    # Column by column, to save memory.
-    medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
-    return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
 def _min_noise_variance_share(x: Array) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, position_of_parabola_minimum, samples_to_nearest_flag
+from drake_teleop.load.batch.methods import NOTHING_REJECTED_NOTE
 from drake_teleop.logs.pose_motion import spectra as spectral
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
@@ -295,11 +296,6 @@ def _clock_rate_change_and_chi_squared(spectra: Spectra) -> tuple[float, float]:
     return step, 2.0 * step**2 / float(inverse[0, 0] + 1e-300)
 
 
-NOTHING_REJECTED_NOTE = (
-    "the residual is large where the load moves and small where it rests, so disturbances"
-    " cannot be distinguished from errors of the motion: no sample was rejected; check delay,"
-    " scale and mounting"
-)
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
 _NORMAL_STD_OVER_MEDIAN_DEVIATION, _MAX_FIT_STD_GROWTH = 1.4826, 2.5
 _RESIDUAL_FILTER_CUTOFF_OVER_KNOT_RATE = 0.3
@@ -315,7 +311,7 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     window, grid = spectra.window, spectra.window.grid
     gain = 0.5 ** ((window.bands.frequency * spacing / _RESIDUAL_FILTER_CUTOFF_OVER_KNOT_RATE) ** 2)
     filtered = (x * gain[:, None] for x in (spectra.signals, window.wrench_spectrum))
-    x, y = (_spectrum_to_time_signal(spectrum, grid) for spectrum in filtered)
+    x, y = (np.fft.irfft(z, grid.transform_length, axis=0)[: len(grid.t)] for z in filtered)
     inside = window.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
@@ -345,12 +341,6 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     if _std_growth_by_rejection(test_signals, inside, inside & ~rejected) > _MAX_FIT_STD_GROWTH:
         return np.zeros(len(x), bool), NOTHING_REJECTED_NOTE
     return rejected, ""
-
-
-def _spectrum_to_time_signal(spectrum: spectral.ComplexArray, grid: WrenchGrid) -> Array:
-    full = np.zeros((grid.transform_length // 2 + 1, spectrum.shape[1]), np.complex128)
-    full[: len(spectrum)] = spectrum
-    return np.asarray(np.fft.irfft(full, grid.transform_length, axis=0)[: len(grid.t)])
 
 
 def _max_residuals_over_std(x: Array, y: Array, weights: Array, used: NDArray[np.bool_]) -> Array:
