@@ -130,7 +130,8 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         limits = device.parameters
         full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * limits.peak_force
         if isinstance(device, LeaderDevice):
-            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * limits.peak_torque[0]
+            reached = np.abs(shown[:, 3:]) >= _SHARE_AT_LIMIT * limits.peak_torque
+            full |= reached.any(axis=1) & limits.peak_torque.all()
             joints = result["master_state"][:, : device.num_joints]
             full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
         elif limits.peak_torque.all():
@@ -282,7 +283,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
         return
     t, intent = result.t, result["intent"][:, 4:]
     force = oscillation.high_pass_above_5_hz(t, result["force_to_master"][:, :3])
-    rows = round(_MIN_INTENT_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
+    rows = max(round(_MIN_INTENT_REST_S / (t[1] - t[0])), 1) if len(t) > 1 else 1
     largest, least = _trailing_maximum(intent, rows), -_trailing_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
