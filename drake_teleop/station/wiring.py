@@ -74,7 +74,10 @@ def build_with_log(
     for name in signals:
         builder.ExportOutput(outputs[name], name)
     wide = {
-        part: port for port, parts in COMBINED_PORTS.items() if port in outputs for part in parts
+        part: port
+        for port, parts in COMBINED_PORTS.items()
+        if {port, *parts} <= outputs.keys()
+        for part in parts
     }
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
     # One log for all ports: at 8 kHz each system with events costs time at every step.

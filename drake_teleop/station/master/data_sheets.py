@@ -49,7 +49,7 @@ class DeviceFigures:
     turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
     peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; 0: none"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; any 0: no torque"
     )
     size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
