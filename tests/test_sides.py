@@ -286,6 +286,18 @@ class Follower(LeafSystem):
         )
 
 
+@pytest.mark.parametrize("torques", [False, True])
+def test_contact_wrench_for_a_controller_requires_a_load_estimate(torques):
+    outputs = {"joint_torque": 6} if torques else {"pose_command": 7}
+    inputs = {"pose_command": 7, "contact_wrench_S": 6}
+    message = "contact_wrench_S of the controller requires a load estimate, but there is none; pass"
+    with pytest.raises(DrakeTeleopError, match=message):
+        MakeSlaveSide(Scenario(), controller=Silent(inputs, outputs))
+    for options in ({"load_estimate": np.ones(16)}, {}):
+        scenario = replace(Scenario(), load_estimator__enabled=not options)
+        MakeSlaveSide(scenario, controller=Silent(inputs, outputs), **options)
+
+
 SHORT_RUN = {"simulation__settle": 0.0, "simulation__duration": 0.05, "force_scaling__sigma": 1.0}
 
 

@@ -132,7 +132,7 @@ class Scenario:
 
     def without_environment(self) -> "Scenario":
         """Return a copy of the scenario without objects to touch."""
-        return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
+        return replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
     def has_no_network_or_passivity(self) -> bool:
@@ -229,12 +229,12 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
         data.get(name) or {} for name in ("wrist_sensor", "master", "joint_control")
     )
     preset = PRESETS.get(str(sensor.get("preset")), WristSensorConfig())
-    defaults = Scenario(wrist_sensor=copy.deepcopy(preset))
+    defaults = Scenario(wrist_sensor=preset)
     if master.get("figures") is not None:  # changes the data sheet
-        defaults.master.figures = copy.deepcopy(FIGURES.get(str(master.get("model"))))
+        defaults.master.figures = FIGURES.get(str(master.get("model")))
     if control.get("interface") is not None:
-        interface = POSITION_INTERFACE_PRESETS.get(str(control.get("servo")))
-        defaults.joint_control.interface = copy.deepcopy(interface)
+        servo = str(control.get("servo"))
+        defaults.joint_control.interface = POSITION_INTERFACE_PRESETS.get(servo)
     scenario = settings_without_range_check(Scenario, data, where, defaults)
     scenario.check(where)
     absolute: Scenario = config.with_absolute_paths(scenario, Path(where).parent)
@@ -266,6 +266,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     A DrakeTeleopError is raised for an invalid name or value.
     """
     expect_type(Scenario, scenario, "scenario")
+    scenario = copy.deepcopy(scenario)
     for name, value in changes.items():
         block, _, inner = name.partition("__")
         config.check_field_name(Scenario, block, f"scenario:{block}")

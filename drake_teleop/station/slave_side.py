@@ -72,11 +72,11 @@ def MakeSlaveSide(
         DrakeTeleopError: for an unreachable start, or if load estimate or noise floor is required.
     """
     check_scenario(scenario)
-    _check_load_is_known(scenario, load_estimate)
+    torques = _is_torque_controller(controller, scenario)
+    _check_load_is_known(scenario, load_estimate, controller)
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    torques = _is_torque_controller(controller, scenario)
     slave, sample, held = _add_slave_blocks(
         builder, scenario, load_estimate, load_covariance, custom_torque=torques
     )
@@ -274,7 +274,9 @@ def _add_contact_and_moving_body_poses(builder: DiagramBuilder, slave: SlavePlan
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
-def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
+def _check_load_is_known(
+    scenario: Scenario, estimate: Array | None, controller: System | None
+) -> None:
     if hasattr(estimate, "estimate"):
         what = f"expected 16 numbers, found {type(estimate).__name__}"
         remedy = "pass the attribute .estimate of this object"
@@ -283,15 +285,17 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
             check_load_not_all_zero("load_estimate", estimate[6:])
-    scales = set(scenario.force_scaling.scales())
-    if len(scales) > 1 and not _has_load_estimate(scenario, estimate):
-        what = "sigma and gamma differ, which requires a load estimate, but there is none"
-        remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
-        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
-    if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
-        what = "contact detection requires a load estimate, but there is none"
-        remedy = "pass the estimate of identify_load as load_estimate"
-        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
+    uses = {
+        "a sigma that differs from gamma": len(set(scenario.force_scaling.scales())) > 1,
+        "contact detection": scenario.contact_detection is not None,
+        "contact_wrench_S of the controller": controller is not None
+        and controller.HasInputPort("contact_wrench_S"),
+    }
+    for name in (name for name in uses if uses[name]):
+        if not _has_load_estimate(scenario, estimate):
+            what = f"{name} requires a load estimate, but there is none"
+            remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
+            raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
 
 
 def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:

@@ -1,6 +1,5 @@
 """Settings of the haptic device: the paper's Phantom, data sheets by name, or a leader arm."""
 
-import copy
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ import numpy as np
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.registry import Registry
+from drake_teleop.common.registry import Presets, Registry
 from drake_teleop.station.master.device_parameters import pack_device_parameters
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
@@ -86,11 +85,17 @@ _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
 }  # fmt: skip
 _SHEET_ROW_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
 _sheets = {
-    name: DeviceFigures(**dict(zip(_SHEET_ROW_FIELDS.split(), copy.deepcopy(row), strict=True)))
+    name: DeviceFigures(**dict(zip(_SHEET_ROW_FIELDS.split(), row, strict=True)))
     for name, row in _DATA_SHEETS.items()
 }
+
+
+class _DeviceRegistry(Presets[DeviceFigures], Registry[DeviceFigures]):
+    pass
+
+
 #: Data sheets by name, for `Master.figures`.
-FIGURES = Registry("device", _sheets, DeviceFigures)
+FIGURES = _DeviceRegistry("device", _sheets, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
