@@ -92,12 +92,10 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
         return passivity
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
-        raise DrakeTeleopError(
-            f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the mass"
-            " of the arm is unbounded in directions in which it cannot move",
-            where="passivity.method",
-            remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
-        )
+        what = f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the"
+        what = f"{what} mass of the arm is unbounded in directions in which it cannot move"
+        remedy = "choose another method, or set passivity.slave_mass and the servo explicitly"
+        raise DrakeTeleopError(what, where="passivity.method", remedy=remedy)
     stiffness, damping, mass = servo_impedance(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
         passivity, servo_stiffness=stiffness, servo_damping=damping, slave_mass=mass

@@ -131,7 +131,6 @@ class Scenario:
         return [*own, *self.environment]
 
     def without_environment(self) -> "Scenario":
-        """Return a copy of the scenario without objects to touch."""
         return replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
@@ -288,11 +287,10 @@ def _check_operator_task(scenario: Scenario, where: str) -> None:
         return
     check_target_beyond_standoff(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
-        raise DrakeTeleopError(
-            "the scale is 0, but the operator's task requires motion of the slave (above 0)",
-            where=f"{where}:kinematic_scaling.translation_scale",
-            remedy="set it above 0, or operator.task: null",
-        )
+        what = "the scale is 0, but the operator's task requires motion of the slave (above 0)"
+        remedy = "set it above 0, or operator.task: null"
+        place = f"{where}:kinematic_scaling.translation_scale"
+        raise DrakeTeleopError(what, where=place, remedy=remedy)
 
 
 def _check_integration_step(scenario: Scenario, where: str) -> None:
@@ -309,11 +307,10 @@ def _check_channel_and_passivity(scenario: Scenario, where: str) -> None:
         line.check(f"{where}:channel")
         timeout = scenario.channel.timeout or MAX_TIMEOUT_S
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
-            raise DrakeTeleopError(
-                f"the timeout, {timeout:g} s, is below two packet intervals at {line.rate_hz:g} Hz",
-                where=f"{where}:channel.timeout",
-                remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
-            )
+            what = f"the timeout, {timeout:g} s, is below two packet intervals"
+            what = f"{what} at {line.rate_hz:g} Hz"
+            remedy = "raise timeout or rate_hz; otherwise the station stays in its safe state"
+            raise DrakeTeleopError(what, where=f"{where}:channel.timeout", remedy=remedy)
     is_direct = scenario.has_no_network_or_passivity and scenario.contact_detection is None
     if scenario.master.is_joint_leader and not is_direct:
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"

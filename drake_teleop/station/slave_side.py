@@ -73,7 +73,8 @@ def MakeSlaveSide(
     """
     check_scenario(scenario)
     torques = _is_torque_controller(controller, scenario)
-    _check_load_is_known(scenario, load_estimate, controller)
+    uses_contact = controller is not None and controller.HasInputPort("contact_wrench_S")
+    _check_load_is_known(scenario, load_estimate, uses_contact)
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
@@ -274,9 +275,7 @@ def _add_contact_and_moving_body_poses(builder: DiagramBuilder, slave: SlavePlan
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
-def _check_load_is_known(
-    scenario: Scenario, estimate: Array | None, controller: System | None
-) -> None:
+def _check_load_is_known(scenario: Scenario, estimate: Array | None, uses_contact: bool) -> None:
     if hasattr(estimate, "estimate"):
         what = f"expected 16 numbers, found {type(estimate).__name__}"
         remedy = "pass the attribute .estimate of this object"
@@ -285,14 +284,12 @@ def _check_load_is_known(
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
             check_load_not_all_zero("load_estimate", estimate[6:])
-    uses = {
-        "a sigma that differs from gamma": len(set(scenario.force_scaling.scales())) > 1,
-        "contact detection": scenario.contact_detection is not None,
-        "contact_wrench_S of the controller": controller is not None
-        and controller.HasInputPort("contact_wrench_S"),
-    }
-    for name in (name for name in uses if uses[name]):
-        if not _has_load_estimate(scenario, estimate):
+    for name, is_used in (
+        ("a sigma that differs from gamma", len(set(scenario.force_scaling.scales())) > 1),
+        ("contact detection", scenario.contact_detection is not None),
+        ("contact_wrench_S of the controller", uses_contact),
+    ):
+        if is_used and not _has_load_estimate(scenario, estimate):
             what = f"{name} requires a load estimate, but there is none"
             remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
             raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)

@@ -19,6 +19,7 @@ from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
 from drake_teleop.station.master.phantom import PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
 
 PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
+_MAX_DEVICE_PITCH_RAD = 1.5
 
 
 @settings
@@ -169,7 +170,6 @@ class Master:
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction_and_encoder_steps(self) -> "Master":
-        """Return a copy of the settings without Coulomb friction and encoder steps."""
         if self.model == PHANTOM_NAME:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -184,8 +184,8 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        if self.model == PHANTOM_NAME and self.figures is not None:
-            what = "the Phantom has fixed dynamics and accepts no data sheet"
+        if self.model in (PHANTOM_NAME, LEADER_NAME) and self.figures is not None:
+            what = f"model '{self.model}' has its own dynamics and accepts no data sheet"
             remedy = "leave figures out, or choose another model, such as custom"
             raise DrakeTeleopError(what, where=f"{where}.figures", remedy=remedy)
         if self.model != PHANTOM_NAME and self.friction != PhantomJointFriction():
@@ -199,16 +199,7 @@ class Master:
             raise DrakeTeleopError(what, where=f"{where}.leader", remedy=remedy)
         if self.leader is not None:
             self.leader.check(f"{where}.leader")
-            if self.figures is not None:
-                what = "the dynamics of a leader arm are from its model file, not a data sheet"
-                raise DrakeTeleopError(what, where=f"{where}.figures", remedy="leave figures out")
         if self.figures is not None and self.figures.turn[1] > _MAX_DEVICE_PITCH_RAD:
-            raise DrakeTeleopError(
-                f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "
-                "where the axes of yaw and roll are parallel",
-                where=f"{where}.figures.turn",
-                remedy=f"choose at most {_MAX_DEVICE_PITCH_RAD:g} rad",
-            )
-
-
-_MAX_DEVICE_PITCH_RAD = 1.5  # rad
+            turn, remedy = self.figures.turn[1], f"choose at most {_MAX_DEVICE_PITCH_RAD:g} rad"
+            what = f"a pitch of {turn:g} rad is near 90 degrees, where yaw and roll are parallel"
+            raise DrakeTeleopError(what, where=f"{where}.figures.turn", remedy=remedy)

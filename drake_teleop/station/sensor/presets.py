@@ -54,7 +54,6 @@ _presets = {
         resolution=3.05e-5,
         force_range=[130.0, 130.0, 400.0],
         torque_range=[10.0, 10.0, 10.0],
-        angular_acceleration_range=500.0,
     ),
     **{
         name: WristSensorConfig(
