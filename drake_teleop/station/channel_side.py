@@ -30,7 +30,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - contact: (1,) flag of the slave's detector (with contact detection)
         - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m] (not for wires)
         - pose_slave: (7,) actual X_WS of the slave (not for wires)
-        - saturated: (1,) 1 while the wrench is invalid (not for wires)
+        - saturated: (1,) above 0.5 while the wrench is invalid (not for wires)
         - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; may stay
           unconnected (not for wires)
         output_ports:

@@ -50,7 +50,7 @@ def MakeSlaveSide(
         - wrench_B: (6,) F_E_B, wrench to render, in the master's base [N, N m]; NaN during a fault
         - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
-        - saturated: (1,) 1 while the wrench is invalid; also a signal
+        - saturated: (1,) above 0.5 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
         - the parts of a sample (`signal_sizes_of_sample`), slave_state, joint_torque,
           joint_command, ik_status, scaled_wrench_S, fault: signals
