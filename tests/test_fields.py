@@ -155,6 +155,8 @@ def test_settings_can_be_copied_pickled_and_replaced() -> None:
     "presets", [sensors.PRESETS, network.PRESETS, FIGURES, POSITION_INTERFACE_PRESETS]
 )
 def test_change_of_a_preset_does_not_change_the_shipped_one(presets) -> None:
+    default = object()
+    assert presets.get("unknown", default) is default and presets.get("unknown") is None
     for name, before in copy.deepcopy(dict(presets)).items():
         for changed in (presets[name], presets.get(name)):
             for field in dataclasses.fields(changed):

@@ -28,7 +28,7 @@ class Presets(dict[str, _Part]):
         return copy.deepcopy(super().__getitem__(name))
 
     def get(self, name: str, default: Any = None) -> Any:
-        return copy.deepcopy(super().get(name, default))
+        return self[name] if dict.__contains__(self, name) else default
 
 
 class Registry(dict[str, _Part]):
