@@ -16,11 +16,15 @@ import drake_teleop
 from drake_teleop.common.config import FieldInfo, check_all_field_values, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.station.channel import network
+from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import TASK_CLASSES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.station.sensor import presets as sensors
+from drake_teleop.station.slave.joint_control import POSITION_INTERFACE_PRESETS
 
 
 def everything(block: type) -> Iterator[tuple[type, FieldInfo]]:
@@ -145,6 +149,34 @@ def test_settings_can_be_copied_pickled_and_replaced() -> None:
         other.force_scaling.sigma = 0.25
         other.simulation = dataclasses.replace(other.simulation, seed=3)
         assert other == replace(scenario, force_scaling__sigma=0.25, simulation__seed=3)
+
+
+@pytest.mark.parametrize(
+    "presets", [sensors.PRESETS, network.PRESETS, FIGURES, POSITION_INTERFACE_PRESETS]
+)
+def test_change_of_a_preset_does_not_change_the_shipped_one(presets) -> None:
+    default = object()
+    assert presets.get("unknown", default) is default and presets.get("unknown") is None
+    for name, before in copy.deepcopy(dict(presets)).items():
+        for changed in (presets[name], presets.get(name)):
+            for field in dataclasses.fields(changed):
+                value = getattr(changed, field.name)
+                if isinstance(value, list):
+                    value.append(0.5)
+                elif isinstance(value, float):
+                    object.__setattr__(changed, field.name, value + 0.5)
+            assert changed != before and presets[name] == before
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"force_scaling__sigma": 0.5}, {"slave": Scenario().slave, "slot": None}]
+)
+def test_change_of_a_replaced_scenario_does_not_change_the_first_one(changes) -> None:
+    first = Scenario()
+    for other in (replace(first, **changes), first.without_environment()):
+        other.simulation.seed, other.wrist_sensor.offset[0] = 7, 1.0
+        other.environment.append(None)
+        assert first == Scenario() and other != first
 
 
 def test_help_contains_units_ranges_and_meanings() -> None:

@@ -18,6 +18,7 @@ from drake_teleop.station.replay import ReplayScene, replay_command, write_repla
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.signals import signal_with_size
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.station import MakeTeleopStation
@@ -201,6 +202,24 @@ def test_folder_without_run_is_rejected(tmp_path, scenario, result):
     )
     with pytest.raises(DrakeTeleopError, match=r"replay\.html: .* contains no slave_state, load_e"):
         write_replay(tmp_path / "replay.html", wrench, scenario)
+
+
+@pytest.mark.parametrize("row", [0, 7])
+def test_replay_of_a_log_without_rows_names_the_settings(tmp_path, scenario, result, row):
+    with pytest.raises(DrakeTeleopError, match="contains no samples; increase simula"):
+        write_replay(tmp_path / "replay.html", result[row:row], scenario)
+
+
+@pytest.mark.parametrize("joints", [5, 7])
+@pytest.mark.parametrize("name", ["slave_state", "master_state"])
+def test_log_of_another_arm_or_device_is_rejected(tmp_path, scenario, result, name, joints):
+    signals = {each: result[each] for each in result}
+    signals[name] = np.tile(signals[name], 2)[:, : 2 * joints]
+    specs = [signal_with_size(each, values.shape[1]) for each, values in signals.items()]
+    odd = SimulationResult(result.t, signals, specs)
+    message = rf"replay\.html: {name} has {joints} joints, .* device 6; give the scenario of"
+    with pytest.raises(DrakeTeleopError, match=message):
+        write_replay(tmp_path / "replay.html", odd, scenario)
 
 
 @pytest.mark.parametrize(("slow_motion", "frames"), [(1.0, 3), (10.0, 21), (50.0, 101)])

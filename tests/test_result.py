@@ -127,6 +127,12 @@ def test_inconsistent_signals_are_rejected(arrays, message):
         SimulationResult([0.0, 1.0], arrays, [SPECS[-1]])
 
 
+@pytest.mark.parametrize("t", [0.5, [[0.0, 1.0]], [[0.0], [1.0]]])
+def test_times_in_a_table_are_rejected(t):
+    with pytest.raises(DrakeTeleopError, match=r"t: has shape .* instead of \(N,\); give one time"):
+        SimulationResult(t, {"sigma": np.zeros(np.shape(t)[:1] or 1)}, [SPECS[-1]])
+
+
 def test_a_signal_needs_a_unit_for_every_component():
     with pytest.raises(ValueError, match="3 components, but 2 units"):
         Signal("force", XYZ, ("N", "N"))

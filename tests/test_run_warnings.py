@@ -251,6 +251,35 @@ def test_motors_of_a_leader_that_limit_the_force_are_reported(limit, count):
     assert all("its largest force or torque" in each for each in found)
 
 
+@pytest.mark.parametrize(
+    ("torque", "peak", "count"),
+    [
+        ([0.5, 0.0, 0.0], 0.5, 1),
+        ([0.1, -0.3, 0.3], 0.3, 1),
+        ([0.4, 0.0, 0.3], 0.45, 0),  # below the limit about each axis, the norm above it
+        ([0.2, -0.2, 0.2], 0.3, 0),
+        ([0.0, 0.0, 0.0], 0.0, 0),  # a leader without torque display
+    ],
+)
+def test_torque_of_a_leader_is_limited_about_each_axis(torque, peak, count):
+    home = [0.2, -0.6, 1.9, 0.3, 0.5, -0.2]
+    leader = Leader(str(models_dir() / "leader_arm.urdf"), hand_frame="hand", home=home)
+    leader.torque_limit, leader.peak_torque = [1e3], peak
+    changed = {
+        "master_state": (slice(0, 6), home - HOME_POSTURE_RAD),
+        "force_to_master": (slice(3, 6), np.outer(during(1, 2), torque)),
+    }
+    scenario = replace(OVER_NETWORK, master=Master(model="leader", leader=leader))
+    found = run_warnings(recorded(**changed), scenario, ARM)
+    assert len(found) == count
+    assert all("its largest force or torque from 1.000 to 2.000 s" in each for each in found)
+
+
+@pytest.mark.parametrize("step", [100, 500, 1000, 1500])
+def test_log_with_few_rows_has_no_warnings(step):
+    assert run_warnings(recorded()[::step], OVER_NETWORK, ARM) == []
+
+
 def test_ledger_reserve_warning_gives_the_required_energy():
     """The hand moves at up to 0.164 m/s; 0.02 J allow the slave 0.091 m/s."""
     scenario = replace(

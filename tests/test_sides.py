@@ -11,6 +11,7 @@ from operator_motion import intent_at
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
+from drake_teleop.common.blocks import Fault
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison.whole_station import injected_energy
 from drake_teleop.lab.identification import true_load
@@ -26,6 +27,7 @@ from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave_side import MakeSlaveSide
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
+from drake_teleop.station.wiring import build_with_log
 
 PAGE = (Path(__file__).parents[1] / "docs" / "station.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| (\w+) \| `(\w+)` \| (in|out) \| (\d+) \| (.*?) \|", PAGE, re.M)
@@ -227,6 +229,30 @@ def test_blocks_are_found_in_all_sides():
         GetBlock(station, "slave_plan")
 
 
+def test_documented_causes_of_faults_are_those_of_the_code():
+    rows = re.findall(r"^\| (\d) `(\w+)` \|", PAGE, re.M)
+    assert rows == [(str(int(fault)), fault.name) for fault in Fault if fault != Fault.NONE]
+
+
+@pytest.mark.parametrize("parts", [("measured_wrench_S",), ("measured_wrench_S", "sample_time")])
+@pytest.mark.parametrize("combined", ["sample", "scaled_contact_and_fault"])
+def test_log_of_a_side_with_combined_port_and_few_parts_is_right(combined, parts):
+    names = {combined: 23, **dict.fromkeys(parts, 6), "slave_state": 12, "fault": 1}
+    names |= {"sample_time": 1} if "sample_time" in parts else {}
+    builder = DiagramBuilder()
+    side = DiagramBuilder()
+    for value, (name, size) in enumerate(names.items()):
+        block = side.AddNamedSystem(name, ConstantVectorSource(np.full(size, 1.0 + value)))
+        side.ExportOutput(block.get_output_port(), name)
+    custom = builder.AddNamedSystem("slave_side", side.Build())
+    station = build_with_log(builder, "station", (custom,), 1000.0)
+    result = simulate(station, Simulation(settle=0.0, duration=0.002))
+    assert set(result.signals) == names.keys() - {combined}
+    for value, name in enumerate(names):
+        if name != combined:
+            np.testing.assert_array_equal(result[name], 1.0 + value)
+
+
 def test_direct_wires_replace_an_ideal_channel():
     seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
     far = replace(Scenario(), channel=Channel(delay=0.01))
@@ -258,6 +284,18 @@ class Follower(LeafSystem):
         self.DeclareVectorOutputPort(
             output, size, lambda context, out: out.SetFromVector(entry.Eval(context)[:size])
         )
+
+
+@pytest.mark.parametrize("torques", [False, True])
+def test_contact_wrench_for_a_controller_requires_a_load_estimate(torques):
+    outputs = {"joint_torque": 6} if torques else {"pose_command": 7}
+    inputs = {"pose_command": 7, "contact_wrench_S": 6}
+    message = "contact_wrench_S of the controller requires a load estimate, but there is none; pass"
+    with pytest.raises(DrakeTeleopError, match=message):
+        MakeSlaveSide(Scenario(), controller=Silent(inputs, outputs))
+    for options in ({"load_estimate": np.ones(16)}, {}):
+        scenario = replace(Scenario(), load_estimator__enabled=not options)
+        MakeSlaveSide(scenario, controller=Silent(inputs, outputs), **options)
 
 
 SHORT_RUN = {"simulation__settle": 0.0, "simulation__duration": 0.05, "force_scaling__sigma": 1.0}

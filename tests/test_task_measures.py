@@ -148,6 +148,17 @@ def test_failure_text_gives_the_reason(said):
     assert task_measures(result, scenario)["success"] == 0.0
 
 
+@pytest.mark.parametrize("done", [1.0, -1.0])
+@pytest.mark.parametrize("first", [int(1000 * END), int(1000 * END) + 400])
+def test_task_that_ends_before_the_log_has_no_measures(done, first):
+    result, scenario = run(Touch(**AT), done=done)
+    late = result[first:]
+    text = "the task ended before the log begins; set a shorter simulation.settle"
+    assert task_failure(late, scenario) == text
+    found = task_measures(late, scenario)
+    assert found["success"] == 0.0 and math.isnan(found["task_time_s"])
+
+
 def test_successful_task_has_no_failure_text():
     for task in (Touch(), Press(force=5.0, tolerance=2.0), Reach(translation=[0, 0, 0])):
         assert task_failure(*run(task)) == ""

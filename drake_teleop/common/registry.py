@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 import reprlib
@@ -18,6 +19,16 @@ _Part = TypeVar("_Part")
 _SCRIPTS_ENV = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
 REGISTRIES: dict[str, Registry[Any]] = {}
 """All tables by the kind of their parts, as far as their modules are imported."""
+
+
+class Presets(dict[str, _Part]):
+    """Settings by name; each access by name returns a copy."""
+
+    def __getitem__(self, name: str) -> _Part:
+        return copy.deepcopy(super().__getitem__(name))
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if dict.__contains__(self, name) else default
 
 
 class Registry(dict[str, _Part]):

@@ -30,7 +30,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - contact: (1,) flag of the slave's detector (with contact detection)
         - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m] (not for wires)
         - pose_slave: (7,) actual X_WS of the slave (not for wires)
-        - saturated: (1,) 1 while the wrench is invalid (not for wires)
+        - saturated: (1,) above 0.5 while the wrench is invalid (not for wires)
         - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; may stay
           unconnected (not for wires)
         output_ports:
@@ -92,12 +92,10 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
         return passivity
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
-        raise DrakeTeleopError(
-            f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the mass"
-            " of the arm is unbounded in directions in which it cannot move",
-            where="passivity.method",
-            remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
-        )
+        what = f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the"
+        what = f"{what} mass of the arm is unbounded in directions in which it cannot move"
+        remedy = "choose another method, or set passivity.slave_mass and the servo explicitly"
+        raise DrakeTeleopError(what, where="passivity.method", remedy=remedy)
     stiffness, damping, mass = servo_impedance(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
         passivity, servo_stiffness=stiffness, servo_damping=damping, slave_mass=mass

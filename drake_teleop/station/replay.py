@@ -99,7 +99,15 @@ def write_replay(
     if missing or not len(result.t):
         what = f"a replay cannot be made: the log contains no {', '.join(missing) or 'samples'}"
         remedy = "give the log of a station with a simulated slave"
+        if not missing:
+            remedy = "increase simulation.duration or rates.log_hz, or reduce simulation.settle"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
+    arms = NominalSlave(scenario.slave).arm, scenario.master.device(0.0, 0.0)
+    for name, arm in zip(("slave_state", "master_state"), arms, strict=True):
+        found = len(result.units.get(name, ())) // 2
+        if name in result and found != arm.num_joints:
+            what = f"{name} has {found} joints, but the scenario's arm or device {arm.num_joints}"
+            raise DrakeTeleopError(what, where=str(path), remedy="give the scenario of this log")
     start, stop = float(result.t[0]), float(result.t[-1])
     times, slow_motion = replay_file.frame_times(start, stop, slow_motion)
     rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time

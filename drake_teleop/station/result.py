@@ -88,6 +88,9 @@ class SimulationResult:
         self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
     ) -> None:
         self._t = _read_only_view(float_array("t", t))
+        if self._t.ndim != 1:
+            what = f"has shape {self._t.shape} instead of (N,)"
+            raise DrakeTeleopError(what, where="t", remedy="give one time per row")
         self._specs = {spec.name: spec for spec in specs}
         self._columns = {c: (s.name, i) for s in self.specs for i, c in enumerate(s.columns)}
         if self._specs.keys() != signals.keys():

@@ -130,7 +130,8 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         limits = device.parameters
         full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * limits.peak_force
         if isinstance(device, LeaderDevice):
-            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * limits.peak_torque[0]
+            reached = np.abs(shown[:, 3:]) >= _SHARE_AT_LIMIT * limits.peak_torque
+            full |= reached.any(axis=1) & limits.peak_torque.all()
             joints = result["master_state"][:, : device.num_joints]
             full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
         elif limits.peak_torque.all():
@@ -142,11 +143,9 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         yield "the device is at the end of its workspace", find_spans(t, ended), advice
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
         bent = scenario.first_sheet_spring.max_linear_deflection
-        yield (
-            f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
-            find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),
-            "reduce the contact force",
-        )
+        text = f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,"
+        spans = find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent)
+        yield text, spans, "reduce the contact force"
 
 
 def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario) -> Warnings:
@@ -165,12 +164,9 @@ def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario)
         lag = lag_beyond_delay(t, command, actual, window)
         spans = find_spans(t, lag > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, lag, spans)
-        yield (
-            f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
-            " more than its delay explains,",
-            spans,
-            "move more slowly, or use another passivity method",
-        )
+        late = f"up to {scale * largest:.1f} {unit} more than its delay explains,"
+        advice = "move more slowly, or use another passivity method"
+        yield f"the channel ({by}) delays the slave's command: {late}", spans, advice
     yield from _check_speed_limit_of_energy_reserve(result, scenario)
     window += oscillation.COMMAND_REVERSAL_WINDOW_S
     oscillating = flag_pose_oscillation(t, sent, received, window)
@@ -282,7 +278,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
         return
     t, intent = result.t, result["intent"][:, 4:]
     force = oscillation.high_pass_above_5_hz(t, result["force_to_master"][:, :3])
-    rows = round(_MIN_INTENT_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
+    rows = max(round(_MIN_INTENT_REST_S / (t[1] - t[0])), 1) if len(t) > 1 else 1
     largest, least = _trailing_maximum(intent, rows), -_trailing_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
@@ -304,12 +300,9 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     if not over_network and small and share < _MIN_POWER_SHARE_OF_OSCILLATION:
         return  # noise of the sensor
     ledger = ", or increase passivity.ledger.initial with ledger" if over_network else ""
-    yield (
-        f"the rendered force oscillates at {frequency:.2g} Hz with up to"
-        f" {largest_rms:.2g} N rms while the hand rests",
-        spans,
-        f"{_REDUCE_FORCE_ADVICE}{ledger}",
-    )
+    size = f"{frequency:.2g} Hz with up to {largest_rms:.2g} N rms"
+    text = f"the rendered force oscillates at {size} while the hand rests"
+    yield text, spans, f"{_REDUCE_FORCE_ADVICE}{ledger}"
 
 
 def _is_torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:

@@ -131,8 +131,7 @@ class Scenario:
         return [*own, *self.environment]
 
     def without_environment(self) -> "Scenario":
-        """Return a copy of the scenario without objects to touch."""
-        return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
+        return replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
     def has_no_network_or_passivity(self) -> bool:
@@ -230,12 +229,12 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
         data.get(name) or {} for name in ("wrist_sensor", "master", "joint_control")
     )
     preset = PRESETS.get(str(sensor.get("preset")), WristSensorConfig())
-    defaults = Scenario(wrist_sensor=copy.deepcopy(preset))
+    defaults = Scenario(wrist_sensor=preset)
     if master.get("figures") is not None:  # changes the data sheet
-        defaults.master.figures = copy.deepcopy(FIGURES.get(str(master.get("model"))))
+        defaults.master.figures = FIGURES.get(str(master.get("model")))
     if control.get("interface") is not None:
-        interface = POSITION_INTERFACE_PRESETS.get(str(control.get("servo")))
-        defaults.joint_control.interface = copy.deepcopy(interface)
+        servo = str(control.get("servo"))
+        defaults.joint_control.interface = POSITION_INTERFACE_PRESETS.get(servo)
     scenario = settings_without_range_check(Scenario, data, where, defaults)
     scenario.check(where)
     absolute: Scenario = config.with_absolute_paths(scenario, Path(where).parent)
@@ -267,6 +266,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     A DrakeTeleopError is raised for an invalid name or value.
     """
     expect_type(Scenario, scenario, "scenario")
+    scenario = copy.deepcopy(scenario)
     for name, value in changes.items():
         block, _, inner = name.partition("__")
         config.check_field_name(Scenario, block, f"scenario:{block}")
@@ -288,11 +288,10 @@ def _check_operator_task(scenario: Scenario, where: str) -> None:
         return
     check_target_beyond_standoff(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
-        raise DrakeTeleopError(
-            "the scale is 0, but the operator's task requires motion of the slave (above 0)",
-            where=f"{where}:kinematic_scaling.translation_scale",
-            remedy="set it above 0, or operator.task: null",
-        )
+        what = "the scale is 0, but the operator's task requires motion of the slave (above 0)"
+        remedy = "set it above 0, or operator.task: null"
+        place = f"{where}:kinematic_scaling.translation_scale"
+        raise DrakeTeleopError(what, where=place, remedy=remedy)
 
 
 def _check_integration_step(scenario: Scenario, where: str) -> None:
@@ -310,11 +309,10 @@ def _check_channel_and_passivity(scenario: Scenario, where: str) -> None:
         line.check(f"{where}:{name}")
         timeout = scenario.channel.timeout or MAX_TIMEOUT_S
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
-            raise DrakeTeleopError(
-                f"the timeout, {timeout:g} s, is below two packet intervals at {line.rate_hz:g} Hz",
-                where=f"{where}:channel.timeout",
-                remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
-            )
+            what = f"the timeout, {timeout:g} s, is below two packet intervals"
+            what = f"{what} at {line.rate_hz:g} Hz"
+            remedy = "raise timeout or rate_hz; otherwise the station stays in its safe state"
+            raise DrakeTeleopError(what, where=f"{where}:channel.timeout", remedy=remedy)
     is_direct = scenario.has_no_network_or_passivity and scenario.contact_detection is None
     if scenario.master.is_joint_leader and not is_direct:
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"

@@ -21,7 +21,6 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
 from drake_teleop.station.signals import LOG_BLOCK_NAME, SLIDING_JOINTS_ATTRIBUTE, signal_with_size
 
-# Interval of progress updates [ms].
 _SIM_MS_PER_PROGRESS = 20
 # Rows of a part of a log on disk: some seconds, some MB.
 _LOG_ROWS_PER_PART = 8192

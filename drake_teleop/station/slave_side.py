@@ -50,7 +50,7 @@ def MakeSlaveSide(
         - wrench_B: (6,) F_E_B, wrench to render, in the master's base [N, N m]; NaN during a fault
         - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
-        - saturated: (1,) 1 while the wrench is invalid; also a signal
+        - saturated: (1,) above 0.5 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
         - the parts of a sample (`signal_sizes_of_sample`), slave_state, joint_torque,
           joint_command, ik_status, scaled_wrench_S, fault: signals
@@ -72,11 +72,12 @@ def MakeSlaveSide(
         DrakeTeleopError: for an unreachable start, or if load estimate or noise floor is required.
     """
     check_scenario(scenario)
-    _check_load_is_known(scenario, load_estimate)
+    torques = _is_torque_controller(controller, scenario)
+    uses_contact = controller is not None and controller.HasInputPort("contact_wrench_S")
+    _check_load_is_known(scenario, load_estimate, uses_contact)
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    torques = _is_torque_controller(controller, scenario)
     slave, sample, held = _add_slave_blocks(
         builder, scenario, load_estimate, load_covariance, custom_torque=torques
     )
@@ -274,7 +275,7 @@ def _add_contact_and_moving_body_poses(builder: DiagramBuilder, slave: SlavePlan
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
-def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
+def _check_load_is_known(scenario: Scenario, estimate: Array | None, uses_contact: bool) -> None:
     if hasattr(estimate, "estimate"):
         what = f"expected 16 numbers, found {type(estimate).__name__}"
         remedy = "pass the attribute .estimate of this object"
@@ -283,15 +284,15 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
             check_load_not_all_zero("load_estimate", estimate[6:])
-    scales = set(scenario.force_scaling.scales())
-    if len(scales) > 1 and not _has_load_estimate(scenario, estimate):
-        what = "sigma and gamma differ, which requires a load estimate, but there is none"
-        remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
-        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
-    if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
-        what = "contact detection requires a load estimate, but there is none"
-        remedy = "pass the estimate of identify_load as load_estimate"
-        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
+    for name, is_used in (
+        ("a sigma that differs from gamma", len(set(scenario.force_scaling.scales())) > 1),
+        ("contact detection", scenario.contact_detection is not None),
+        ("contact_wrench_S of the controller", uses_contact),
+    ):
+        if is_used and not _has_load_estimate(scenario, estimate):
+            what = f"{name} requires a load estimate, but there is none"
+            remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
+            raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
 
 
 def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:

@@ -39,7 +39,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     state, t, ended = result["task_state"], result.t, _log_row_at_task_end(result)
     begun = int(np.argmax(state[:, decision.PHASE_INDEX] != decision.PHASE_WAITING))
     span = slice(begun, ended + 1)
-    done = state[ended, decision.OUTCOME_INDEX] > 0.0
+    done = ended > 0 and state[ended, decision.OUTCOME_INDEX] > 0.0
     force = true_contact_force_magnitudes(result)
     held = np.empty(0)
     if done and isinstance(task, Press):
@@ -73,6 +73,8 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     task, state, ended = scenario.operator.task, result["task_state"], _log_row_at_task_end(result)
     assert task is not None
     at, outcome = float(result.t[ended]), state[ended, decision.OUTCOME_INDEX]
+    if outcome != 0.0 and ended == 0:
+        return "the task ended before the log begins; set a shorter simulation.settle"
     if outcome > 0.0:
         wrong = _failed_criterion(result, scenario, task, ended)
         return f"the operator finished at {at:.2f} s, but {wrong}" if wrong else ""

@@ -42,12 +42,9 @@ def connect_ports(
             raise DrakeTeleopError(what, where=block.get_name(), remedy=remedy)
     output, port = source.GetOutputPort(output_name), target.GetInputPort(input_name)
     if output.size() != port.size():
-        raise DrakeTeleopError(
-            f"its output port '{output_name}' has {output.size()} numbers, but input port"
-            f" '{input_name}' of {target.get_name()} expects {port.size()}",
-            where=source.get_name(),
-            remedy=remedy,
-        )
+        what = f"its output port '{output_name}' has {output.size()} numbers, but input port"
+        what = f"{what} '{input_name}' of {target.get_name()} expects {port.size()}"
+        raise DrakeTeleopError(what, where=source.get_name(), remedy=remedy)
     builder.Connect(output, port)
 
 
@@ -73,9 +70,9 @@ def build_with_log(
     signals += [name for name in outputs if name.startswith(MOVING_BODY_POSE_PREFIX)]
     for name in signals:
         builder.ExportOutput(outputs[name], name)
-    wide = {
-        part: port for port, parts in COMBINED_PORTS.items() if port in outputs for part in parts
-    }
+    wide = dict[str, str]()
+    for port, parts in COMBINED_PORTS.items():
+        wide |= dict.fromkeys(parts, port) if {port, *parts} <= outputs.keys() else {}
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
     # One log for all ports: at 8 kHz each system with events costs time at every step.
     row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))

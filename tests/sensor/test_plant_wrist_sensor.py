@@ -461,6 +461,14 @@ REFUSED = {
         "joint or frame 'wrist' belongs to another plant",
     ),
     "a name": (lambda c: setattr(c, "place", "wrist"), "expected Joint or Frame, found 'wrist'"),
+    "name of a preset": (
+        lambda c: c.options.update(config="jr3_85m35a3"),
+        "AddWristSensor: config: expected WristSensorConfig, found 'jr3_85m35a3'; take one of",
+    ),
+    "no configuration": (
+        lambda c: c.options.update(config={}),
+        "AddWristSensor: config: expected WristSensorConfig, found {}",
+    ),
     "half steps": (
         lambda c: c.options.update(period=1.5e-3),
         "period: sampling period 0.0015 s is no multiple of the plant's time step 0.001 s",

@@ -16,6 +16,7 @@ from drake_teleop.common.config import check_all_field_values, choice, plain, qu
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.registry import Presets
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import has_packet_arrived, move_pose_into
@@ -74,7 +75,7 @@ class NetworkConfig:
             )
 
 
-PRESETS: dict[str, NetworkConfig] = {
+_presets = {
     "ideal": NetworkConfig(),
     "lan": NetworkConfig(delay=0.5e-3, jitter=0.5, distribution="gamma", loss=1e-5),
     "wan": NetworkConfig(delay=15e-3, jitter=0.1, distribution="gamma", loss=1e-3, burst=5e-3),
@@ -86,6 +87,7 @@ PRESETS: dict[str, NetworkConfig] = {
     ),
     "lunar": NetworkConfig(delay=1.3, jitter=0.01, distribution="gamma", loss=0.01, burst=0.1),
 }
+PRESETS = Presets(_presets)
 """Networks by name, the same in both directions. Only the delays have sources.
 
 lan: switched network, round trip 1 ms, most of it in the hosts. wan: 1500 km of fibre at 5 us/km

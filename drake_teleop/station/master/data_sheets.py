@@ -1,6 +1,5 @@
 """Settings of the haptic device: the paper's Phantom, data sheets by name, or a leader arm."""
 
-import copy
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ import numpy as np
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.registry import Registry
+from drake_teleop.common.registry import Presets, Registry
 from drake_teleop.station.master.device_parameters import pack_device_parameters
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
@@ -20,6 +19,7 @@ from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
 from drake_teleop.station.master.phantom import PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
 
 PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
+_MAX_DEVICE_PITCH_RAD = 1.5
 
 
 @settings
@@ -49,7 +49,7 @@ class DeviceFigures:
     turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
     peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; 0: none"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; any 0: no torque"
     )
     size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
@@ -86,11 +86,17 @@ _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
 }  # fmt: skip
 _SHEET_ROW_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
 _sheets = {
-    name: DeviceFigures(**dict(zip(_SHEET_ROW_FIELDS.split(), copy.deepcopy(row), strict=True)))
+    name: DeviceFigures(**dict(zip(_SHEET_ROW_FIELDS.split(), row, strict=True)))
     for name, row in _DATA_SHEETS.items()
 }
+
+
+class _DeviceRegistry(Presets[DeviceFigures], Registry[DeviceFigures]):
+    pass
+
+
 #: Data sheets by name, for `Master.figures`.
-FIGURES = Registry("device", _sheets, DeviceFigures)
+FIGURES = _DeviceRegistry("device", _sheets, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
@@ -164,7 +170,6 @@ class Master:
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction_and_encoder_steps(self) -> "Master":
-        """Return a copy of the settings without Coulomb friction and encoder steps."""
         if self.model == PHANTOM_NAME:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -179,8 +184,8 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        if self.model == PHANTOM_NAME and self.figures is not None:
-            what = "the Phantom has fixed dynamics and accepts no data sheet"
+        if self.model in (PHANTOM_NAME, LEADER_NAME) and self.figures is not None:
+            what = f"model '{self.model}' has its own dynamics and accepts no data sheet"
             remedy = "leave figures out, or choose another model, such as custom"
             raise DrakeTeleopError(what, where=f"{where}.figures", remedy=remedy)
         if self.model != PHANTOM_NAME and self.friction != PhantomJointFriction():
@@ -194,16 +199,7 @@ class Master:
             raise DrakeTeleopError(what, where=f"{where}.leader", remedy=remedy)
         if self.leader is not None:
             self.leader.check(f"{where}.leader")
-            if self.figures is not None:
-                what = "the dynamics of a leader arm are from its model file, not a data sheet"
-                raise DrakeTeleopError(what, where=f"{where}.figures", remedy="leave figures out")
         if self.figures is not None and self.figures.turn[1] > _MAX_DEVICE_PITCH_RAD:
-            raise DrakeTeleopError(
-                f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "
-                "where the axes of yaw and roll are parallel",
-                where=f"{where}.figures.turn",
-                remedy=f"choose at most {_MAX_DEVICE_PITCH_RAD:g} rad",
-            )
-
-
-_MAX_DEVICE_PITCH_RAD = 1.5  # rad
+            turn, remedy = self.figures.turn[1], f"choose at most {_MAX_DEVICE_PITCH_RAD:g} rad"
+            what = f"a pitch of {turn:g} rad is near 90 degrees, where yaw and roll are parallel"
+            raise DrakeTeleopError(what, where=f"{where}.figures.turn", remedy=remedy)

@@ -259,13 +259,11 @@ def is_any_axis_at_end_stop(q: Array) -> NDArray[np.bool_]:
 
 def check_limits(q: Array) -> None:
     ranges = [*zip(JOINT_LOWER_RAD, JOINT_UPPER_RAD, strict=True), Q2_MINUS_Q3_RANGE_RAD]
-    for i, (angle, (lower, upper)) in enumerate(zip([*q, q[1] - q[2]], ranges, strict=True)):
-        if lower - 1e-9 <= angle <= upper + 1e-9:
-            continue
-        at, least, most = np.degrees([angle, lower, upper])
-        what = f"Phantom angle q2 - q3 would be {at:.1f} degrees, its range is -55 to 65"
-        if i < 6:
+    names = [*(f"joint {k}" for k in range(1, 7)), "angle q2 - q3"]
+    for name, angle, (lower, upper) in zip(names, [*q, q[1] - q[2]], ranges, strict=True):
+        if not lower - 1e-9 <= angle <= upper + 1e-9:
+            at, least, most = np.degrees([angle, lower, upper])
             limits = f"its range is {least:.1f} to {most:.1f}"
-            what = f"Phantom joint {i + 1} would be at {at:.1f} degrees, {limits}"
-        remedy = "choose a start position inside the device's workspace"
-        raise DrakeTeleopError(what, where="master.position", remedy=remedy)
+            what = f"Phantom {name} would be at {at:.1f} degrees, {limits}"
+            remedy = "choose a start position inside the device's workspace"
+            raise DrakeTeleopError(what, where="master.position", remedy=remedy)

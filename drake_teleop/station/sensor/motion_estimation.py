@@ -50,8 +50,6 @@ _RMS_SENSOR_DISPLACEMENT_M_PER_RAD = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
 _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
-#: Constants: whether the encoders are the only source, and whether they correct the accelerometer;
-#: waits of wrench, acceleration, angles (fractional); low-passes of the sensor and of `encoders`.
 _NUM_ANGLE_LOW_PASS_SECTIONS = 4
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for

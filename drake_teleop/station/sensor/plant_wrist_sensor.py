@@ -91,7 +91,8 @@ def AddWristSensor(
             tool without mass, or an unsuitable period.
     """
     _check_finalized_in_builder(builder, plant)
-    config = config or WristSensorConfig(ideal=True)
+    config = WristSensorConfig(ideal=True) if config is None else config
+    expect_type(WristSensorConfig, config, f"{_FUNCTION_NAME}: config", "take one of PRESETS")
     sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
+from drake_teleop.common.registry import Presets
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 # The IMU of the ATI record, with the low-pass before the noise.
@@ -41,11 +41,11 @@ _OTHER_PRESET_FIELDS: dict[str, dict[str, Any]] = {
     | dict(gain_error=0.05, cross_talk=0.03, force_latency=2e-3),
 }
 
-PRESETS: dict[str, WristSensorConfig] = {
+_presets = {
     "ideal": WristSensorConfig(ideal=True),
     "jr3_85m35a3": WristSensorConfig(),
     "ati_gamma_imu": WristSensorConfig(
-        **copy.deepcopy(_ATI_IMU_SETTINGS),
+        **_ATI_IMU_SETTINGS,
         R_SA=[0.0, -1.0, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0],
         force_noise=0.018,
         torque_noise=9e-4,
@@ -54,11 +54,10 @@ PRESETS: dict[str, WristSensorConfig] = {
         resolution=3.05e-5,
         force_range=[130.0, 130.0, 400.0],
         torque_range=[10.0, 10.0, 10.0],
-        angular_acceleration_range=500.0,
     ),
     **{
         name: WristSensorConfig(
-            **copy.deepcopy(_ATI_IMU_SETTINGS)
+            **_ATI_IMU_SETTINGS
             | {"force_range": [side, side, along], "torque_range": [bending, bending, twist]}
             | {"force_noise": force, "torque_noise": torque, "resolution": step}
             | _OTHER_PRESET_FIELDS.get(name, {})
@@ -66,4 +65,5 @@ PRESETS: dict[str, WristSensorConfig] = {
         for name, (side, along, bending, twist, force, torque, step) in _RANGES_AND_NOISE.items()
     },
 }
+PRESETS = Presets(_presets)
 """Sensors by name; the sources of their values are in docs/sensor.md, "The presets"."""

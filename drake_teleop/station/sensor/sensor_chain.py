@@ -271,8 +271,6 @@ TRUE_JOINT_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
-#: Constants of the chain: those up to `range` are of 12 channels, and `offset` may change in a run.
-#: Calibrations: (6, 6) of the wrench, (2, 3, 3) of s and alpha from S into A; low-pass: (2, 5).
 _LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_POSITIONS
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
@@ -289,12 +287,14 @@ def initialize_sensor_chain(
 
     `constants[0].offset[:6]` is the wrench's offset [N, N m]; `memory[0]` counts samples.
     """
+    if config.ideal:
+        config = without_parts(config, *DISABLED_PART_VALUES)
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
     ranges = config.ranges()
     limits = ranges if config.saturates else np.full(_NUM_NOISY_CHANNELS, np.inf)
     sections = np.zeros((_NUM_LOW_PASS_SECTIONS, 5))
-    if config.low_pass != "none" and not config.ideal:
+    if config.low_pass != "none":
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
     latencies = config.latency_samples(period)
     drift = np.append(np.array(config.drift) * period, np.zeros(6))
@@ -313,12 +313,10 @@ def initialize_sensor_chain(
         low_pass_stage=_LOW_PASS_POSITIONS.index(config.low_pass),
         latency_samples=latencies,
         encoder_quantum=config.encoder_resolution,
-        is_ideal=config.ideal,
         overload_limits=_OVERLOAD_LIMIT_IN_RANGES * ranges[:6],
     )
-    rows = 0 if config.ideal else latencies.max() + 1
-    memory = np.zeros(_DELAY_LINE_MEMORY_START + rows * (_DELAYED_ANGLES_START + num_joints))
-    return constants, memory
+    size = (latencies.max() + 1) * (_DELAYED_ANGLES_START + num_joints)
+    return constants, np.zeros(_DELAY_LINE_MEMORY_START + size)
 
 
 @njit(cache=True)
@@ -346,13 +344,6 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
     constants, angles = constants[0], truth[TRUE_JOINT_ANGLES]
-    if constants.is_ideal != 0.0:
-        copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
-        copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
-        copy_into(reading, READ_ACCELERATION.start + 3, truth, SAMPLE_ANGULAR_ACCELERATION.start, 3)
-        reading[READ_SATURATED] = 0.0
-        copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
-        return
     count = int(memory[0])
     line = memory[_DELAY_LINE_MEMORY_START:].reshape((-1, _DELAYED_ANGLES_START + angles.shape[0]))
     shift_delay_line(line)

@@ -18,6 +18,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.registry import Presets
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics, jacobian
 
@@ -70,8 +71,7 @@ class PositionInterface:
             raise DrakeTeleopError(what, where=f"{where}.drive_bandwidth_hz", remedy=remedy)
 
 
-#: Interfaces by name; docs/station.md lists the sources.
-POSITION_INTERFACE_PRESETS: dict[str, PositionInterface] = {
+_presets = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
         command_hz=1000.0,
@@ -83,6 +83,8 @@ POSITION_INTERFACE_PRESETS: dict[str, PositionInterface] = {
         drive_bandwidth_hz=20.0,
     ),
 }
+#: Interfaces by name; docs/station.md lists the sources.
+POSITION_INTERFACE_PRESETS = Presets(_presets)
 
 
 @settings
