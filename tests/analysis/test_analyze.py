@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace as replace_fields
 
+import numpy as np
 import pytest
 from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis import analyze
 from drake_teleop.lab.analysis.maps import stability_map
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.report import print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -141,6 +145,28 @@ def test_verdict_reports_coupled_direction_and_nonlinear_method():
     # Sideways, contact rotates the tool; the verdict reports that one axis is not valid.
     assert found["two_port"]["sampled"]["h22"] > 0.1
     assert any("is not one axis" in sentence for sentence in found["verdict"])
+
+
+@pytest.mark.parametrize(("gamma", "sigma"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5)])
+def test_models_without_displayed_force_have_no_deviation(gamma, sigma):
+    axis, sampling = OneAxis(gamma=gamma, sigma=sigma, wall_stiffness=0.0), Sampling()
+    with_hand_mass = replace_fields(axis, device_mass=axis.device_mass + axis.hand_mass)
+    H = sampled_two_port(with_hand_mass, sampling, analyze.OMEGA)
+    found = analyze.two_port_deviations(H, axis, sampling)
+    assert max(found["sampled"].values()) == 0.0
+    assert np.isfinite(list(found["closed_form"].values())).all()
+
+
+@pytest.mark.parametrize(("rate", "low_pass"), [(2000.0, 500.0), (1e4, 4500.0), (2e4, 9500.0)])
+def test_rates_of_the_map_increase_for_each_low_pass(monkeypatch, rate, low_pass):
+    monkeypatch.setattr(analyze, "_NUM_POINTS_PER_MAP_AXIS", 2)
+    maps = analyze.parameter_maps(
+        *(OneAxis(wall_stiffness=0.0), OneAxis(), Sampling(rate, rate, rate, low_pass)),
+        lambda name: lambda done: None,
+    )
+    for shown in maps["Rate and stiffness of the wall"].values():
+        assert shown.x[0] == pytest.approx(2.4 * low_pass)
+        assert shown.x[-1] == pytest.approx(max(4.8 * low_pass, 1e4))
 
 
 def test_eta_raises_because_of_two_sigmas():
