@@ -14,7 +14,7 @@ from drake_teleop.lab.analysis import analyze
 from drake_teleop.lab.analysis.maps import stability_map
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
-from drake_teleop.lab.analysis.report import print_tables, verdict_sentences
+from drake_teleop.lab.analysis.report import margin_cells, print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
@@ -167,6 +167,15 @@ def test_rates_of_the_map_increase_for_each_low_pass(monkeypatch, rate, low_pass
     for shown in maps["Rate and stiffness of the wall"].values():
         assert shown.x[0] == pytest.approx(2.4 * low_pass)
         assert shown.x[-1] == pytest.approx(max(4.8 * low_pass, 1e4))
+
+
+@pytest.mark.parametrize(("delay", "more"), [(0.05, 86.0), (0.22, 63.8), (0.25, 3.8)])
+def test_report_states_the_delay_that_may_be_added(delay, more):
+    """The longer delays are stable beyond a range of unstable ones."""
+    axis = OneAxis(sigma=1.0, wall_stiffness=0.0, delay=delay)
+    light = analyze.margin_rows(axis, Sampling(), 0.0)[0]
+    assert (light["grip"], light["stable"]) == ("light", True)
+    assert float(margin_cells(light, delay)[-1]) == pytest.approx(more, abs=0.1)
 
 
 def test_eta_raises_because_of_two_sigmas():

@@ -263,7 +263,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
                 "stable": stable,
                 "gain": gain,
                 "phase_deg": float(np.degrees(phase)),
-                "round_trip_s": float(cut_loop.delay_margin(loop)),
+                "round_trip_s": float(cut_loop.delay_margin(loop, 2 * axis.delay if stable else 0)),
             }
         )
     return rows
