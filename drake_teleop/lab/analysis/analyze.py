@@ -334,8 +334,7 @@ def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str
 
 def virtual_wall_limits(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     wall_damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
-    mass = axis.hand_mass + axis.device_mass
-    damping = axis.hand_damping + axis.device_damping
+    mass, damping = axis.hand_mass + axis.device_mass, axis.hand_damping + axis.device_damping
     limits = {
         "wall_damping_Ns_per_m": wall_damping,
         "passive_N_per_m": passive_stiffness(axis.device_damping, wall_damping, period),

@@ -323,9 +323,8 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.table import Table
 
     console = Console()
-    table = Table(title="Stability margins", title_justify="left", box=SIMPLE_HEAD)
-    for heading in ("Grip", "Wall", "Stable"):
-        table.add_column(heading)
+    table = Table("Grip", "Wall", "Stable", title="Stability margins", box=SIMPLE_HEAD)
+    table.title_justify = "left"
     for heading in ("Gain", "Phase", "More round trip [ms]"):
         table.add_column(escape(heading), justify="right")  # [ms] is no markup
     for row in summary["margins"]:
