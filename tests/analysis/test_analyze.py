@@ -178,6 +178,28 @@ def test_report_states_the_delay_that_may_be_added(delay, more):
     assert float(margin_cells(light, delay)[-1]) == pytest.approx(more, abs=0.1)
 
 
+@pytest.mark.parametrize(("deviation", "stated"), [(0.09, False), (0.11, True), (1.42, True)])
+def test_verdict_names_both_causes_of_a_difference_from_one_axis(deviation, stated):
+    fit = {"mass": 0.15, "stiffness": 291.0}
+    both = {"felt": fit, "ideal": fit, "unnoticed_to_Hz": 5.0}
+    figures = {
+        "method": "none",
+        "wall_is": "the leaf",
+        "diagram": [],
+        "margins": [],
+        "grip": "firm",
+        "direction": "z",
+        "two_port": {"sampled": {"h11": 0.0, "h12": deviation}},
+        "bounded": {"each": {}, "grips": None},
+        "absolute": {"absolutely_stable": True},
+        "axis": {"sigma": 0.0},
+        "transparency": {"free": both, "wall": both, "tracking_bandwidth_Hz": 14.0},
+    }
+    text = " ".join(verdict_sentences(figures))
+    assert ("Along z the station is not one axis." in text) == stated
+    assert ("Contact rotates the tool, or its motion is estimated with a delay" in text) == stated
+
+
 def test_eta_raises_because_of_two_sigmas():
     scenario = replace(
         LoadScenario("free_motion_force"),
