@@ -19,6 +19,7 @@ from drake_teleop.lab.run import (
     ScenarioRun,
     _detection_delays,
     _moving_body_displacements,
+    _print_summary,
     is_in_contact,
     run_command,
     summarise,
@@ -79,6 +80,16 @@ def quick(tmp_path, monkeypatch):
         return run_command(path, tmp_path / name, seed=seed, quiet=quiet), tmp_path / name
 
     return run
+
+
+@pytest.mark.parametrize(("seed", "samples"), [(123456, 100001), (7, 20)])
+def test_printed_seed_and_number_of_samples_are_exact(capsys, tmp_path, seed, samples):
+    summary = {"description": "", "scenario": "touch", "seed": seed, "samples": samples}
+    summary |= {"peak_force": 1.23456, "load_source": "", "true_contact_s": [], "warnings": []}
+    _print_summary(summary, tmp_path)
+    assert f"seed {seed} samples {samples} peak_force 1.235 " in " ".join(
+        capsys.readouterr().out.replace("│", " ").split()
+    )
 
 
 @pytest.mark.slow

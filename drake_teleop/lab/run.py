@@ -206,7 +206,7 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     table.add_column(justify="right")
     for name, value in summary.items():
         if isinstance(value, (int, float)):
-            table.add_row(name, f"{value:.4g}")
+            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
     console = Console()
     console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
     console.print(table)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace as replace_fields
 
+import numpy as np
 import pytest
 from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis import analyze
 from drake_teleop.lab.analysis.maps import stability_map
-from drake_teleop.lab.analysis.report import print_tables, verdict_sentences
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
+from drake_teleop.lab.analysis.report import margin_cells, print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
@@ -141,6 +145,59 @@ def test_verdict_reports_coupled_direction_and_nonlinear_method():
     # Sideways, contact rotates the tool; the verdict reports that one axis is not valid.
     assert found["two_port"]["sampled"]["h22"] > 0.1
     assert any("is not one axis" in sentence for sentence in found["verdict"])
+
+
+@pytest.mark.parametrize(("gamma", "sigma"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5)])
+def test_models_without_displayed_force_have_no_deviation(gamma, sigma):
+    axis, sampling = OneAxis(gamma=gamma, sigma=sigma, wall_stiffness=0.0), Sampling()
+    with_hand_mass = replace_fields(axis, device_mass=axis.device_mass + axis.hand_mass)
+    H = sampled_two_port(with_hand_mass, sampling, analyze.OMEGA)
+    found = analyze.two_port_deviations(H, axis, sampling)
+    assert max(found["sampled"].values()) == 0.0
+    assert np.isfinite(list(found["closed_form"].values())).all()
+
+
+@pytest.mark.parametrize(("rate", "low_pass"), [(2000.0, 500.0), (1e4, 4500.0), (2e4, 9500.0)])
+def test_rates_of_the_map_increase_for_each_low_pass(monkeypatch, rate, low_pass):
+    monkeypatch.setattr(analyze, "_NUM_POINTS_PER_MAP_AXIS", 2)
+    maps = analyze.parameter_maps(
+        *(OneAxis(wall_stiffness=0.0), OneAxis(), Sampling(rate, rate, rate, low_pass)),
+        lambda name: lambda done: None,
+    )
+    for shown in maps["Rate and stiffness of the wall"].values():
+        assert shown.x[0] == pytest.approx(2.4 * low_pass)
+        assert shown.x[-1] == pytest.approx(max(4.8 * low_pass, 1e4))
+
+
+@pytest.mark.parametrize(("delay", "more"), [(0.05, 86.0), (0.22, 63.8), (0.25, 3.8)])
+def test_report_states_the_delay_that_may_be_added(delay, more):
+    """The longer delays are stable beyond a range of unstable ones."""
+    axis = OneAxis(sigma=1.0, wall_stiffness=0.0, delay=delay)
+    light = analyze.margin_rows(axis, Sampling(), 0.0)[0]
+    assert (light["grip"], light["stable"]) == ("light", True)
+    assert float(margin_cells(light, delay)[-1]) == pytest.approx(more, abs=0.1)
+
+
+@pytest.mark.parametrize(("deviation", "stated"), [(0.09, False), (0.11, True), (1.42, True)])
+def test_verdict_names_both_causes_of_a_difference_from_one_axis(deviation, stated):
+    fit = {"mass": 0.15, "stiffness": 291.0}
+    both = {"felt": fit, "ideal": fit, "unnoticed_to_Hz": 5.0}
+    figures = {
+        "method": "none",
+        "wall_is": "the leaf",
+        "diagram": [],
+        "margins": [],
+        "grip": "firm",
+        "direction": "z",
+        "two_port": {"sampled": {"h11": 0.0, "h12": deviation}},
+        "bounded": {"each": {}, "grips": None},
+        "absolute": {"absolutely_stable": True},
+        "axis": {"sigma": 0.0},
+        "transparency": {"free": both, "wall": both, "tracking_bandwidth_Hz": 14.0},
+    }
+    text = " ".join(verdict_sentences(figures))
+    assert ("Along z the station is not one axis." in text) == stated
+    assert ("Contact rotates the tool, or its motion is estimated with a delay" in text) == stated
 
 
 def test_eta_raises_because_of_two_sigmas():

@@ -391,3 +391,12 @@ def test_rates_method_and_direction_without_linear_model_raise():
         linearize_station(replace(scenario, passivity=PassivityConfig(method="tdpa")))
     with pytest.raises(DrakeTeleopError, match="direction"):
         task_direction(scenario, (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("displacement", "message"),
+    [((0.01,), r"shape \(1,\)"), ((0.0, np.nan, 0.0), "is not finite"), (0.01, "shape")],
+)
+def test_displacement_that_is_no_vector_raises(displacement, message):
+    with pytest.raises(DrakeTeleopError, match=f"^displacement: .*{message}"):
+        linearize(LoadScenario("free_motion_force"), displacement=displacement)

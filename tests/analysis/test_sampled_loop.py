@@ -280,6 +280,18 @@ def test_margins_of_a_delayed_integrator() -> None:
     assert gain_and_phase_margin(0.5 / (1 + 1j * w)) == (np.inf, np.inf)
 
 
+@pytest.mark.parametrize("round_trip", [0.0, 0.1, 0.18, 0.43, 0.48])
+def test_delay_margin_above_a_stable_delay_is_the_next_unstable_one(round_trip) -> None:
+    """Between 186 and about 400 ms and from about 500 ms the loop is unstable."""
+    loop = cut_loop(held("light", sigma=1.0, wall_stiffness=0.0), STATION)
+    margin = float(delay_margin(loop, round_trip))
+    between = np.linspace(round_trip, margin - 1e-6, 200)
+    assert margin > round_trip
+    assert not any(count_unstable_multipliers(loop, delay / 2) for delay in between)
+    assert count_unstable_multipliers(loop, (margin + 1e-6) / 2) == 2
+    assert delay_margin(loop, margin + 1e-3) == margin + 1e-3  # unstable
+
+
 def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
     assert delay_margin(cut_loop(held("light", wall_stiffness=5.1e3), STATION)) == 0.0
     firm = cut_loop(held("firm", wall_stiffness=5.1e3), STATION)

@@ -135,6 +135,10 @@ def test_grid_of_parameters_equals_single_values():
         (lambda: passive_stiffness(-1.0, 0.0, PERIOD), "^device_damping: has the value -1"),
         (lambda: stable_stiffness(0.0, 1.0, 0.0, PERIOD), "^mass: has the value 0"),
         (lambda: stable_stiffness(1.0, 1.0, 0.0, PERIOD, hand_stiffness=-5.0), "^hand_stiffness:"),
+        (lambda: passive_stiffness(1.0, np.nan, PERIOD), "^wall_damping: is not finite"),
+        (lambda: stable_stiffness(1.0, 1.0, [2.0, np.inf], PERIOD), "^wall_damping: is not finite"),
+        (lambda: sampled_poles(1.0, 1.0, 0.0, np.nan, 2.0, PERIOD), "^wall_stiffness: is not fin"),
+        (lambda: sampled_poles(1.0, 1.0, 0.0, 3.0, -np.inf, PERIOD), "^wall_damping: is not fin"),
     ],
 )
 def test_invalid_numbers_raise(spoilt, match):

@@ -6,6 +6,7 @@ import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.analyze import describe_wall_source
+from drake_teleop.lab.analysis.linearization import network_delay_periods
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
@@ -47,6 +48,32 @@ def test_axis_has_the_parameters_of_the_scenario():
     assert axis.mass_error == pytest.approx(0.1)
     assert axis.wall_stiffness == scenario.sheet_spring.stiffness
     assert OneAxisFromScenario(replace(scenario, sheet_spring=None), (1, 0, 0)).wall_stiffness == 0
+
+
+@pytest.mark.parametrize(
+    ("forward", "backward", "delay", "periods"),
+    [
+        ({"delay": 0.02, "playout": 0.05}, {"delay": 0.02}, 0.035, (100, 40)),
+        ({"delay": 0.06, "playout": 0.05}, {"playout": 0.01}, 0.035, (120, 20)),
+        ({"trace": "0.04"}, {"trace": "0.03", "playout": 0.1}, 0.07, (80, 200)),
+        # Half a period more than 2 and 3 periods, as the network rounds.
+        ({"delay": 1.25e-3}, {"delay": 1.75e-3}, 1.5e-3, (3, 4)),
+    ],
+)
+def test_delay_is_the_age_at_which_the_network_delivers(
+    tmp_path, forward, backward, delay, periods
+):
+    lines = []
+    for settings in (forward, backward):
+        if constant := settings.get("trace"):
+            path = tmp_path / f"{constant}.csv"
+            path.write_text(f"time,delay\n0,{constant}\n1,{constant}\n")
+            settings = settings | {"trace": str(path)}
+        lines.append(settings)
+    channel = Channel(**lines[0], backward=NetworkConfig(**lines[1]))
+    scenario = replace(Scenario(), channel=channel)
+    assert OneAxisFromScenario(scenario, (0, 0, 1)).delay == pytest.approx(delay)
+    assert network_delay_periods(scenario) == periods
 
 
 @pytest.mark.parametrize(

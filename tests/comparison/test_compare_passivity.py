@@ -108,9 +108,12 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
         ({"methods": ["magic"]}, r"methods.*no passivity method 'magic'.*tdpa"),
         ({"methods": []}, "methods: is empty; give"),
         ({"networks": []}, "networks: is empty; give"),
+        ({"networks": ["ideal"]}, "networks: .* over 'ideal' with method 'none'; remove"),
+        ({"networks": ["lan", "ideal"], "methods": ["tdpa", "none"]}, "networks: .*'ideal'"),
     ],
 )
-def test_unknown_names_raise(tmp_path, arguments, message):
+def test_invalid_names_raise(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.setattr(study, "_run_longest_round_trip_study", lambda *_: pytest.fail("too late"))
     with pytest.raises(DrakeTeleopError, match=message):
         study.compare_command(tmp_path, **arguments)
 
@@ -138,6 +141,14 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     # Steps longer than the events' period avoid extra steps by rounding.
     assert base.simulation.integrator == "runge_kutta3"
     assert base.simulation.max_step > 1.5 / base.rates.hand_hz
+
+
+def test_slave_that_does_not_translate_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "_run_longest_round_trip_study", lambda *_: pytest.fail("too late"))
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("{kinematic_scaling: {translation_scale: 0}}")
+    with pytest.raises(DrakeTeleopError, match=r"^kinematic_scaling\.translation_scale: is 0"):
+        study.compare_command(tmp_path / "out", scenario=mine)
 
 
 def test_slip_speed_at_the_leaf_is_the_default(monkeypatch):

@@ -65,6 +65,14 @@ def test_points_with_many_failures_are_excluded():
     assert found.best_share[0, 0] == 0.0
 
 
+@pytest.mark.parametrize(("failing", "seeds"), [(1, 20), (2, 40), (1, 19), (3, 40)])
+def test_one_failure_in_twenty_is_accepted(failing, seeds):
+    rows = tables(seeds)
+    rows["press"]["success"][0, 0, :failing] = 0.0
+    rows["press"]["effort"][0, 0, :failing] = np.nan
+    assert np.isfinite(rate_scales(rows, ("effort",)).merit[0, 0]) == (20 * failing <= seeds)
+
+
 @pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
 def test_seeds_with_failed_reference_are_excluded(failing, best):
     rows = tables(seeds=3)

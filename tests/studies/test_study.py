@@ -269,6 +269,12 @@ def test_kills_neither_lose_nor_duplicate_rows(tmp_path):
     assert rows["hand_work_J"].null_count() == failed["hand_work_J"].null_count() == failed.height
 
 
+@pytest.mark.parametrize("repeats", [-1, 0, 2.5])
+def test_invalid_repeats_raise(files, repeats):
+    with pytest.raises(DrakeTeleopError, match=rf"repeats: .*{repeats}"):
+        study_command(files / "study.yaml", files / "none", repeats=repeats, quiet=True)
+
+
 def test_failed_run_is_a_row_with_an_error(files):
     (files / "failing.yaml").write_text(
         STUDY.replace(

@@ -7,10 +7,12 @@ from dataclasses import replace as replace_fields
 
 import numpy as np
 import pytest
+from pydrake.math import RollPitchYaw
 
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.comparison import whole_station
 from drake_teleop.lab.comparison.one_dof import RunMeasures
 from drake_teleop.lab.comparison.whole_station import (
     _slave_height_and_rotation,
@@ -87,6 +89,12 @@ def test_scenario_without_network_is_refused_before_the_runs(tmp_path, network):
     assert not (tmp_path / "out").exists()
 
 
+def test_slave_that_does_not_translate_is_refused():
+    rigid = replace(LoadScenario("contact_transition"), kinematic_scaling__translation_scale=0.0)
+    with pytest.raises(DrakeTeleopError, match=r"^kinematic_scaling\.translation_scale: is 0"):
+        without_task_and_method(rigid, "internet")
+
+
 def test_unknown_networks_are_refused():
     with pytest.raises(DrakeTeleopError, match=r"^network: 'internt' is unknown"):
         without_task_and_method(LoadScenario("touch"), "internt")
@@ -112,6 +120,53 @@ def test_press_reaches_the_leaf_and_the_depth_at_the_masters_scale():
     leaf, tip = setup.first_sheet_spring, NominalSlave(scaled.slave).p_WTip_start
     np.testing.assert_allclose(leaf.position, tip - [0.0, 0.0, 0.03])
     assert leaf.stiffness == pytest.approx(3000.0)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("alignment", [[0.0, 0.0, 0.0], [0.0, np.pi / 2, 0.0], [0.4, -1.1, 2.0]])
+def test_slave_swings_above_the_leaf_and_presses_down_for_each_alignment(alignment, scale):
+    scenario = replace(
+        LoadScenario("contact_transition"),
+        kinematic_scaling__alignment=alignment,
+        kinematic_scaling__translation_scale=scale,
+    )
+    setup, _ = press_scenario(scenario, UNEQUAL, PassivityConfig(method="ledger"), "contact")
+    R_WB = RollPitchYaw(alignment).ToRotationMatrix().matrix()
+    swing, press, retreat = (scale * R_WB @ part.translation for part in setup.operator.intent)
+    np.testing.assert_allclose(swing, min(scale, 1.0) * np.array([0.005, 0.0, 0.02]), atol=1e-15)
+    np.testing.assert_allclose(press, [0.0, 0.0, -0.03 - 0.02 * scale], atol=1e-15)
+    np.testing.assert_allclose(retreat, -press, atol=1e-15)
+    rotation = R_WB @ setup.operator.intent[0].rotation
+    np.testing.assert_allclose(rotation, [0.0, 0.05, 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("alignment", [[0.0, 0.0, 0.0], [0.0, np.pi / 2, 0.0], [0.4, -1.1, 2.0]])
+def test_displayed_force_is_vertical_in_the_world(monkeypatch, alignment):
+    monkeypatch.setattr(whole_station, "injected_energy", lambda *_: np.zeros(3))
+    scenario = replace(LoadScenario("contact_transition"), kinematic_scaling__alignment=alignment)
+    R_WB = RollPitchYaw(alignment).ToRotationMatrix().matrix()
+    force_B = np.zeros((3, 6))
+    force_B[:, :3] = np.array([[9.0, 8.0, 1.0], [7.0, 6.0, 2.0], [0.0, 0.0, 3.0]]) @ R_WB
+    signals = {"force_to_master": force_B, "true_contact_wrench_W": np.full((3, 6), 2.0)}
+    result = SimulationResult(np.arange(3.0), signals, [SIGNALS[name] for name in signals])
+    found = whole_station.force_and_energy_traces(result, scenario)["hand_force"]
+    np.testing.assert_allclose(found, [1.0, 2.0, 3.0], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "scale", "slave_scale"), [(0.0, 1, 1), (30.0, 1, 1), (30.0, 0.5, 0.5), (30.0, 2, 1)]
+)
+def test_predicted_threshold_includes_the_load_in_the_slaves_swing(sigma, scale, slave_scale):
+    one = trial()
+    base = replace(one.base_scenario, kinematic_scaling__translation_scale=scale)
+    human = base.operator.perception
+    load = 1.0 * 0.02 * slave_scale * (3 * np.pi) ** 2 / np.sqrt(2)  # N, rms: m A omega^2
+    row = {"gamma_limit": 2.2, "sigma_inertia": sigma, "low_pass_hz": 100.0, "share": 0.9}
+    found = search._add_predicted_force_threshold(
+        row, replace_fields(one, base_scenario=base), {100.0: 0.0}
+    )
+    smallest = max(human.absolute_threshold, human.weber_fraction * sigma * load / 17.5)
+    assert found["threshold_N"] == pytest.approx(smallest * 17.5 / (2.0 * 0.9))
 
 
 def test_rotation_of_the_slave_is_about_the_axes_of_the_world():
@@ -237,39 +292,62 @@ def capture_arguments(*arguments, **options):
 
 
 UNEQUAL = Channel(delay=0.02, backward=NetworkConfig(delay=0.05))
+BUFFERED = Channel(delay=0.02, playout=0.03, backward=NetworkConfig(delay=0.05, playout=0.06))
 
 
-def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
+@pytest.mark.parametrize(
+    ("channel", "playouts", "round_trip"),
+    [(UNEQUAL, (0.0, 0.0), 0.07), (BUFFERED, (0.03, 0.06), 0.09)],
+)
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_low_pass_of_the_sensor_delays_the_force_alone(
+    monkeypatch, channel, playouts, round_trip, scale
+):
     monkeypatch.setattr(press_trial.one_dof, "run_one_dof", capture_arguments)
     one = trial()
-    unequal = replace(one.base_scenario, channel=UNEQUAL)
+    unequal = replace(one.base_scenario, channel=channel)
     search_ = OneAxisGammaSearch(unequal, one.operating_range, {})
     tuned = TunedSettings("ledger", 1.5, 0.3, 100.0)
     with pytest.raises(CapturedArguments) as found:
-        search_.share_in_one_axis(OneAxis(), tuned, "firm", 3000.0, 4)
+        axis = OneAxis(position_scale=scale, force_scale=0.1)
+        search_.share_in_one_axis(axis, tuned, "firm", 3000.0, 4)
     (model, _, forward, backward), options = found.value.args
-    assert forward.delay == 0.02 and backward.delay == pytest.approx(0.05 + 0.416 / 100.0)
+    lag = 0.416 / 100.0
+    assert forward.delay == 0.02 and backward.delay == pytest.approx(0.05 + lag)
+    assert forward.playout == playouts[0]
+    expected = playouts[1] + lag if playouts[1] else 0.0
+    assert max(backward.playout, backward.delay) == pytest.approx(max(expected, 0.05 + lag))
+    # The loop gain is force scale times motion scale.
+    assert model.force_scale == pytest.approx(0.1 * scale)
+    times = press_trial.short_press_task(round_trip)
+    np.testing.assert_array_equal(options["intent"], press_trial.one_dof.operator_intent(times))
     assert (model.hand_stiffness, model.wall_stiffness, model.gamma) == (700.0, 3000.0, 1.5)
     assert options["seed"] == 4
 
 
-def test_trial_waits_for_both_directions_and_presses_as_deep_as_the_device_can(monkeypatch):
+@pytest.mark.parametrize(("channel", "round_trip"), [(UNEQUAL, 0.07), (BUFFERED, 0.09)])
+def test_trial_waits_for_both_directions_and_presses_as_deep_as_the_device_can(
+    monkeypatch, channel, round_trip
+):
     monkeypatch.setattr(press_trial, "press_scenario", capture_arguments)
     one = trial()
-    one = replace_fields(one, base_scenario=replace(one.base_scenario, channel=UNEQUAL))
+    one = replace_fields(one, base_scenario=replace(one.base_scenario, channel=channel))
     values = {"method": "as given", "hand": "firm", "wall": 3000.0}
     with pytest.raises(CapturedArguments) as found:
         one(values, 3)
-    (_, channel, _, wall), options = found.value.args
-    assert (channel, wall, options["depth"]) == (UNEQUAL, 3000.0, 0.02)
-    assert options["task"] == press_trial.short_press_task(0.07)
+    (_, used, _, wall), options = found.value.args
+    assert (used, wall, options["depth"]) == (channel, 3000.0, 0.02)
+    assert options["task"] == press_trial.short_press_task(round_trip)
 
 
+@pytest.mark.parametrize("alignment", [[0.0, 0.0, 0.0], [0.4, -1.1, 2.0]])
 @pytest.mark.parametrize("free_force", [0.0, 4.0])
-def test_smallest_detected_force_is_that_at_the_tool(monkeypatch, free_force):
+def test_smallest_detected_force_is_that_at_the_tool(monkeypatch, free_force, alignment):
     """The operator detects 0.06 N or a tenth of the free force, and twice the force at rest."""
     t = np.arange(0.0, 8.0, 1e-3)
-    ripple = 0.02 * np.sin(2.0 * np.pi * 40.0 * t)[:, None] * [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    z_B = RollPitchYaw(alignment).ToRotationMatrix().matrix()[2]
+    in_hold = t > press_trial.short_press_task(0.1).press_end
+    ripple = 0.02 * (in_hold * np.sin(2.0 * np.pi * 40.0 * t))[:, None] * [*z_B, 0.0, 0.0, 0.0]
     signals = {"force_to_master": ripple, "true_contact_wrench_W": np.full((len(t), 6), -5.0)}
     measures = RunMeasures(True, 0.0, 0.0, 0.0, 0.0, -0.2, 0.0, free_force, 0.0, 0.0)
     for name, value in (
@@ -279,7 +357,10 @@ def test_smallest_detected_force_is_that_at_the_tool(monkeypatch, free_force):
     ):
         monkeypatch.setattr(press_trial, name, lambda *_, value=value, **__: value)
     tuned = {"method": "ledger", "gamma": 2.0, "sigma_inertia": 0.3, "low_pass_hz": 100.0}
-    found = trial()(tuned | {"hand": "firm", "wall": 3000.0}, 3)
+    one = trial()
+    turned = replace(one.base_scenario, kinematic_scaling__alignment=alignment)
+    one = replace_fields(one, base_scenario=turned)
+    found = one(tuned | {"hand": "firm", "wall": 3000.0}, 3)
     rest = 0.02 / np.sqrt(2.0)
     human = Perception()
     smallest = max(human.absolute_threshold, human.weber_fraction * free_force)

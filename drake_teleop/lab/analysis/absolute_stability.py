@@ -157,8 +157,8 @@ def impedance_range_of_grips() -> ImpedanceRange:
 def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     """Return, for each omega, the softest wall [N/m] that oscillates with a hand in range (T57).
 
-    0: oscillates in free motion; inf: with no wall. If a dense grid contains only inf, all hands
-    are stable or all are unstable.
+    0: oscillates in free motion; inf: with no wall. If a grid, dense for the range, contains only
+    inf, all hands are stable or all are unstable. A single hand returns inf.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
@@ -192,12 +192,8 @@ def singular_value_in_ranges(
     through = h12 * h21 * reduction**2 / displayed
     # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
     # with this diagonal and this product of the other two.
-    first, second, product = (
-        r1 / displayed,
-        r2 * (h22 * reduction - through),
-        -r1 * r2 * through / displayed,
-    )
-    mu = structured_singular_value(two_port_matrix(first, product, 1.0, second))
+    first, second = r1 / displayed, r2 * (h22 * reduction - through)
+    mu = structured_singular_value(two_port_matrix(first, -first * r2 * through, 1.0, second))
     return np.min(mu, axis=(-2, -1))
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
@@ -21,7 +20,7 @@ from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_ma
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
 from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
-from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
+from drake_teleop.lab.analysis.task_direction import TaskDirection, check_can_press, task_direction
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -166,10 +165,7 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     """Return the master's displacement [m], in its base B, for a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
-    if scaling.translation_scale == 0:
-        what = "is 0, so that the slave cannot press on the leaf of the sheet spring"
-        remedy = "choose a scale above 0, or remove the sheet spring (sheet_spring or !SheetSpring)"
-        raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
+    check_can_press(scenario)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).p_WTip_start
     return list(scaling.R_WB.T @ displacement / scaling.translation_scale)
@@ -204,10 +200,7 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def summarise_diagram_stability(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest mode of the linearised Diagram and of the one-axis model.
-
-    The slowest mode is that of the largest multiplier.
-    """
+    """Return stability and slowest mode (largest multiplier) of Diagram and one-axis model."""
     loop = cut_loop.cut_loop(axis, sampling)
     stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
     return {
@@ -240,7 +233,8 @@ def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[s
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
     def max_relative_deviations_from(other: Complex) -> dict[str, float]:
-        found = np.abs(H[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
+        largest = np.abs(other).max(axis=0)
+        found = np.abs(H[compared] - other).max(axis=0) / np.where(largest > 0, largest, 1.0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     closed_form = two_port.hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])
@@ -269,7 +263,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
                 "stable": stable,
                 "gain": gain,
                 "phase_deg": float(np.degrees(phase)),
-                "round_trip_s": float(cut_loop.delay_margin(loop)),
+                "round_trip_s": float(cut_loop.delay_margin(loop, 2 * axis.delay if stable else 0)),
             }
         )
     return rows
@@ -340,8 +334,7 @@ def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str
 
 def virtual_wall_limits(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     wall_damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
-    mass = axis.hand_mass + axis.device_mass
-    damping = axis.hand_damping + axis.device_damping
+    mass, damping = axis.hand_mass + axis.device_mass, axis.hand_damping + axis.device_damping
     limits = {
         "wall_damping_Ns_per_m": wall_damping,
         "passive_N_per_m": passive_stiffness(axis.device_damping, wall_damping, period),
@@ -392,7 +385,7 @@ def parameter_maps(
     walls = np.geomspace(100.0, 1e5, n)
     # The sensor's low-pass has to stay below half of its rate.
     slowest = 2.4 * (sampling.low_pass_hz or 0.0) * sampling.hand_hz / sampling.sensor_hz
-    rate = np.geomspace(max(slowest, 100.0), 10e3, n)
+    rate = np.geomspace(max(slowest, 100.0), max(2 * slowest, 10e3), n)
     parameters: dict[str, tuple[Any, ...]] = {
         "Delay and stiffness of the wall": (contact, "delay", delay, "wall_stiffness", walls),
         "Delay and σ, in free motion": (axis, "delay", delay, "sigma", sigma),

@@ -112,13 +112,15 @@ def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDA
     return outside - (loop.gain_crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
-def delay_margin(loop: CutLoop) -> Array:
-    """Return the shortest round-trip delay [s] that makes the loop unstable; inf: none does."""
+def delay_margin(loop: CutLoop, round_trip_s: float = 0.0) -> Array:
+    """Return the shortest delay [s] above `round_trip_s` that makes the loop unstable, or inf."""
     angles = loop.gain_crossing_angles
+    phases = loop.gain_crossing_phases - round_trip_s / loop.period_s[..., None] * angles
     inside = (angles > 0) & (angles < np.pi) & (loop.gain_crossing_signs != 0)
-    steps = np.mod(loop.gain_crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
-    first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
-    return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
+    steps = np.mod(phases, 2 * np.pi) / np.where(inside, angles, 1.0)
+    more = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
+    unstable = count_unstable_multipliers(loop, round_trip_s / 2) > 0
+    return round_trip_s + np.where(unstable, 0.0, more)
 
 
 @njit(cache=True)

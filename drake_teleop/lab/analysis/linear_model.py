@@ -46,8 +46,7 @@ class Linearization:
         columns = self._component_indices(inputs, self.inputs)
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
-        A = self.A + self.B[:, columns] @ self.C[list(rows)]
-        return dataclasses.replace(self, A=A)
+        return dataclasses.replace(self, A=self.A + self.B[:, columns] @ self.C[list(rows)])
 
     def frequency_response(self, omega: Array) -> Complex:
         """Return the response (n, outputs, inputs) at `omega` (n,) [rad/s], with closed loops."""

@@ -32,6 +32,7 @@ from drake_teleop.lab.analysis.linear_model import Linearization, port_component
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.environment.point_contact import PAIR_FRICTION_COLUMNS
 from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -72,8 +73,9 @@ def linearize(
         load_estimate = finite_array("load_estimate", load_estimate, 16)
         # The sensor of the linear model has no offset.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
+    displacement_B = finite_array("displacement", displacement, 3)
     period = _PeriodSimulator(scenario, load_estimate)
-    x, A, C = period.find_rest_state_and_derivatives(np.asarray(displacement, dtype=float))
+    x, A, C = period.find_rest_state_and_derivatives(displacement_B)
     B = period.differentiate_by_input(x)
     affects = _states_affecting_outputs(A, C)
     names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
@@ -110,7 +112,7 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     if scenario.has_no_network_or_passivity:
         return 0, 0
     rate, lines = scenario.rates.hand_hz, scenario.channel.networks_of_directions()
-    ahead, back = (max(1, round(max(line.delay, line.playout) * rate)) for line in lines)
+    ahead, back = (max(1, int(mean_delay(line) * rate + 0.5)) for line in lines)
     return ahead, back
 
 

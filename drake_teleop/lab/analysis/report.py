@@ -241,10 +241,10 @@ def verdict_sentences(figures: dict[str, Any]) -> list[str]:
     for row in figures["margins"]:
         if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]:
             sentences += _margin_sentences(row, figures["delay_s"])
-    worst = max(figures["two_port"]["sampled"].values())
-    if worst > 0.1:
+    if (worst := max(figures["two_port"]["sampled"].values())) > 0.1:
         sentences += [
-            f"Along {figures['direction']} the station is not one axis: contact rotates the tool.",
+            f"Along {figures['direction']} the station is not one axis.",
+            "Contact rotates the tool, or its motion is estimated with a delay (encoders).",
             f"Its two-port differs from one axis by up to {100 * worst:.2g} % below 30 Hz.",
             "Margins and maps assume one axis and are approximate here.",
         ]
@@ -323,9 +323,8 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.table import Table
 
     console = Console()
-    table = Table(title="Stability margins", title_justify="left", box=SIMPLE_HEAD)
-    for heading in ("Grip", "Wall", "Stable"):
-        table.add_column(heading)
+    table = Table("Grip", "Wall", "Stable", title="Stability margins", box=SIMPLE_HEAD)
+    table.title_justify = "left"
     for heading in ("Gain", "Phase", "More round trip [ms]"):
         table.add_column(escape(heading), justify="right")  # [ms] is no markup
     for row in summary["margins"]:

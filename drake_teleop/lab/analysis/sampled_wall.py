@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.numeric import Array, nonnegative_array, positive_array
+from drake_teleop.common.numeric import Array, finite_array, nonnegative_array, positive_array
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.period_map import mass_spring_responses_to_unit_x_v_u
 
@@ -21,8 +21,9 @@ _NUM_STIFFNESS_BISECTIONS = 60
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
     """Return the largest stiffness [N/m] of a passive virtual wall; 0: no wall is passive (T62)."""
     b = positive_array("device_damping", device_damping, *np.shape(device_damping))
+    B = finite_array("wall_damping", wall_damping, *np.shape(wall_damping))
     positive_array("period", period)
-    return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
+    return np.maximum(2 * (b - np.abs(B)) / period, 0.0)
 
 
 def stable_stiffness(
@@ -40,11 +41,12 @@ def stable_stiffness(
     device = mass, damping, hand_stiffness
     push = _sampled_device_responses_to_unit_x_v_f(*device, period)[..., 2]
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
-    high = 5 / push[..., 0] + np.abs(wall_damping) / period
+    B = finite_array("wall_damping", wall_damping, *np.shape(wall_damping))
+    high = 5 / push[..., 0] + np.abs(B) / period
     low = np.zeros_like(high)
     for _ in range(_NUM_STIFFNESS_BISECTIONS):
         middle = (low + high) / 2
-        poles = sampled_poles(*device, middle, wall_damping, period)
+        poles = sampled_poles(*device, middle, B, period)
         stable = np.abs(poles).max(axis=-1) < 1
         low, high = np.where(stable, middle, low), np.where(stable, high, middle)
     return low
@@ -59,7 +61,8 @@ def sampled_poles(
     period: float,
 ) -> Complex:
     """Return the eigenvalues (..., 3) of device, hand and virtual wall over one sampling period."""
-    K, B = np.broadcast_arrays(wall_stiffness, wall_damping)
+    walls = {"wall_stiffness": wall_stiffness, "wall_damping": wall_damping}
+    K, B = np.broadcast_arrays(*(finite_array(k, x, *np.shape(x)) for k, x in walls.items()))
     responses = _sampled_device_responses_to_unit_x_v_f(mass, damping, hand_stiffness, period)
     # States: position, velocity, last sampled position
     force = np.stack([K + B / period, np.zeros_like(B, dtype=float), -B / period], axis=-1)

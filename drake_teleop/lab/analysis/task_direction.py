@@ -16,6 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.environment.point_contact import PAIR_STIFFNESS_COLUMN
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import Scenario, check_scenario
@@ -86,7 +87,6 @@ def task_direction(
     servo, sheet = scenario.joint_control, scenario.first_sheet_spring
     servo.require_computed_torque("the model of one axis")
     scenario.master.check_pose_mode("the model of one axis")
-    forward, backward = scenario.channel.networks_of_directions()
     axis = OneAxis(
         hand_mass=hand.mass,
         hand_damping=hand.damping,
@@ -102,11 +102,17 @@ def task_direction(
         position_scale=scaling.translation_scale,
         sigma=sigma,
         gamma=gamma,
-        delay=0.5 * (forward.delay + backward.delay),
+        delay=0.5 * sum(map(mean_delay, scenario.channel.networks_of_directions())),
         wall_stiffness=_environment_stiffness(scenario),
         wall_damping=0.0 if sheet is None else float(sheet.damping),
     )
     return TaskDirection(axis, hand_B, tool_W, float(mass_acceleration / mobility))
+
+
+def check_can_press(scenario: Scenario) -> None:
+    if scenario.kinematic_scaling.translation_scale == 0.0:
+        what, remedy = "is 0, so that the slave cannot press", "choose a scale above 0"
+        raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
 
 
 def _environment_stiffness(scenario: Scenario) -> float:

@@ -20,6 +20,7 @@ from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
+from drake_teleop.lab.analysis.task_direction import check_can_press
 from drake_teleop.lab.comparison import one_dof, whole_station
 from drake_teleop.lab.comparison.one_dof import PERIOD_S, TAP_RATES_HZ, OneDof, RunMeasures, Task
 from drake_teleop.lab.identified_load import identified_load
@@ -75,6 +76,9 @@ def compare_command(
             raise DrakeTeleopError("is empty", where=where, remedy="give one name or more")
     for name in methods:
         METHODS.check(name, "methods")
+    if "ideal" in networks and "none" in methods:
+        what = "the station has no energy balance over 'ideal' with method 'none'"
+        raise DrakeTeleopError(what, where="networks", remedy="remove the network or the method")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
@@ -137,8 +141,10 @@ def longest_round_trip(
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
     """Return the scenario without environment and contact detection, at the comparison's rates."""
+    given = LoadScenario(scenario).without_environment()
+    check_can_press(given)
     return replace(
-        LoadScenario(scenario).without_environment(),
+        given,
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
         rates=_COMPARISON_RATES,
         contact_detection=None,
@@ -260,20 +266,14 @@ def _displayed_share_of_tap_impulse(
 def _run_longest_round_trip_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
-    cases = [
-        (method, wall, jitter, loss)
-        for method in methods
-        for wall, (jitter, loss) in itertools.product(WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
-    ]
+    product = itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
+    cases = [(method, wall, *pair) for method, wall, pair in product]
     # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
     seeds = [seed, seed + 1]
-    runs = [
-        (method, OneDof(wall_stiffness=wall), jitter, loss, seeds)
-        for method, wall, jitter, loss in cases
-    ]
+    runs = [(method, OneDof(wall_stiffness=wall), *pair, seeds) for method, wall, *pair in cases]
     found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
     names, grid = ("method", "wall_N_per_m", "jitter", "loss"), list(ROUND_TRIPS_S)
     return [

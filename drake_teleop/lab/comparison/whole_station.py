@@ -18,6 +18,7 @@ from drake_teleop.lab.comparison.one_dof import AT_COMMAND, AT_HAND, AT_MOTOR, A
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.passivity import methods
@@ -66,23 +67,24 @@ def press_scenario(
     `leaf` is a key of `LEAF_THICKNESSES_M` or a stiffness [N/m]; `depth` [m] is the hand's intended
     displacement beyond the contact.
     """
-    task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
-    settle = 0.5
+    task = task or task_for_round_trip(sum(map(mean_delay, channel.networks_of_directions())))
+    settle, scale = 0.5, base.kinematic_scaling.translation_scale
+    x_B, y_B, z_B = base.kinematic_scaling.R_WB  # axes of W, in B
     swing = Sine(
         t_start=settle + task.swing_start,
         duration=task.swing_end - task.swing_start,
         ramp=min(0.5, 0.5 * (task.swing_end - task.swing_start)),
         frequency=1.5,
-        translation=[0.005, 0.0, 0.02],
-        rotation=[0.0, 0.05, 0.0],
+        # The slave's swing stays above the leaf.
+        translation=((0.005 * x_B + 0.02 * z_B) / max(scale, 1.0)).tolist(),
+        rotation=(0.05 * y_B).tolist(),
     )
-    scale = base.kinematic_scaling.translation_scale
-    reach = [0.0, 0.0, -(_TIP_LEAF_GAP_M / scale + depth)]
+    rise_B = (_TIP_LEAF_GAP_M / scale + depth) * z_B
     press, retreat = (
-        MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
+        MinimumJerk(t_start=settle + start, duration=end - start, translation=translation.tolist())
         for start, end, translation in (
-            (task.press_start, task.press_end, reach),
-            (task.release_start, task.release_end, [-x for x in reach]),
+            (task.press_start, task.press_end, -rise_B),
+            (task.release_start, task.release_end, rise_B),
         )
     )
     x, y, z = NominalSlave(base.slave).p_WTip_start.tolist()
@@ -127,7 +129,7 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
     scaling = scenario.force_scaling
     return {
         "t": result.t,
-        "hand_force": result["force_to_master"][:, 2],
+        "hand_force": result["force_to_master"][:, :3] @ scenario.kinematic_scaling.R_WB[2],
         "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
         "energy": injected_energy(result, scenario),
     }
@@ -185,10 +187,7 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the work (N, 2) [J] so far of the load's displayed wrench, at the master's scale.
-
-    Columns: translation, rotation.
-    """
+    """Return the work (N, 2) [J] so far of the load's displayed wrench: translation, rotation."""
     arm, t = slave_arm(scenario), result.t
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [arm.num_joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))

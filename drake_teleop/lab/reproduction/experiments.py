@@ -82,12 +82,11 @@ def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgres
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation, progress=progress)
     wrench, s, omega, alpha = sensor_samples(result)
-    offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
-    scaled = {}
-    for sigma in SIGMAS:
-        scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}
-        parts = wrench, offsets, s, omega, alpha, phi, no_object
-        scaled[sigma] = scaled_wrench(*parts, **scales)
+    parts = wrench, estimate[:6], s, omega, alpha, estimate[6:], np.zeros(10)  # no object
+    scaled = {
+        sigma: scaled_wrench(*parts, sigma_gripper=sigma, sigma_object=sigma, gamma=1.0)
+        for sigma in SIGMAS
+    }
     return MotionRun(scenario, result, scaled)
 
 

@@ -103,7 +103,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
         if names
     ]
     merits = np.mean(parts, axis=0)
-    failures = np.max([1 - t["success"].mean(axis=-1) for t in tables.values()], axis=0)
+    failures = np.max([(1 - t["success"]).mean(axis=-1) for t in tables.values()], axis=0)
     usable = failures <= _MAX_FAILED_RUN_SHARE
     # Draws in which the reference has no successful run are undefined.
     known = np.isfinite(merits[:, usable]).all(axis=1)

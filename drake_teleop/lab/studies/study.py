@@ -84,7 +84,7 @@ def study_command(
             what = f"the options {first} and {second} cannot be combined"
             raise DrakeTeleopError(what, where="study", remedy="remove one of them")
     study, path = LoadStudy(path), scenarios.find_shipped_file("study", path, studies_dir())
-    study.repeats = repeats or study.repeats
+    study.repeats = study.repeats if repeats is None else repeats
     study.check_num_runs(str(path), yes)
     known = study.scenario in scenarios.ScenarioNames()
     data, where = scenarios.ReadScenarioData(

@@ -16,13 +16,13 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
-from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
+from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, check_can_press
 from drake_teleop.lab.comparison import one_dof
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
 from drake_teleop.lab.comparison.whole_station import measures_of_press, press_scenario
 from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.station.channel.channel import Channel
-from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
@@ -86,13 +86,11 @@ class OperatingRange:
 
     @property
     def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
-        """Parts of the test, each with its own seed: factor of gamma, grips, walls [N/m].
-
-        The softest grip fails first: it is tested twice.
-        """
+        """Parts of the test, each with its own seed: factor of gamma, grips, walls [N/m]."""
         low, high = self.walls
         margin, hands = self.requirements.loop_gain_margin, list(self.hands)
         walls = np.geomspace(high, low, _NUM_TESTED_WALL_STIFFNESSES if low < high else 1).tolist()
+        # The softest grip fails first: it is tested twice.
         parts = [(margin, part, walls) for part in (hands[:1], hands[:1], hands[1:]) if part]
         return [*parts, (1.0, [*dict.fromkeys((hands[0], hands[-1]))], [high])]
 
@@ -105,11 +103,9 @@ def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str
     """Return the operating range of these grips, walls [kN/m] and this task."""
     _check_names_are_known("hands", hands, tuple(GRIP_IMPEDANCES))
     _check_names_are_known("task", [task], tuple(REQUIREMENTS_OF_TASK))
-    if not hands:
-        raise DrakeTeleopError("no grip is given", where="hands", remedy="give one, such as light")
-    if not walls:
-        remedy = "give kN/m, such as 0.5,20"
-        raise DrakeTeleopError("no wall stiffness is given", where="walls", remedy=remedy)
+    for where, given, example in (("hands", hands, "light"), ("walls", walls, "0.5,20 (kN/m)")):
+        if not given:
+            raise DrakeTeleopError("is empty", where=where, remedy=f"give such as {example}")
     for wall in walls:
         if not _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M:
             lowest, highest = _MIN_WALL_N_M / 1e3, _MAX_WALL_N_M / 1e3
@@ -141,6 +137,7 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
         what += ", which the energy balances of the runs need"
         remedy = f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}"
         raise DrakeTeleopError(what, where="network", remedy=remedy)
+    check_can_press(scenario)
     force_scale = scenario.force_scaling.force_scale
     simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_DT_S, end_with_task=False)
     return replace(
@@ -206,7 +203,7 @@ class StationPressTrial:
             scenario = settings_from_values(values).apply(self.base_scenario, self.operating_range)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel, passivity = self.base_scenario.channel, scenario.passivity
-        task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
+        task = short_press_task(sum(map(mean_delay, channel.networks_of_directions())))
         depth = renderable_press_depth(self.base_scenario, grip)
         setup, _ = press_scenario(scenario, channel, passivity, wall, task=task, depth=depth)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
@@ -220,7 +217,7 @@ class StationPressTrial:
         gain = scaling.force_scale * scaling.scales().gamma
         free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
         force, period = result["force_to_master"], result.t[1] - result.t[0]
-        forces = (force[hold, 2], *force[free, :3].T)
+        forces = (force[hold, :3] @ scenario.kinematic_scaling.R_WB[2], *force[free, :3].T)
         rest_force = max(rms_above_5_hz(f, period) for f in forces)
         share = found.rendered_share if np.isfinite(found.rendered_share) else 0.0
         human = self.base_scenario.operator.perception
@@ -286,12 +283,15 @@ class OneAxisGammaSearch:
         forward, backward = self.base_scenario.channel.networks_of_directions()
         held = axis_with_grip(axis, grip)
         shown = {f.name: getattr(held, f.name) for f in dataclasses.fields(AxisParameters)}
+        # With the slave's motion over its scale, the model is the same at this force scale.
+        shown["force_scale"] *= held.position_scale
         model = OneDof(**shown | {"wall_stiffness": wall, "gamma": settings.gamma})
         ideal = self.base_scenario.wrist_sensor.ideal
         added = 0.0 if ideal else _FILTER_DELAY_BANDWIDTH_PRODUCT / settings.low_pass_hz
-        task = short_press_task(forward.delay + backward.delay)
+        task = short_press_task(mean_delay(forward) + mean_delay(backward))
         passivity, intent = settings.passivity(self.operating_range), one_dof.operator_intent(task)
-        filtered = dataclasses.replace(backward, delay=backward.delay + added)
+        later = {name: getattr(backward, name) + added for name in ("delay", "playout")}
+        filtered = dataclasses.replace(backward, **later)
         run = one_dof.run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
         found = one_dof.measures_of_run(run, model, task)
         noise = rms_above_5_hz(run.hand_force[task.is_held(run.t)], run.t[1] - run.t[0])

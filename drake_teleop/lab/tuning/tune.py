@@ -242,7 +242,9 @@ def _add_predicted_force_threshold(
     gamma = row["gamma_limit"] / trial.operating_range.requirements.loop_gain_margin
     human = trial.base_scenario.operator.perception
     scale = trial.base_scenario.force_scaling.force_scale
-    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # of the swing, as `press_scenario`
+    motion_scale = trial.base_scenario.kinematic_scaling.translation_scale
+    # Of the slave's swing, as `press_scenario`.
+    amplitude, frequency = 0.02 * min(motion_scale, 1.0), 2 * np.pi * 1.5
     rms_load_force = float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
     masked = row["sigma_inertia"] * scale * rms_load_force
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
