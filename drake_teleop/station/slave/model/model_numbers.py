@@ -208,8 +208,11 @@ def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
-        if not text:
+        is_zero_effort = name == "effort" and parse_number(text) == 0.0
+        if not text or (is_zero_effort and not model.purpose.is_scene):  # Drake omits such a motor
             limit.attrib.pop(name, None)
+            for inner in limit.findall(name):
+                limit.remove(inner)
             continue
         values[name] = parse_number(text)
         if math.isnan(values[name]):
