@@ -424,6 +424,25 @@ def test_joints_of_another_model_may_have_the_same_names(tmp_path, limit, inside
         read(path)
 
 
+@pytest.mark.parametrize("order", [("left", "right"), ("right", "left"), ("b", "a")])
+@pytest.mark.parametrize("name", ["j1", "j4"])
+def test_held_joint_is_that_of_the_arm_with_the_sensor(tmp_path, order, name):
+    written(tmp_path, arm())
+    url = (tmp_path / "arm.urdf").as_uri()
+    models = [f"- add_model: {{name: {each}, file: {url}}}" for each in order]
+    for owner in order:
+        frame = f"- add_frame: {{name: {owner}::ft, X_PF: {{base_frame: {owner}::l6}}}}"
+        text = "\n".join(["directives:", *models, frame])
+        path = written(tmp_path, text, "arms.dmd.yaml")
+        plant, model, said = read(path, "ft", hold={name: 0.3})
+        assert model.joint_names == tuple(f"j{k}" for k in range(1, 7) if f"j{k}" != name)
+        assert f"held at 0.3: {name};" in said
+        instance = plant.GetModelInstanceByName(owner)
+        weld = plant.GetJointByName(f"{name}_held", instance)
+        angle = weld.X_FM().rotation().ToAngleAxis().angle()
+        np.testing.assert_allclose(angle, 0.3)
+
+
 def test_models_of_directives_are_repaired(tmp_path):
     beside = link("x") + joint(8, parent="l6", child="x")
     written(tmp_path, arm(beyond=beside, l3=link("l3", INERTIAL.replace(INERTIA, INERTIA.replace(

@@ -104,7 +104,6 @@ class StartPlace(NamedTuple):
 
     @property
     def reachable_text(self) -> str:
-        """Reachable displacements from the start, as a text."""
         directions = "up and down" if self.moves_only_vertically else "in all directions"
         return f"{1e3 * self.cube_half_m:g} mm {directions}"
 

@@ -135,10 +135,14 @@ def check_chain(
 
 
 def weld_held_joints(
-    plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
+    plant: MultibodyPlant, frame: Frame, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint."""
-    known = {j.name(): j for j in map(plant.get_joint, joints) if j.num_velocities() > 0}
+    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint.
+
+    Of joints with equal names, that inboard of `frame` is welded.
+    """
+    ordered = *map(plant.get_joint, joints), *chain_to_body(plant, frame.body())
+    known = {joint.name(): joint for joint in ordered if joint.num_velocities() > 0}
     for name, position in hold.items():
         joint = known.get(name)
         if joint is None:

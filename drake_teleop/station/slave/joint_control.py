@@ -40,10 +40,10 @@ class PositionInterface:
     )
     lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "delay behind a command of constant speed")
     max_speed: float = quantity(
-        math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
+        math.pi, "rad/s", 1e-3, 100.0, "speed limit, unless the model's (or assumed) one is lower"
     )
     max_acceleration: float = quantity(
-        40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit of each joint, unless the model's is lower"
+        40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit, in the same way"
     )
     drive_bandwidth_hz: float = quantity(
         30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"

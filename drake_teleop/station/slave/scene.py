@@ -27,13 +27,11 @@ class Scene(Environment):
     file: str = plain(
         "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
-    position: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "position in W of the file, for free roots"
-    )
+    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "the file's position in W")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W of the file, for free roots"
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of the file in W"
     )
-    fixed: bool = plain(True, "weld free roots, at their poses in the file; false: they float")
+    fixed: bool = plain(True, "weld free roots at their poses in the file; false: they float")
     contact: str = choice(
         "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
     )

@@ -208,8 +208,10 @@ def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
-        is_zero_effort = name == "effort" and parse_number(text) == 0.0
-        if not text or (is_zero_effort and not model.purpose.is_scene):  # Drake omits such a motor
+        # Drake omits motors without effort.
+        if not text or (
+            name == "effort" and parse_number(text) == 0 and not model.purpose.is_scene
+        ):
             limit.attrib.pop(name, None)
             for inner in limit.findall(name):
                 limit.remove(inner)
