@@ -27,11 +27,13 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.new_station import new_command, place, plan_station
 from drake_teleop.lab.new_station.place import StartPlace, find_start_place
 from drake_teleop.station.scenario import LoadScenario
-from drake_teleop.station.slave.arm import pose_into
+from drake_teleop.station.slave.arm import holding_torque, pose_into
 from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Slave, Tool
 
 ARM = models_dir() / "rx90.sdf"
 
@@ -119,6 +121,21 @@ def test_joint_margin_counts_more_than_cube_size():
         best._replace(cube_half_m=0.0, joint_margin=0.0),
     ]
     assert max([*worse, best], key=place._start_place_sort_key) is best
+
+
+@pytest.mark.parametrize("axis", place.R_SA_BY_AXIS)
+@pytest.mark.parametrize("com", [[0.2, 0.0, 0.0], [-0.05, 0.1, 0.15]])
+def test_frame_along_any_axis_carries_the_same_load(axis, com):
+    """The motors hold the same torques, whichever frame describes the load."""
+    tool = Tool(mass=5.0, com=com, inertia=[0.02, 1e-3, -2e-3, 0.03, 1.5e-3, 0.025])
+    arm, q = NominalSlave(Slave(tool=tool)).arm, np.array([0.3, -0.4, -1.2, 0.2, -0.9, 0.4])
+    pointed = place._arm_with_frame_A(arm, axis)
+    np.testing.assert_allclose(holding_torque(pointed, q), holding_torque(arm, q), atol=1e-9)
+    np.testing.assert_allclose(mass_matrix(pointed, q), mass_matrix(arm, q), atol=1e-9)
+    R_WA, R_WS = (RotationMatrix(Quaternion(each.pose(q)[:4])) for each in (pointed, arm))
+    expected = R_WS @ place.R_SA_BY_AXIS[axis]
+    np.testing.assert_allclose(R_WA.matrix(), expected.matrix(), atol=1e-9)
+    np.testing.assert_allclose(pointed.pose(q)[4:], arm.pose(q)[4:], atol=1e-12)
 
 
 def turned(rpy, tmp_path):

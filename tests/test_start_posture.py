@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,6 +50,7 @@ from drake_teleop.station.slave.posture_shapes import (
     overlap_warnings,
     start_overlap_texts,
 )
+from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
 pytestmark = pytest.mark.slow
@@ -376,6 +379,22 @@ def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
         arm, table=table, **{n: v if n == names[0] else np.array(v) for n, v in fewer.items()}
     )
     assert sensor_degrees_of_freedom(short, random_postures(short)) == 4
+
+
+@pytest.mark.parametrize("included", [False, True])
+def test_edited_scene_is_examined_again(tmp_path, included):
+    """The file of a scene, or one that it includes, moves a box into the tool."""
+    pad, scene = tmp_path / "pad.sdf", Scene(file=str(tmp_path / "pad.sdf"))
+    if included:
+        scene.file = str(tmp_path / "table.dmd.yaml")
+        Path(scene.file).write_text(f"directives: [add_model: {{name: a, file: {pad.as_uri()}}}]")
+    for time, (height, overlaps) in enumerate(((0.0, 0), (0.3, 1), (0.1, 0))):
+        shape = f"<pose>0.55 0 {height} 0 0 0</pose><geometry><box><size>0.3 0.3 0.1</size></box>"
+        link = f'<link name="pad"><collision name="c">{shape}</geometry></collision></link>'
+        pad.write_text(f'<sdf version="1.9"><model name="pad">{link}</model></sdf>')
+        os.utime(pad, ns=(time, time))
+        warnings = start_overlap_texts(Slave(), scene)[0]
+        assert sum("tool and pad overlap by" in text for text in warnings) == overlaps
 
 
 def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.point_contact import (
     FindContactPairs,
     depth_of_sphere_in_box,
@@ -34,7 +35,7 @@ from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.station.slave.plant import AddSlavePlant, ParseSlave
 from drake_teleop.station.slave.plant_dynamics import environment_wrench_about_Wo_into
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.slave_config import Slave, Tool
 from drake_teleop.station.slave.surroundings import AddEnvironment
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -95,6 +96,23 @@ def test_materials_of_both_sides_combine_to_those_of_the_slot():
     np.testing.assert_allclose(
         pairs[:, 22:26], np.tile([3e3, 0.7, 0.45, 0.45], (14, 1)), rtol=1e-12
     )
+
+
+@pytest.mark.parametrize("names", [("grip",), ("slot", "finger"), ("tool", "finger"), ("tool",)])
+def test_tool_of_a_slot_has_a_body_named_tool(tmp_path, names):
+    inertia = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+    inertial = f'<inertial><mass value="1"/>{inertia}</inertial>'
+    links = "".join(f'<link name="{name}">{inertial}</link>' for name in names)
+    for first, second in pairwise(names):
+        ends = f'<parent link="{first}"/><child link="{second}"/>'
+        links += f'<joint name="j" type="fixed">{ends}</joint>'
+    (tmp_path / "tool.urdf").write_text(f'<robot name="slot">{links}</robot>')
+    slave = Slave(tool=Tool(model=str(tmp_path / "tool.urdf")))
+    if "tool" in names:
+        assert len(AddSlavePlant(DiagramBuilder(), slave, Slot()).contact.compiled_pairs) == 7
+        return
+    with pytest.raises(DrakeTeleopError, match="tool: a slot requires one body named tool"):
+        AddSlavePlant(DiagramBuilder(), slave, Slot())
 
 
 def test_contact_does_not_pull_a_fast_ball():

@@ -163,6 +163,40 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
     assert len(touched) == 4  # with contact of the block and without
 
 
+@pytest.mark.parametrize("depth", [0.001, 0.004])
+@pytest.mark.parametrize("link", ["world", "floor"])
+def test_shapes_on_the_world_follow_drakes_contact_law(tmp_path, depth, link):
+    """A URDF may give shapes to the link `world`, beside other bodies."""
+    surface = (
+        '<drake:proximity_properties><drake:point_contact_stiffness value="3e4"/>'
+        '<drake:mu_dynamic value="0.4"/><drake:hunt_crossley_dissipation value="1.0"/>'
+        "</drake:proximity_properties>"
+    )
+    links = "".join(
+        f'<link name="{name}"><collision><origin xyz="{place} 0.0 {0.15 + depth}"/><geometry>'
+        f'<box size="0.3 0.3 0.2"/></geometry>{surface}</collision></link>'
+        for name, place in ((link, 0.55), ("cup", 1.55))
+    )
+    joint = f'<joint name="j" type="fixed"><parent link="{link}"/><child link="cup"/></joint>'
+    text = f'<robot name="s" xmlns:drake="d">{links}{joint}</robot>'
+    (tmp_path / "scene.urdf").write_text(text)
+    builder = DiagramBuilder()
+    slave = AddSlavePlant(builder, Slave(), Scene(file=str(tmp_path / "scene.urdf")))
+    root = builder.Build().CreateDefaultContext()
+    context, contact, found = (
+        slave.plant.GetMyContextFromRoot(root),
+        slave.contact,
+        np.zeros(6),
+    )
+    results = slave.plant.get_contact_results_output_port().Eval(context)
+    expected = contact_wrench_W(results, contact.tool_bodies, contact.tool_shapes)
+    tables = slave.arm.table, contact.compiled_pairs, contact.joint_table, np.zeros(6)
+    states = slave.start, np.zeros(6), np.zeros(2), np.zeros(0)
+    environment_wrench_about_Wo_into(*tables, *states, found)
+    assert expected[2] > 10.0
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
 def test_bodies_move_smoothly_between_two_states():
     """A body that rotates about two axes, at a half and a third of a step."""
     plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
@@ -404,6 +438,27 @@ def test_unmodelled_contact_is_not_linearised():
     scenario = replace(Scenario(), environment=[Block()])
     with pytest.raises(DrakeTeleopError, match="cannot be linearised: block can move"):
         linearize(scenario)
+
+
+MODEL = '<model name="{0}"><pose>{1}</pose><link name="{0}"/></model>'
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_bodies_of_a_scene_keep_their_poses_in_the_file(tmp_path, fixed, yaw):
+    poses = {"cup": [0.1, 0.2, 0.3, 0.0, 0.0, 0.5], "pan": [-0.4, 0.0, 0.1, 0.2, 0.0, 0.0]}
+    models = [MODEL.format(name, " ".join(map(str, pose))) for name, pose in poses.items()]
+    text = f'<sdf version="1.9"><world name="w">{"".join(models)}</world></sdf>'
+    (tmp_path / "table.sdf").write_text(text)
+    place = [0.5, -0.1, 0.2]
+    file, plant = str(tmp_path / "table.sdf"), MultibodyPlant(0.0)
+    Scene(file=file, position=place, rotation=[0.0, 0.0, yaw], fixed=fixed).AddTo(plant)
+    plant.Finalize()
+    context, X_WFile = plant.CreateDefaultContext(), RigidTransform(RollPitchYaw(0, 0, yaw), place)
+    for name, (*p, roll, pitch, turn) in poses.items():
+        X_WB = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(name))
+        expected = X_WFile @ RigidTransform(RollPitchYaw(roll, pitch, turn), p)
+        np.testing.assert_allclose(X_WB.GetAsMatrix34(), expected.GetAsMatrix34(), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -186,6 +186,26 @@ def test_only_load_makes_contact(folder, tmp_path):
         assert (len(contact.compiled_pairs), contact.drake_contact_reason) == (1, "")
 
 
+@pytest.mark.parametrize("shape", ['<box size="3 3 0.1"/>', '<sphere radius="0.2"/>'])
+def test_pedestals_of_model_directives_make_no_contact(folder, tmp_path, shape):
+    collision = f"<collision><geometry>{shape}</geometry></collision>"
+    text = f'<robot name="p"><link name="pedestal">{collision}</link></robot>'
+    for name, content in (("pedestal", text), ("mine", (folder / "arm.urdf").read_text())):
+        (tmp_path / f"{name}.urdf").write_text(content)
+    urls = {name: (tmp_path / f"{name}.urdf").as_uri() for name in ("mine", "pedestal")}
+    models = [f"- add_model: {{name: {name}, file: {url}}}" for name, url in urls.items()]
+    (tmp_path / "arm.dmd.yaml").write_text("\n".join(["directives:", *models]))
+    tool = Tool(mass=1.0, shapes=[Ball()])
+    slave = Slave(model=str(tmp_path / "arm.dmd.yaml"), sensor_frame="ft", home=HOME, tool=tool)
+    builder = DiagramBuilder()
+    contact = AddSlavePlant(builder, slave, Wall()).contact
+    (scene_graph,) = (each for each in builder.GetSystems() if each.get_name() == "scene_graph")
+    inspector = scene_graph.model_inspector()
+    touching = inspector.GetAllGeometryIds(Role.kProximity)
+    assert {inspector.GetName(each) for each in touching} == {"tool::tool_0", "wall::wall"}
+    assert (len(contact.compiled_pairs), contact.drake_contact_reason) == (1, "")
+
+
 def test_model_directives_find_files_and_packages(folder, tmp_path):
     (tmp_path / "packages" / "parts").mkdir(parents=True)
     (tmp_path / "packages" / "parts" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -355,6 +375,25 @@ def test_tip_is_on_a_tilted_ball(folder, scenario):
     (folder / "ball.urdf").write_text(text + "</robot>")
     slave = dataclasses.replace(scenario.slave, model=str(folder / "ball.urdf"))
     np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.0, 0.22], atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("shape", "end"),
+    [
+        ('<sphere radius="0.01"/>', [0.03, -0.02, 0.21]),
+        ('<box size="0.06 0.04 0.1"/>', [0.03, -0.02, 0.25]),
+        ("", [0.02, -0.03, 0.08]),  # the centre of mass
+    ],
+)
+def test_tip_of_a_tool_file_is_at_the_end_of_its_shapes(tmp_path, shape, end):
+    at = f'<collision><origin xyz="0.03 -0.02 0.2"/><geometry>{shape}</geometry></collision>'
+    inertial = (
+        odd_arms.link("t").replace("0.001", "0").replace("-0.002", "0").replace("0.0015", "0")
+    )
+    link = inertial.replace("</link>", f"{at if shape else ''}</link>")
+    (tmp_path / "tool.urdf").write_text(f'<robot name="tool">{link}</robot>')
+    slave = Slave(tool=Tool(model=str(tmp_path / "tool.urdf")))
+    np.testing.assert_allclose(NominalSlave(slave).tip, end, atol=1e-12)
 
 
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])

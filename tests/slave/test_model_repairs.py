@@ -210,6 +210,33 @@ def test_motors_keep_gear_rotor_and_effort_of_their_joint(tmp_path, hold):
     np.testing.assert_array_equal(model.effort_limit, efforts[kept])
 
 
+SDF_MASS = "<inertial><mass>1</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia>"
+SDF_JOINT = f"""<sdf version="1.9" xmlns:drake="d"><model name="a">
+<link name="a">{SDF_MASS}</inertial></link><link name="b">{SDF_MASS}</inertial></link>
+<joint name="j" type="revolute"><parent>a</parent><child>b</child><axis><xyz>0 1 0</xyz><limit>
+<lower>-1</lower><upper>1</upper><effort>{{}}</effort></limit></axis>{{}}</joint></model></sdf>"""
+
+
+@pytest.mark.parametrize("effort", ["0", "0.0", "", "-0"])
+@pytest.mark.parametrize("gear", [1.0, 50.0])
+def test_rotor_of_a_motor_without_effort_limit_is_kept(tmp_path, effort, gear):
+    """Drake omits a motor with a limit of 0, which exporters write for unknown limits."""
+    motor = (
+        '<transmission type="SimpleTransmission"><joint name="j3"/><actuator name="a">'
+        f'<drake:gear_ratio value="{gear}"/><drake:rotor_inertia value="2e-3"/></actuator>'
+        "</transmission>"
+    )
+    third = joint(3).replace('effort="200"', f'effort="{effort}"')
+    _, model, _ = read(written(tmp_path, arm(j3=third, beyond=motor)))
+    assert model.effort_limit[2] == np.inf
+    np.testing.assert_allclose(model.table[:-1, 22], [0, 0, gear**2 * 2e-3, 0, 0, 0])
+    motor = f"<drake:rotor_inertia>2e-3</drake:rotor_inertia><drake:gear_ratio>{gear}"
+    text = SDF_JOINT.format(effort, f"{motor}</drake:gear_ratio>")
+    _, model, _ = read(written(tmp_path, text, "arm.sdf"), "b")
+    assert model.effort_limit[0] == np.inf
+    np.testing.assert_allclose(model.table[0, 22], gear**2 * 2e-3)
+
+
 def test_continuous_joints_keep_their_limits_only_if_given(tmp_path):
     text = arm(j3=joint(3, "continuous").replace(LIMIT, '<limit effort="9" velocity="1"/>'))
     _, model, _ = read(
@@ -377,6 +404,45 @@ DIRECTIVES = """directives:
 """
 
 
+@pytest.mark.parametrize("limit", [7.0, 90.0])
+@pytest.mark.parametrize("inside", ["", '<mimic joint="j4"/>'])
+def test_joints_of_another_model_may_have_the_same_names(tmp_path, limit, inside):
+    """The hand's joint j3 limits neither torque nor motion of the arm's joint j3."""
+    written(tmp_path, arm())
+    hand = link("palm") + link("f") + link("g")
+    for k, child, own in ((3, "f", inside), (4, "g", "")):
+        text = joint(k, "prismatic", own, "palm", child)
+        hand += text.replace('effort="200"', f'effort="{limit}"')
+    written(tmp_path, f'<robot name="hand">{hand}</robot>', "f.urdf")
+    written(tmp_path, f'<robot name="cup">{link("cup")}</robot>', "cup.urdf")
+    directives = re.sub(r", default_joint_positions: {{\w+: \[[\d.]+\]}}", "", DIRECTIVES)
+    path = written(tmp_path, directives.format(tmp_path), "arm.dmd.yaml")
+    _, model, _ = read(path)
+    np.testing.assert_array_equal(model.effort_limit, 200.0)
+    with pytest.raises(DrakeTeleopError, match=r"j3 moves with another joint \(mimic\)"):
+        written(tmp_path, arm(j3=joint(3, inside='<mimic joint="j1"/>')))
+        read(path)
+
+
+@pytest.mark.parametrize("order", [("left", "right"), ("right", "left"), ("b", "a")])
+@pytest.mark.parametrize("name", ["j1", "j4"])
+def test_held_joint_is_that_of_the_arm_with_the_sensor(tmp_path, order, name):
+    written(tmp_path, arm())
+    url = (tmp_path / "arm.urdf").as_uri()
+    models = [f"- add_model: {{name: {each}, file: {url}}}" for each in order]
+    for owner in order:
+        frame = f"- add_frame: {{name: {owner}::ft, X_PF: {{base_frame: {owner}::l6}}}}"
+        text = "\n".join(["directives:", *models, frame])
+        path = written(tmp_path, text, "arms.dmd.yaml")
+        plant, model, said = read(path, "ft", hold={name: 0.3})
+        assert model.joint_names == tuple(f"j{k}" for k in range(1, 7) if f"j{k}" != name)
+        assert f"held at 0.3: {name};" in said
+        instance = plant.GetModelInstanceByName(owner)
+        weld = plant.GetJointByName(f"{name}_held", instance)
+        angle = weld.X_FM().rotation().ToAngleAxis().angle()
+        np.testing.assert_allclose(angle, 0.3)
+
+
 def test_models_of_directives_are_repaired(tmp_path):
     beside = link("x") + joint(8, parent="l6", child="x")
     written(tmp_path, arm(beyond=beside, l3=link("l3", INERTIAL.replace(INERTIA, INERTIA.replace(
@@ -490,6 +556,21 @@ def test_damaged_meshes_are_dropped_and_stated_for_an_arm_only(tmp_path):
     pad = f'<robot name="s">{link("pad", INERTIAL + shape("gone.obj"))}</robot>'
     with pytest.raises(DrakeTeleopError, match="shapes are missing of pad"):
         ParseScene(MultibodyPlant(0.0), written(tmp_path, pad, "pad.urdf"))
+
+
+@pytest.mark.parametrize("visual", ['<box size="1 1 1"/>', '<sphere radius="0.1"/>'])
+@pytest.mark.parametrize("fault", ['<mesh filename="gone.obj"/>', "<cone/>"])
+def test_lost_contact_is_stated_beside_visual_shapes(tmp_path, visual, fault):
+    """Visual shapes make no contact: of an arm they replace lost shapes, of a tool they do not."""
+    shapes = f"<visual><geometry>{visual}</geometry></visual>"
+    shapes += f"<collision><geometry>{fault}</geometry></collision>"
+    pad = f'<robot name="s">{link("pad", INERTIAL + shapes)}</robot>'
+    path, what = written(tmp_path, pad, "pad.urdf"), "shapes are missing of pad"
+    with pytest.raises(DrakeTeleopError, match=what):
+        ParseScene(MultibodyPlant(0.0), path)
+    assert what in "; ".join(NominalSlave(Slave(tool=Tool(model=str(path)))).assumptions)
+    _, _, said = read(written(tmp_path, arm(l3=link("l3", INERTIAL + shapes))))
+    assert "shapes are missing" not in said
 
 
 def test_tool_may_have_joints_of_any_kind(tmp_path):

@@ -16,7 +16,7 @@ from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.slave_config import Payload, Slave
+from drake_teleop.station.slave.slave_config import Payload, Slave, Tool
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
@@ -30,6 +30,16 @@ def test_payload_adds_to_tool_parameters():
     np.testing.assert_allclose(phi - bare, ball, rtol=1e-4, atol=1e-15)
     nothing = slave_arm(replace(Scenario(), slave__payload=Payload(mass=0.0)))
     np.testing.assert_array_equal(nothing.phi_load, bare)
+
+
+@pytest.mark.parametrize("name", ["payload", "tool"])
+def test_bodies_of_a_tool_file_may_have_any_name(tmp_path, name):
+    inertia = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<link name="{name}"><inertial><mass value="0.7"/>{inertia}</inertial></link>'
+    (tmp_path / "tool.urdf").write_text(f'<robot name="{name}">{link}</robot>')
+    slave = Slave(tool=Tool(model=str(tmp_path / "tool.urdf")), payload=HELD)
+    phi = AddSlavePlant(DiagramBuilder(), slave, None).arm.phi_load
+    np.testing.assert_allclose(phi[:4], [2.7, *np.multiply(2.0, HELD.com)])
 
 
 def test_sensor_wrench_includes_payload():

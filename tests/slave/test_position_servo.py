@@ -115,6 +115,26 @@ def test_torque_with_invalid_command_or_encoders(arm, bad):
     np.testing.assert_array_equal(update.get_value(0), weight)
 
 
+@pytest.mark.parametrize("dead_time", [0.0, 0.002, 0.02])
+@pytest.mark.parametrize("bad", [np.nan, 1e9])
+def test_invalid_commands_are_replaced_by_the_last_one(arm, dead_time, bad):
+    interface, ends = dataclasses.replace(UR, dead_time=dead_time), (0.02, 0.05)
+
+    def command(t, invalid):
+        is_lost = ends[0] <= t < ends[1]
+        last = HOME + 0.5 * min(t, ends[0] - 1 / UR.command_hz)
+        return np.full(6, invalid) if is_lost else last if t < ends[1] else HOME
+
+    def held(t):
+        return command(min(t, ends[0] - PERIOD) if t < ends[1] else t, bad)
+
+    states, torques = follow(arm, interface, lambda t: command(t, bad), 160)
+    expected = follow(arm, interface, held, 160)
+    assert np.abs(states[:, :6] - HOME).max() > 1e-3
+    np.testing.assert_array_equal(states, expected[0])
+    np.testing.assert_array_equal(torques, expected[1])
+
+
 @pytest.mark.parametrize(
     ("changes", "where"),
     [

@@ -7,7 +7,6 @@ The start is the posture with the largest reachable cube among those with the be
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -32,6 +31,7 @@ from drake_teleop.lab.new_station.random_postures import (
     select_suitable_postures,
     sensor_degrees_of_freedom,
 )
+from drake_teleop.load.inertia import transform_phi
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
 from drake_teleop.station.slave.arm import (
     ROTATION_COLUMN,
@@ -104,7 +104,6 @@ class StartPlace(NamedTuple):
 
     @property
     def reachable_text(self) -> str:
-        """Reachable displacements from the start, as a text."""
         directions = "up and down" if self.moves_only_vertically else "in all directions"
         return f"{1e3 * self.cube_half_m:g} mm {directions}"
 
@@ -146,9 +145,7 @@ def find_start_place(
         plane: height of the base plane, below which the arm has no joints [m].
         axis: axis of S that points down, one of `R_SA_BY_AXIS`.
     """
-    table, rotation = arm.table.copy(), slice(ROTATION_COLUMN, TRANSLATION_COLUMN)
-    table[-1, rotation] = (table[-1, rotation].reshape(3, 3) @ R_SA_BY_AXIS[axis].matrix()).ravel()
-    pointed = replace(arm, table=table)  # with frame A instead of S
+    pointed = _arm_with_frame_A(arm, axis)
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     has_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6
@@ -178,6 +175,14 @@ def find_start_place(
         raise DrakeTeleopError(what, where="new", remedy=remedy)
     pose = best.pose if axis == "z" else arm.pose(best.q)
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
+
+
+def _arm_with_frame_A(arm: ArmModel, axis: str) -> ArmModel:
+    R_SA = R_SA_BY_AXIS[axis].matrix()
+    turned = arm.with_load(transform_phi(arm.phi_load, R_SA.T, np.zeros(3)))
+    R_JS = turned.table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN]
+    R_JS[:] = (R_JS.reshape(3, 3) @ R_SA).ravel()
+    return turned
 
 
 def _select_rows_far_from_limits_or_all(arm: ArmModel, q: Array) -> NDArray[np.intp]:

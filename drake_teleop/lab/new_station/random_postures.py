@@ -100,7 +100,7 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
         R = R @ row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
         origins.append(p)
         axes.append(R[:, :, 2])
-        if row is not arm.table[-1] and row[IS_PRISMATIC_COLUMN]:
+        if row[IS_PRISMATIC_COLUMN]:
             p = p + angle[:, None] * R[:, :, 2]
         else:
             c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle

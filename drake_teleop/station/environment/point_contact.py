@@ -89,7 +89,8 @@ def FindContactPairs(
         direction = _prismatic_joint_direction_W(plant, context, body)
         for other in plant.GetCollisionGeometriesForBody(body):
             for own, X_SOwn in tool.items():
-                if inspector.CollisionFiltered(own, other):
+                has_contact = inspector.GetProximityProperties(other) is not None
+                if not has_contact or inspector.CollisionFiltered(own, other):
                     continue
                 X_Other = X_Body @ inspector.GetPoseInFrame(other)
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)

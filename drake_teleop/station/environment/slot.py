@@ -20,7 +20,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.station.environment.environment import ContactMaterial, Environment, FloorStand
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.environment.environment import (
+    ContactMaterial,
+    Environment,
+    FloorStand,
+    NewInstance,
+)
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
 #: (E) is as high as the nut above it permits in the deepest slot.
@@ -78,10 +84,16 @@ class Slot(Environment):
         return FloorStand(0.16, 0.16, self.position[0], self.position[1], self.floor_bottom_height)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
+        body = plant.AddRigidBody("slot", NewInstance(plant, "slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():
             return
+        if plant.NumBodiesWithName("tool") != 1:
+            what, remedy = (
+                "a slot requires one body named tool",
+                "give one link of the tool this name",
+            )
+            raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
         tool = plant.GetBodyByName("tool")
         above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])
         ball, properties = Sphere(PEG_RADIUS_M), _slot_contact_material(self)

@@ -6,7 +6,7 @@ The chain is the list of joints from the base outwards to the sensor, welds incl
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import dropwhile
+from itertools import dropwhile, product
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -115,12 +115,17 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
     return [note] if names else []
 
 
-def check_chain(chain: list[Joint], dependence_reasons: dict[str, str], where: str) -> None:
+def check_chain(
+    plant: MultibodyPlant, chain: list[Joint], dependence_reasons: dict[str, str], where: str
+) -> None:
     """Raise DrakeTeleopError if a joint of the chain has several axes or depends on another."""
     for joint in chain:
-        for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
-            if name in dependence_reasons:
-                what = f"{name} {dependence_reasons[name]}"
+        models = plant.GetModelInstanceName(joint.model_instance()).split("::")
+        scopes = ["", *(f"{'::'.join(models[: k + 1])}::" for k in range(len(models)))]
+        names = joint.name(), joint.child_body().name(), joint.parent_body().name()
+        for scope, name in product(scopes, names):
+            if reason := dependence_reasons.get(f"{scope}{name}"):
+                what = f"{name} {reason}"
                 remedy = "make the joints up to the sensor independent of each other"
                 raise DrakeTeleopError(what, where=where, remedy=remedy)
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)) and joint.num_velocities() > 0:
@@ -130,10 +135,14 @@ def check_chain(chain: list[Joint], dependence_reasons: dict[str, str], where: s
 
 
 def weld_held_joints(
-    plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
+    plant: MultibodyPlant, frame: Frame, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint."""
-    known = {j.name(): j for j in map(plant.get_joint, joints) if j.num_velocities() > 0}
+    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint.
+
+    Of joints with equal names, that inboard of `frame` is welded.
+    """
+    ordered = *map(plant.get_joint, joints), *chain_to_body(plant, frame.body())
+    known = {joint.name(): joint for joint in ordered if joint.num_velocities() > 0}
     for name, position in hold.items():
         joint = known.get(name)
         if joint is None:
@@ -236,13 +245,10 @@ def _default_joint_pose(joint: Joint) -> RigidTransform:
     return joint.GetDefaultPose() if np.any(q) else RigidTransform()
 
 
-def set_one_actuator_per_joint(
-    plant: MultibodyPlant, moving: list[Joint], limits: dict[str, float] | None
-) -> None:
+def set_one_actuator_per_joint(plant: MultibodyPlant, moving: list[Joint]) -> None:
     """Give each of the joints `moving` exactly one actuator, in this order.
 
-    `limits` maps joint names to effort limits; joints without an entry are unlimited. None keeps
-    the limits of existing actuators. Actuators of other joints remain.
+    Limits of existing actuators, and actuators of other joints, remain.
     """
     data = {joint.index(): (np.inf, 0.0, 1.0) for joint in moving}
     for motor in list(map(plant.get_joint_actuator, plant.GetJointActuatorIndices())):
@@ -252,8 +258,6 @@ def set_one_actuator_per_joint(
             plant.RemoveJointActuator(motor)
     for joint in moving:
         effort, rotor, gear = data[joint.index()]
-        if limits is not None:
-            effort = limits.get(joint.name(), np.inf)
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(rotor)
         actuator.set_default_gear_ratio(gear)

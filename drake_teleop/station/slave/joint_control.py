@@ -41,10 +41,10 @@ class PositionInterface:
     )
     lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "delay behind a command of constant speed")
     max_speed: float = quantity(
-        math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
+        math.pi, "rad/s", 1e-3, 100.0, "speed limit, unless the model's (or assumed) one is lower"
     )
     max_acceleration: float = quantity(
-        40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit of each joint, unless the model's is lower"
+        40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit, in the same way"
     )
     drive_bandwidth_hz: float = quantity(
         30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"
@@ -198,13 +198,18 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
     period, gain, lookahead, _, periods_per_command, queue_length = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
-    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and are_valid_port_values(command):
+    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0:
+        is_valid = are_valid_port_values(command)
         if queue_length > 0.0:
-            place = 2 + 3 * n + int(memory[_OLDEST_QUEUED_INDEX]) * n
+            oldest, start = memory[_OLDEST_QUEUED_INDEX], 2 + 3 * n
+            place, newest = start + int(oldest) * n, start + int((oldest - 1.0) % queue_length) * n
             copy_into(target, 0, memory, place, n)
-            copy_into(memory, place, command, 0, n)
-            memory[_OLDEST_QUEUED_INDEX] = (memory[_OLDEST_QUEUED_INDEX] + 1.0) % queue_length
-        else:
+            if is_valid:
+                copy_into(memory, place, command, 0, n)
+            else:
+                copy_into(memory, place, memory, newest, n)
+            memory[_OLDEST_QUEUED_INDEX] = (oldest + 1.0) % queue_length
+        elif is_valid:
             copy_into(target, 0, command, 0, n)
     periods = memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0
     memory[_PERIODS_SINCE_COMMAND_INDEX] = periods % periods_per_command

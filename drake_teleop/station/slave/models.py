@@ -92,8 +92,8 @@ def _add_directives(parser: parsing.Parser, model: ModelRepair) -> list[ModelIns
             parts[file] = model.repair_part(file, _repair_model_text)
         if parts[file].text:
             added.file = f"file://{model.write_file(file.name, parts[file].text)}"
-    texts = [part.text for part in parts.values()]
-    model.text = "".join(texts) if all(texts) else ""
+        reasons = parts[file].dependence_reasons
+        model.dependence_reasons |= {f"{added.name}::{k}": why for k, why in reasons.items()}
     with raise_logged_errors():
         models = parsing.ProcessModelDirectives(directives, parser)
     return [each.model_instance for each in models]
@@ -146,16 +146,16 @@ def ParseModel(
     purpose = ModelPurpose(sensor_frame, hold)
     instances, model = repair_and_parse_model(plant, path, package_paths, purpose)
     frame = _find_sensor_frame(plant, instances, model)
-    held = chain_joints.weld_held_joints(plant, hold, set(plant.GetJointIndices()) - before)
+    added = sorted(set(plant.GetJointIndices()) - before)
+    held = chain_joints.weld_held_joints(plant, frame, hold, added)
     chain = chain_joints.weld_base_and_find_chain(plant, frame, X_WBase, where)
-    chain_joints.check_chain(chain, model.dependence_reasons, where)
+    chain_joints.check_chain(plant, chain, model.dependence_reasons, where)
     free = chain_joints.weld_free_bodies(plant, instances)
     moving = [joint for joint in chain if joint.num_velocities() > 0]
     with translate_drake_errors(path):
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
         held += chain_joints.weld_load_of_link_to_sensor_frame(plant, frame, chain)
-        limits = model.effort_limits if model.text else None
-        chain_joints.set_one_actuator_per_joint(plant, moving, limits)
+        chain_joints.set_one_actuator_per_joint(plant, moving)
         rotors = chain_joints.add_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)
     of_chain = {joint.model_instance() for joint in moving}
     if len(of_chain) > 1:

@@ -14,7 +14,7 @@ from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -167,14 +167,16 @@ def AddSlavePlant(
         plant.set_stiction_tolerance(environment.slip_speed)
     parsed = ParseSlave(plant, slave)
     instance, tool = parsed.instance, parsed.tool
+    load = {int(body.index()) for body in bodies_carried_by(plant, parsed.sensor_frame.body())}
+    links = map(plant.get_body, map(BodyIndex, set(range(plant.num_bodies())) - load))
+    arm_shapes = [shape for link in links for shape in plant.GetCollisionGeometriesForBody(link)]
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
         finalize_without_limit_warnings(plant)
     contact = ToolContactModel()
     if environment is not None and surroundings is not None:
+        _remove_shapes_without_contact(plant, scene_graph, arm_shapes)
         frame = parsed.sensor_frame
-        load = bodies_carried_by(plant, frame.body())
-        _remove_shapes_without_contact(plant, scene_graph, instance, load)
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = home.find_start_posture(slave, arm) if q_start is None else q_start
@@ -256,18 +258,14 @@ def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
 
 
 def _remove_shapes_without_contact(
-    plant: MultibodyPlant,
-    scene: geometry.SceneGraph,
-    arm: ModelInstanceIndex,
-    load: list[RigidBody],
+    plant: MultibodyPlant, scene: geometry.SceneGraph, arm_shapes: list[geometry.GeometryId]
 ) -> None:
-    source, carried = plant.get_source_id(), {body.index() for body in load}
+    source = plant.get_source_id()
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
         for shape in plant.GetVisualGeometriesForBody(body):
             scene.RemoveGeometry(source, shape)
-        is_of_arm = body.model_instance() == arm and body.index() not in carried
-        for shape in plant.GetCollisionGeometriesForBody(body) if is_of_arm else ():
-            scene.RemoveRole(source, shape, geometry.Role.kProximity)
+    for shape in arm_shapes:
+        scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
 def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
@@ -332,7 +330,7 @@ def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: A
             return tip.GetFixedPoseInBodyFrame().translation()
         context = plant.CreateDefaultContext()
         return tip.CalcPose(context, parsed.sensor_frame).translation()
-    if slave.tool is not None:
+    if slave.tool is not None and slave.tool.mass > 0.0:
         end = end_of_tool_shapes(slave.tool)
         return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
     hulls = _hulls_of_carried_shapes_S(slave)

@@ -22,6 +22,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.chain_joints import AddSkeleton, bodies_carried_by
+from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.model.model_repair import join_names
 from drake_teleop.station.slave.plant import (
     HashableByValue,
@@ -30,6 +31,7 @@ from drake_teleop.station.slave.plant import (
     finalize_without_limit_warnings,
     hull_points_of,
 )
+from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
@@ -106,10 +108,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
-        """Return pairs of overlapping bodies with their signed distance [m] (minus the depth).
-
-        Pairs that nearly always overlap are left out.
-        """
+        """Return pairs of overlapping bodies with their signed distance [m] (minus the depth)."""
         body, found = self.plant.get_body, self._overlap_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
         return [(body(first), body(second), found[first, second]) for first, second in pairs]
@@ -196,7 +195,9 @@ def start_overlap_texts(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
-    return _warnings_and_assumptions(HashableByValue((slave, parts), slave.model_files()))
+    scenes = [part.path for part in parts if isinstance(part, Scene)]
+    files = [file for path in scenes for file in list_model_files(path, ())]
+    return _warnings_and_assumptions(HashableByValue((slave, parts), slave.model_files() + files))
 
 
 @lru_cache(maxsize=4)

@@ -27,11 +27,11 @@ class Scene(Environment):
     file: str = plain(
         "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
-    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "free roots' position in W")
+    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "the file's position in W")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W of free roots"
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of the file in W"
     )
-    fixed: bool = plain(True, "weld free roots at this pose; false: they float")
+    fixed: bool = plain(True, "weld free roots at their poses in the file; false: they float")
     contact: str = choice(
         "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
     )
@@ -64,8 +64,11 @@ class Scene(Environment):
                 raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         attached = {joint.child_body().index() for joint in joints}
         bases = [index for index in map(BodyIndex, added) if index not in attached]
-        X_WBase = RigidTransform(RollPitchYaw(self.rotation), self.position)
+        X_WFile = RigidTransform(RollPitchYaw(self.rotation), self.position)
+        name = "GetDefaultFloatingBaseBodyPose"  # older versions of Drake have the second name
+        pose_in_file = getattr(plant, name, None) or plant.GetDefaultFreeBodyPose
         for body in map(plant.get_body, bases):
+            X_WBase = X_WFile @ pose_in_file(body)
             if self.fixed:
                 plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBase)
             else:

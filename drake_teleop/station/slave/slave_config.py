@@ -13,7 +13,7 @@ from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
-from drake_teleop.station.environment.environment import ContactMaterial
+from drake_teleop.station.environment.environment import ContactMaterial, NewInstance
 from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, IK_METHODS
 from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.models import ParseTool
@@ -181,7 +181,7 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
     if payload.mass == 0.0:
         return
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))
-    body = plant.AddRigidBody("payload", holder.model_instance(), inertia)
+    body = plant.AddRigidBody("payload", NewInstance(plant, "payload"), inertia)
     weld = WeldJoint("payload_weld", holder, body.body_frame(), RigidTransform(payload.com))
     plant.AddJoint(weld)
 
@@ -202,7 +202,7 @@ def AddTool(
     """
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
-    body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _tool_spatial_inertia(tool))
+    body = plant.AddRigidBody("tool", NewInstance(plant, "tool"), _tool_spatial_inertia(tool))
     weld = WeldJoint("sensor_weld", sensor_frame, body.body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     if plant.geometry_source_is_registered():

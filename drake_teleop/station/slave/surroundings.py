@@ -127,9 +127,10 @@ def MakeToolContactModel(
         is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE)
         from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
+    touched = [*added.instances, tree.world_model_instance()]  # a link "world" may have shapes
     try:
         compiled, monitored, reason = FindContactPairs(
-            plant, inspector, from_S, added.instances, slip_speed, order
+            plant, inspector, from_S, touched, slip_speed, order
         )
     except DrakeTeleopError as error:
         return contact._replace(drake_contact_reason=str(error))

@@ -42,10 +42,10 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
     """Remove shapes that Drake cannot read, or all shapes if the plant has no SceneGraph.
 
     Relative mesh addresses become absolute. STL meshes are converted to convex hulls, because Drake
-    does not read STL. Removed shapes are reported for links without any remaining shape. Removed
-    collision shapes are also reported for links with other collision shapes.
+    does not read STL. Removed shapes are reported for links without any remaining shape, removed
+    collision shapes also for tools, scenes, and links with other collision shapes.
     """
-    lost: dict[str, list[str]] = {}
+    lost, purpose = dict[str, list[str]](), model.purpose
     for link in model.root.iter("link"):
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
@@ -54,11 +54,13 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
                     link.remove(shape)
                     removed.add(fault)
         reported = faults["collision"]
-        if link.find("collision") is None:
-            reported = set() if link.find("visual") is not None else reported | faults["visual"]
+        if link.find("visual") is None and link.find("collision") is None:
+            reported |= faults["visual"]
+        elif link.find("collision") is None and not (purpose.is_tool or purpose.is_scene):
+            reported = set()
         for fault in sorted(reported):
             lost.setdefault(fault, []).append(link.get("name", ""))
-        if not model.purpose.plant_has_shapes:
+        if not purpose.plant_has_shapes:
             for shape in [*link.findall("collision"), *link.findall("visual")]:
                 link.remove(shape)
     for fault, links in lost.items():

@@ -233,8 +233,8 @@ class MjcfWriter:
         materials = [each for each in mjcf.elements_in("asset") if each.tag == "material"]
         self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
 
-    def write(self, world: Body, moving: list[Joint]) -> str:
-        """Return the MJCF text of a world body; the joints `moving` get motors."""
+    def write(self, world: Body, efforts: dict[str, float]) -> str:
+        """Return the MJCF text of a world body; joints in `efforts` get motors of these limits."""
         top = SubElement(self._root, "worldbody")
         self._write_joints_geoms_and_children(top, world)
         names = {body.name for body in world.with_descendants()}
@@ -244,8 +244,11 @@ class MjcfWriter:
             if each.tag == "exclude" and names.issuperset(ends.values()):
                 SubElement(contact, "exclude", ends)
         actuators = SubElement(self._root, "actuator")
-        for joint in moving:
-            SubElement(actuators, "motor", name=joint.name, joint=joint.name)
+        for name, effort in efforts.items():
+            motor = SubElement(actuators, "motor", name=name, joint=name)
+            if 0.0 < effort < float("inf"):
+                motor.set("ctrllimited", "true")
+                motor.set("ctrlrange", _format_numbers((-effort, effort)))
         return tostring(self._root, encoding="unicode")
 
     def _write_joints_geoms_and_children(self, element: Element, body: Body) -> None:

@@ -62,14 +62,14 @@ def repair_mjcf(model: ModelRepair) -> None:
     _check_unique_names_and_generator_tags(bodies, model)
     _set_mass_properties_of_bodies(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
-    model.effort_limits = _effort_limits(mjcf, with_motor)
+    efforts = {} if purpose.is_scene else _effort_limits(mjcf, with_motor)
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if shape.has_contact or not body.geoms:
                 model.add_repair(f"{fault}; {MISSING_SHAPES_TEXT}", body.name)
     model.auxiliary_bodies = {body.name for body in bodies if body.is_auxiliary}
     model.raise_faults()
-    model.text = MjcfWriter(mjcf).write(world, [] if purpose.is_scene else with_motor)
+    model.text = MjcfWriter(mjcf).write(world, efforts)
     model.raise_faults()
 
 
@@ -209,7 +209,7 @@ def _report_unread_couplings_and_springs(joints: list[Joint], mjcf: Mjcf) -> Non
 
 
 def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
-    """Return the effort limits [N m, N] of joints by name; joints without a limit have no entry.
+    """Return the effort limits [N m, N] of joints by name; 0 and inf mean no limit.
 
     Limits of several actuators add up. The joint's own `actuatorfrcrange` limits their sum.
     """
@@ -223,8 +223,7 @@ def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
         names = "actuatorfrcrange", "actuatorfrclimited"
         own = _symmetric_limit_from_range(mjcf, joint.attributes, *names)
         limits[joint.name] = min(limits.get(joint.name, float("inf")), own)
-    of_joints = {joint.name: limits[joint.name] for joint in joints}
-    return {name: limit for name, limit in of_joints.items() if 0.0 < limit < float("inf")}
+    return {joint.name: limits[joint.name] for joint in joints}
 
 
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:

@@ -208,8 +208,13 @@ def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
-        if not text:
+        # Drake omits motors without effort.
+        if not text or (
+            name == "effort" and parse_number(text) == 0 and not model.purpose.is_scene
+        ):
             limit.attrib.pop(name, None)
+            for inner in limit.findall(name):
+                limit.remove(inner)
             continue
         values[name] = parse_number(text)
         if math.isnan(values[name]):

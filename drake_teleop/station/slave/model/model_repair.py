@@ -42,16 +42,15 @@ class ModelRepair:
 
     Attributes:
         folder: folder of converted meshes and of repaired copies of included files.
-        text: XML for Drake's parser, with absolute mesh paths; empty if a part was not repaired.
-        effort_limits: torque or force limits [N m, N] by joint; joints without an entry have none.
-        dependence_reasons: texts by name: why mimic joints or floating links depend on others.
+        text: XML for Drake's parser, with absolute mesh paths; empty without a repair.
+        dependence_reasons: texts by name: why mimic joints or floating links depend on others; with
+            model directives by MODEL::NAME.
         auxiliary_bodies: names of massless bodies that the repair added.
     """
 
     def __init__(self, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path) -> None:
         self.path, self.files, self.purpose, self.folder = path, files, purpose, folder
         self.text = ""
-        self.effort_limits: dict[str, float] = {}
         self.dependence_reasons: dict[str, str] = {}
         self.auxiliary_bodies: set[str] = set()
         # Dictionaries keep the order and contain each text once.
@@ -65,12 +64,10 @@ class ModelRepair:
         return read_xml(self.path)
 
     def repair_part(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
-        """Repair a file that this one includes or adds; return it and merge its results here."""
+        """Repair a file that this one includes or adds; return it, and merge its assumptions."""
         purpose = self.purpose._replace(is_in_directives=True)
         part = ModelRepair(path, self.files, purpose, self.folder)
         repair(part)
-        self.effort_limits |= part.effort_limits
-        self.dependence_reasons |= part.dependence_reasons
         self.auxiliary_bodies |= part.auxiliary_bodies
         self._assumptions_of_parts += part.assumptions
         return part

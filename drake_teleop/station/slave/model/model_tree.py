@@ -44,8 +44,8 @@ def reduce_to_chain(
     """Keep only the tree of links with the sensor; fix joints that are not between root and sensor.
 
     Joints that close a loop are removed. Held joints count as fixed. Return the joints from root to
-    sensor link, including fixed ones. Return also, by link, the number of these joints that move
-    and are between root and link. Return None, and report a fault, if the joints are ambiguous.
+    sensor link, fixed ones included, and by link the number of moving ones between root and link;
+    or None, with a fault, if joints are ambiguous.
     """
     joints = _joint_chain_to_link(scope, sensor_link, model)
     if joints is None:

@@ -25,6 +25,7 @@ _CHILD_TAGS_READ_BY_DRAKE = {
     "collision": {"pose", "geometry", "surface"},
     "visual": {"pose", "geometry", "material"},
 }
+_ONE_AXIS_TYPES = ("revolute", "continuous", "prismatic")
 _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
@@ -37,7 +38,8 @@ def repair_urdf(model: ModelRepair) -> None:
         _keep_one_material_per_name(root)
     _repair_links_and_joints(model, is_sdf=False)
     if not model.purpose.is_scene:
-        _remove_references_to_missing_parts(model)
+        _remove_references_to_missing_parts(root)
+        _keep_one_motor_per_joint(model)
     _convert_meshes_and_set_text(model)
 
 
@@ -89,13 +91,6 @@ def _convert_meshes_and_set_text(model: ModelRepair) -> None:
     model.raise_faults()
     remove_unusable_shapes(model)
     model.raise_faults()
-    limits = dict[str, float]()
-    for joint in model.root.iter("joint"):
-        for limit in joint.iter("limit"):
-            effort = limit.get("effort") or limit.findtext("effort")
-            limits[joint.get("name", "")] = model_numbers.parse_number(effort or "0")
-    limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
-    model.effort_limits = limits | model.effort_limits
     model.dependence_reasons = find_dependence_reasons(model.root) | model.dependence_reasons
     model.text = ElementTree.tostring(model.root, encoding="unicode")
 
@@ -173,16 +168,19 @@ def _has_valid_colour(material: Element) -> bool:
     return len(values) == 4 and all(0.0 <= value <= 1.0 for value in values)
 
 
-def _remove_references_to_missing_parts(model: ModelRepair) -> None:
-    root = model.root
+def _remove_references_to_missing_parts(root: Element) -> None:
     links = {link.get("name", "") for link in root.findall("link")}
-    moving = {joint.get("name", "") for joint in list_joints(root) if joint.get("type") != "fixed"}
     for frame in root.findall("frame"):
         if frame.get("link") not in links:
             root.remove(frame)
     for group in root.findall("drake:collision_filter_group"):
         if any(member.get("link") not in links for member in group.findall("drake:member")):
             root.remove(group)
+
+
+def _keep_one_motor_per_joint(model: ModelRepair) -> None:
+    root = model.root
+    moving = {x.get("name", "") for x in list_joints(root) if x.get("type") in _ONE_AXIS_TYPES}
     for motor in root.findall("transmission"):
         names = [joint.get("name", "") for joint in motor.findall("joint")]
         has_data = any(inner.tag in _DRAKE_ROTOR_TAGS for inner in motor.iter())
@@ -193,6 +191,10 @@ def _remove_references_to_missing_parts(model: ModelRepair) -> None:
         model_numbers.check_lengths_and_inertias(motor, f"motor of {names[0]}", model)
         for actuator in motor.findall("actuator"):
             actuator.set("name", names[0])
+    for name in sorted(moving):  # Drake reads effort limits of joints with motors only
+        motor = SubElement(root, "transmission", type="SimpleTransmission")
+        SubElement(motor, "joint", name=name)
+        SubElement(motor, "actuator", name=name)
 
 
 def _repair_included_file(uri: Element, model: ModelRepair) -> None:
@@ -206,8 +208,9 @@ def _repair_included_file(uri: Element, model: ModelRepair) -> None:
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is not None and included.is_file():
-        text = model.repair_part(included, repair).text
-        uri.text = f"file://{model.write_file(included.name, text)}"
+        part = model.repair_part(included, repair)
+        model.dependence_reasons |= part.dependence_reasons
+        uri.text = f"file://{model.write_file(included.name, part.text)}"
 
 
 def _find_included_model_file(address: str, model: ModelRepair) -> Path | None:
