@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydrake.geometry import Role
@@ -11,6 +14,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.model.model_repair import ModelPurpose
+from drake_teleop.station.slave.models import repair_and_parse_model
 
 
 def parse(name: str):
@@ -145,3 +150,14 @@ def test_the_leaf_moves_up_and_down_and_brings_no_spring_of_its_own(slave):
     assert plant.num_force_elements() == 1
     leaf = 33 / 140 * 7850 * 0.17 * 0.06 * 0.002
     assert plant.GetBodyByName("leaf").default_mass() == pytest.approx(leaf, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["leader_arm.urdf", "rx90.sdf"])
+def test_a_model_without_converted_files_leaves_no_temporary_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    plant = MultibodyPlant(0.0)
+    repair_and_parse_model(plant, models_dir() / name, (), ModelPurpose(is_scene=True))
+    assert plant.num_bodies() > 1
+    assert list(tmp_path.iterdir()) == []

@@ -67,6 +67,8 @@ def repair_and_parse_model(
         what = "the model has springs or other force elements, which are not supported"
         remedy = "remove them; only motors, gravity and contact move the arm"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
+    if not os.listdir(folder.name):
+        folder.cleanup()  # at once, because workers of a study end without clean-up
     return instances, model
 
 
