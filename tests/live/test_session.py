@@ -409,3 +409,21 @@ def test_weight_scale_is_separate_or_that_of_the_inertia_at_minus_one(scenario, 
     # 3.13 kg at rest, on the scale of the master
     scale = scenario.force_scaling.force_scale
     assert abs((felt[100] - felt[0]) / scale) == pytest.approx(3.13 * 9.81, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "scales",
+    [
+        {"force_scale": 2.0},
+        {"force_scale": 100.0, "sigma": 100.0, "gamma": 100.0},
+        {"sigma": 5.0, "gamma": 3.5},
+        {"sigma_weight": 4.0, "sigma_inertia": 0.0},
+    ],
+)
+def test_scales_of_a_scenario_beyond_the_page_are_recorded_and_read(scenario, tmp_path, scales):
+    own = {f"force_scaling__{name}": value for name, value in scales.items()}
+    inputs = Inputs.from_scenario(replace(scenario, **own))
+    path = tmp_path / DRIVE_INPUTS_FILE_NAME
+    path.write_text(HEADER + csv_row(0, inputs) + csv_row(5, inputs))
+    assert read_inputs(path, MADE_BY) == [(0, inputs), (5, inputs)]
+    assert inputs.with_changes({"gamma": 1e4}).gamma == 300
