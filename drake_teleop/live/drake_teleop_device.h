@@ -23,7 +23,7 @@ typedef struct { /* from the device: 88 bytes */
 
 typedef struct { /* to the device: 72 bytes */
   char magic[4]; /* "DTF1" */
-  uint32_t flags; /* DT_NO_FORCE or 0 */
+  uint32_t flags; /* 0 */
   uint64_t number; /* of the state that it answers */
   double t; /* likewise */
   double force[3], torque[3]; /* on the hand [N, N m] */
