@@ -56,8 +56,7 @@ class ServedCompensator:
         node.declare_parameter("load", str(load))
         node.declare_parameter("until", DEFAULT_TOLERANCES_TEXT)
         node.declare_parameter("seconds", 120.0)
-        node.add_on_set_parameters_callback(self._check_scale_parameters)
-        node.add_post_set_parameters_callback(lambda _: self._apply_scale_parameters())
+        node.add_on_set_parameters_callback(self._check_and_apply_scale_parameters)
         for service, answer in (
             ("~/tare", self._make_service_callback(lambda: self._current.tare())),
             ("~/load", self._make_service_callback(self._reload_compensator)),
@@ -80,21 +79,26 @@ class ServedCompensator:
     def _parameter_value(self, name: str) -> Any:
         return self._node.get_parameter(name).value
 
-    def _apply_scale_parameters(self) -> None:
-        sigma, gamma, *others = (self._parameter_value(name) for name in SIGMA_GAMMA_NAMES)
+    def _apply_scale_parameters(self, compensator: Compensator, **changes: float) -> None:
+        values = {name: self._parameter_value(name) for name in SIGMA_GAMMA_NAMES} | changes
+        sigma, gamma, *others = values.values()
         weight, inertia = (None if value < 0.0 else value for value in others)
-        self._current.set_scales(sigma, gamma, weight, inertia)
+        compensator.set_scales(sigma, gamma, weight, inertia)
 
-    def _check_scale_parameters(self, parameters: list[Any]) -> Any:
+    def _check_and_apply_scale_parameters(self, parameters: list[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
-        for each in parameters:
-            if each.name not in SIGMA_GAMMA_NAMES:
-                continue
+        scales = [each for each in parameters if each.name in SIGMA_GAMMA_NAMES]
+        for each in scales:
             lowest = -math.inf if each.name in SIGMA_GAMMA_NAMES[2:] else 0.0
             if not (math.isfinite(each.value) and each.value >= lowest):
                 reason = f"{each.name}: {each.value} is outside {lowest:g} to inf"
                 return SetParametersResult(successful=False, reason=reason)
+        try:
+            changes = {each.name: each.value for each in scales}
+            self._apply_scale_parameters(self._current, **changes)
+        except DrakeTeleopError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _make_service_callback(self, action: Callable[[], str]) -> Callable[[Any, Any], Any]:
@@ -110,8 +114,8 @@ class ServedCompensator:
 
     def _reload_compensator(self) -> str:
         compensator = self._make(load := Identification.load(self._parameter_value("load")))
+        self._apply_scale_parameters(compensator)
         self._current = compensator
-        self._apply_scale_parameters()
         return f"done: {load.mass:.4g} kg"
 
     async def _answer_calibration_request(self, _request: Any, response: Any) -> Any:
