@@ -15,6 +15,7 @@ import numpy as np
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
@@ -122,14 +123,17 @@ def run_compensate_command(
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:
-        dt = readings.dt
-        detector = None if free is None else StreamContactDetector(load, free, dt, cutoff_hz)
+        dt, delay_readings = readings.dt, getattr(readings, "delay_readings", 0)
+        detector, ahead_s = None, delay_readings * dt + filter_lag(dt, cutoff_hz)
+        if free is not None:
+            late = options.get("delay", "auto"), ahead_s if predicted else 0.0
+            detector = StreamContactDetector(load, free, dt, cutoff_hz, *late)
         return Compensator(
             load,
             dt,
             **scales,
             cutoff_hz=cutoff_hz,
-            delay_readings=getattr(readings, "delay_readings", 0),
+            delay_readings=delay_readings,
             predicted=predicted,
             sensor_range=None if sensor_range is None else np.repeat(sensor_range, 3),
             watch=ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None,
