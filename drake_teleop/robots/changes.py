@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -99,14 +100,10 @@ class ZeroAndLoadMonitor:
 
 
 def _find_changes_in_subprocess(rows: Array, dt: float) -> list[TimedChangeText]:
-    done = subprocess.run(
-        [sys.executable, "-m", __name__, repr(dt)],
-        input=rows.tobytes(),
-        stdout=subprocess.PIPE,
-        timeout=_CHANGE_TEST_TIMEOUT_S,
-        check=True,
-        start_new_session=True,  # Ctrl-C stops the loop only
-    )
+    words = [sys.executable, "-m", __name__, repr(dt)]
+    # In a new session, so that Ctrl-C stops the loop only.
+    options: Any = {"timeout": _CHANGE_TEST_TIMEOUT_S, "check": True, "start_new_session": True}
+    done = subprocess.run(words, input=rows.tobytes(), stdout=subprocess.PIPE, **options)
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 

@@ -71,13 +71,10 @@ def compensate_stream(
                 report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def longest_read_timeout_s() -> float:
-        left = compensator.time_to_stale(time.monotonic())
-        return min(left, _ZERO_WRENCH_SEND_PERIOD_S) if left > 0.0 else _ZERO_WRENCH_SEND_PERIOD_S
-
     with suppress(KeyboardInterrupt), raise_interrupt_on_sigint():
         while not INTERRUPTED_EVENT.is_set():
-            if (readings := source.read(longest_read_timeout_s())) is None:
+            left_s = compensator.time_to_stale(time.monotonic()) or _ZERO_WRENCH_SEND_PERIOD_S
+            if (readings := source.read(min(left_s, _ZERO_WRENCH_SEND_PERIOD_S))) is None:
                 break
             stale = compensator.stale_output(time.monotonic()) if source.live else None
             if stale and not readings:

@@ -289,10 +289,9 @@ class Compensator:
 
     def _contact_and_scaled_wrench(self, values: Array, gravity: Array | None) -> Array:
         self._is_gravity_known = gravity is not None
-        if gravity is None:
-            if self._scales[3] != 0.0:
-                self._require_known_weight()
-            gravity = _ZERO_GRAVITY
+        if self._scales[3] != 0.0:
+            self._require_known_weight()
+        gravity = _ZERO_GRAVITY if gravity is None else gravity
         out = np.empty(12)
         at = self.good_readings_in_row % len(self._tare_rows)
         load = self.offsets, self._phi, self._zero_phi, self._scales

@@ -127,13 +127,9 @@ class ServedCompensator:
             return response
         words = [sys.executable, "-c", _CALIBRATE_PYTHON_CODE]
         words += self._calibrate(self._parameter_value("until"), self._parameter_value("seconds"))
-        process = self._process = subprocess.Popen(
-            words,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,  # one signal, from `close`, also at Ctrl-C in a terminal
-        )
+        # In a new session there is one signal, from `close`, also at Ctrl-C in a terminal.
+        options: Any = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+        process = self._process = subprocess.Popen(words, stdout=subprocess.DEVNULL, **options)
         ended: Any = Future(executor=self._node.executor)
         self._pool.submit(lambda: ended.set_result(process.communicate()[1]))
         said, status = await ended, process.returncode

@@ -84,7 +84,7 @@ _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 class StreamContactDetector:
     """Contact detector with the noise floor of the free-motion log `free`.
 
-    `ahead_s` [s] is the time over which the compared contact wrenches are extrapolated.
+    `ahead_s`: extrapolation of the contact wrenches [s].
     """
 
     def __init__(
