@@ -471,12 +471,12 @@ def export(
     """
     from drake_teleop.load.identification import Identification
 
-    if to not in _CONTROLLER_EXPORT_FORMATS:
-        remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
-        option.refuse_given_options("out", "rate_hz", "cutoff_hz", "sensor_range", remedy=remedy)
     if to in ("c99", "fmu"):
         remedy = "remove it, and give the code the wrench of the sensor on the load"
         option.refuse_given_options("sign", remedy=remedy)
+    elif to not in _CONTROLLER_EXPORT_FORMATS:
+        remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
+        option.refuse_given_options("out", "rate_hz", "cutoff_hz", "sensor_range", remedy=remedy)
     found = Identification.load(identification)
     if to in _CONTROLLER_EXPORT_FORMATS:
         from drake_teleop.robots.controller.export import export_controller

@@ -36,7 +36,7 @@ _CLUTCH_OPEN_AT_CONNECT_S = 0.05
 class DeviceLink:
     """UDP link to one device client on this machine; another may follow after 50 ms of silence.
 
-    An address haply://HOST:PORT also starts the client, as a child process.
+    An address haply://HOST:PORT also starts the client.
 
     Attributes:
         refused: number of invalid packets and packets of other senders.
