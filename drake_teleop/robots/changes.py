@@ -56,6 +56,7 @@ class ZeroAndLoadMonitor:
             return
         if not 0.0 < reading.t - self._last < MIN_CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
+            self._reported = [t for t in self._reported if t < reading.t]  # of the same clock
         t = self._last = reading.t
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
@@ -82,10 +83,9 @@ class ZeroAndLoadMonitor:
         self._executor.shutdown()
 
     def _rows_in_time_order(self) -> Array:
-        first = self._count % len(self._rows)
         if self._count <= len(self._rows):
             return self._rows[: self._count].copy()
-        return np.concatenate([self._rows[first:], self._rows[:first]])
+        return np.roll(self._rows, -self._count, axis=0)
 
     def _report_changes(self, found: Future[list[TimedChangeText]]) -> None:
         error = found.exception()
