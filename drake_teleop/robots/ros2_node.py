@@ -132,18 +132,18 @@ class ServedCompensator:
         process = self._process = subprocess.Popen(words, stdout=subprocess.DEVNULL, **options)
         ended: Any = Future(executor=self._node.executor)
         self._pool.submit(lambda: ended.set_result(process.communicate()[1]))
-        said, status = await ended, process.returncode
+        lines, status = (await ended).strip().splitlines(), process.returncode
         self._process = None
         if status == 0:
             path = str(self._out / "identification.json")
             self._node.set_parameters([Parameter("load", value=path)])
             return self._make_service_callback(self._reload_compensator)(None, response)
         advice = "interrupted"
-        if status == 1:
+        if status == 1 and not any(line.startswith("Traceback") for line in lines):
             summary = json.loads((self._out / "summary.json").read_text(encoding="utf-8"))
             advice = f"the tolerance is not met: {summary['advice'] or summary['doubts']}"
-        elif said.strip():
-            advice = said.strip().splitlines()[-1]
+        elif lines:
+            advice = lines[-1]
         response.message = f"refused: {advice}"
         return response
 

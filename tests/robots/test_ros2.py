@@ -224,6 +224,36 @@ def test_scales_that_the_readings_do_not_support_are_refused(
         node.close()
 
 
+@ros
+@pytest.mark.parametrize("earlier", [None, {"advice": "swing", "doubts": []}])
+@pytest.mark.parametrize("error", ["RuntimeError", "MemoryError"])
+def test_crashed_calibration_is_refused_and_the_node_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: dict[str, Any] | None, error: str
+) -> None:
+    from drake_teleop.robots import ros2_node
+    from drake_teleop.robots.ros2 import shared_node
+
+    monkeypatch.setattr(ros2_node, "_CALIBRATE_PYTHON_CODE", f"raise {error}('broken')")
+    if earlier is not None:
+        (tmp_path / "summary.json").write_text(json.dumps(earlier))
+    load().save(tmp_path / "load.json")
+    scales = {"sigma": 0.5, "gamma": 1.0, "sigma_weight": -1.0, "sigma_inertia": -1.0}
+    node = shared_node(int(DOMAIN))
+    served = ros2_node.ServedCompensator(
+        node.node, lambda one: Compensator(one, DT), tmp_path / "load.json",
+        lambda *_: [], tmp_path, scales,
+    )  # fmt: skip
+    answer = served._answer_calibration_request(None, SimpleNamespace())
+    task, deadline = node.node.executor.create_task(answer), time.monotonic() + 60.0
+    try:
+        while not task.done() and time.monotonic() < deadline:
+            node.spin(0.05)
+        assert task.result().message == f"refused: {error}: broken"
+    finally:
+        served.close()
+        node.close()
+
+
 NODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 
 
