@@ -25,7 +25,7 @@ from drake_teleop.live.inputs import (
     csv_row,
     read_inputs,
 )
-from drake_teleop.live.record import BackgroundLog
+from drake_teleop.live.record import LOAD_FILE, BackgroundLog, SessionRecord
 from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
@@ -380,6 +380,20 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
     model.write_text(model.read_text() + "\n")
     with pytest.raises(DrakeTeleopError, match=r"models or other files .* have changed; it cannot"):
         read_drive(tmp_path / "drive")
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK", None])
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_drive_without_its_load_is_not_repeated(scenario, load, tmp_path, damage, sigma):
+    """With sigma = gamma = 1 the station would run without the load, with another log."""
+    scaled = replace(scenario, force_scaling__sigma=sigma, force_scaling__gamma=1.0)
+    SessionRecord(tmp_path, scaled, load, Inputs(), device=False).close(5, Inputs())
+    assert read_drive(tmp_path).load.estimate.tolist() == load.estimate.tolist()
+    (tmp_path / LOAD_FILE).unlink()
+    if damage is not None:
+        (tmp_path / LOAD_FILE).write_bytes(damage)
+    with pytest.raises(DrakeTeleopError, match=r"load\.npz: is not an identified load"):
+        read_drive(tmp_path)
 
 
 def test_incomplete_last_line_is_ignored(tmp_path):
