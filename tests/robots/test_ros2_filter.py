@@ -130,3 +130,12 @@ def test_package_names_the_library_and_its_dependencies(package):
     assert described["type"] in code and described["base_class_type"] in code
     depends = {x.text for x in ElementTree.parse(package / "package.xml").findall("depend")}
     assert f"DEPENDENCIES {' '.join(sorted(depends))})" in cmake
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_defaults_in_the_readme_are_floating_point_as_in_the_code(tmp_path, sign):
+    """ROS 2 refuses the integer 1 for a parameter of type double."""
+    export_controller(kernel.LOAD, "ros2_filter", tmp_path, rate_hz=RATE, sign=sign)
+    text = (tmp_path / "README.md").read_text()
+    assert "| 0.0, 1.0 |" in text and f"| {sign}.0 |" in text
+    assert f"WRENCH_COMPENSATOR_SIGN {sign}.0\n" in (tmp_path / "src" / "load.h").read_text()
