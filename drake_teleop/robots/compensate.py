@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
@@ -120,11 +121,14 @@ def run_compensate_command(
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:
+        if load.weight_removed != found.weight_removed:
+            what = "has another `weight_removed` than the load at the start"
+            remedy = "end this command, and start it with the other load"
+            raise DrakeTeleopError(what, where="load", remedy=remedy)
         dt, delay_readings = readings.dt, getattr(readings, "delay_readings", 0)
-        detector, ahead_s = None, delay_readings * dt + filter_lag(dt, cutoff_hz)
-        if free is not None:
-            late = options.get("delay", "auto"), ahead_s if predicted else 0.0
-            detector = StreamContactDetector(load, free, dt, cutoff_hz, *late)
+        ahead_s = delay_readings * dt + filter_lag(dt, cutoff_hz) if predicted else 0.0
+        stream = dt, cutoff_hz, options.get("delay", "auto"), ahead_s
+        detector = None if free is None else StreamContactDetector(load, free, *stream)
         return Compensator(
             load,
             dt,

@@ -95,8 +95,7 @@ class ServedCompensator:
                 reason = f"{each.name}: {each.value} is outside {lowest:g} to inf"
                 return SetParametersResult(successful=False, reason=reason)
         try:
-            changes = {each.name: each.value for each in scales}
-            self._apply_scale_parameters(self._current, **changes)
+            self._apply_scale_parameters(self._current, **{x.name: x.value for x in scales})
         except DrakeTeleopError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -162,6 +163,29 @@ def test_command_gives_delay_and_prediction_to_the_detector(
     assert (cutoff_hz, used_delay) == (30.0, delay)
     expected = delay_readings * DT + filter_lag(DT, 30.0) if predicted else 0.0
     assert ahead_s == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_another_load_with_or_without_weight_is_refused(tmp_path: Path, removed: bool) -> None:
+    """The motion of the open source fits the load at the start."""
+    t, values = readings()
+    turn = {"q_w": np.cos(t), "q_x": np.sin(t), "q_y": 0 * t, "q_z": 0 * t}
+    write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "log.parquet")
+    columns = [pl.Series(name, column) for name, column in turn.items()]
+    table = pl.read_parquet(tmp_path / "log.parquet").with_columns(columns)
+    table.write_parquet(tmp_path / "log.parquet")
+    replace(LOAD, weight_removed=removed).save(tmp_path / "load.json")
+    refused = []
+
+    def attach(make):
+        with pytest.raises(DrakeTeleopError, match=r"has another .weight_removed. than") as error:
+            make(replace(LOAD, weight_removed=not removed))
+        refused.append(error)
+        return make(replace(LOAD, weight_removed=removed))
+
+    loop = f"replay:{tmp_path}/log.parquet", tmp_path / "load.json", str(tmp_path / "out.csv")
+    run_compensate_command(*loop, delay=0.0, attach=attach)
+    assert refused
 
 
 def test_noise_floor_requires_the_same_rate_and_a_low_pass(tmp_path: Path) -> None:
