@@ -38,8 +38,7 @@ def norm_range_into(vectors, origins, out):
 
 @njit(cache=True)
 def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    # `energy` [J]: work of the hand on the stylus, and of the tool on its contacts. `before` (13,):
-    # time, p_WS and R_WS of the last row.
+    # `energy` [J]: of hand on stylus, of tool on contacts. `before`: t, p_WS, R_WS of the last row.
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
