@@ -385,7 +385,7 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
 @pytest.mark.parametrize("damage", [b"", b"PK", None])
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_drive_without_its_load_is_not_repeated(scenario, load, tmp_path, damage, sigma):
-    """With sigma = gamma = 1 the station would run without the load, with another log."""
+    """The station with sigma = gamma = 1 would run without the load, with another log."""
     scaled = replace(scenario, force_scaling__sigma=sigma, force_scaling__gamma=1.0)
     SessionRecord(tmp_path, scaled, load, Inputs(), device=False).close(5, Inputs())
     assert read_drive(tmp_path).load.estimate.tolist() == load.estimate.tolist()

@@ -187,7 +187,7 @@ def test_missing_rclpy_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_scales_that_the_readings_do_not_support_are_refused(
     tmp_path: Path, name: str, removed: bool
 ) -> None:
-    """Without gravity, or with a wrench without weight; the node continues with its load."""
+    """Gravity is unknown, or the weight is removed; the node continues with its load."""
     from rclpy.parameter import Parameter
 
     from drake_teleop.robots.ros2 import shared_node
