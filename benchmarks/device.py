@@ -227,7 +227,7 @@ def driven(seconds: float) -> dict[str, float]:
                 late.append(-live.pace.time_to_next_slice(clock()))
             live.tick(clock)
             time.sleep(live.time_to_next_tick(clock()))
-        figures = link.link_statistics(clock())
+        figures = link.link_statistics()
         device.wait()
         found = json.loads(told.read_text())
         lost = live.pace.lost_time_s - lost

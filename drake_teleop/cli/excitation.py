@@ -54,7 +54,7 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory; return its results as one dictionary.
+    """Design, check and write an excitation trajectory; return its results.
 
     Args:
         model: model file of another arm; the sensor is the scenario's.

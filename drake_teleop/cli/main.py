@@ -471,7 +471,10 @@ def export(
     """
     from drake_teleop.load.identification import Identification
 
-    if to not in _CONTROLLER_EXPORT_FORMATS:
+    if to in ("c99", "fmu"):
+        remedy = "remove it, and give the code the wrench of the sensor on the load"
+        option.refuse_given_options("sign", remedy=remedy)
+    elif to not in _CONTROLLER_EXPORT_FORMATS:
         remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
         option.refuse_given_options("out", "rate_hz", "cutoff_hz", "sensor_range", remedy=remedy)
     found = Identification.load(identification)

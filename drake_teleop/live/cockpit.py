@@ -38,7 +38,7 @@ def norm_range_into(vectors, origins, out):
 
 @njit(cache=True)
 def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    # `energy` [J]: work of the hand on the stylus, and of the tool's force on its contacts.
+    # `energy` [J]: of hand on stylus, of tool on contacts. `before`: t, p_WS, R_WS of the last row.
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -48,10 +48,15 @@ def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist,
                 power += hand_E[row, i] * twist[row, i]
             energy[0] += (t[row] - before[0]) * power
             for i in range(3):
+                a, b, turn = (i + 1) % 3, (i + 2) % 3, 0.0
+                for k in range(3):  # half the sum of the axes' cross products from row to row
+                    turn += 0.5 * before[4 + 3 * a + k] * R_WS[b, k]
+                    turn -= 0.5 * before[4 + 3 * b + k] * R_WS[a, k]
                 for k in range(3):
-                    energy[1] += R_WS[i, k] * contact_S[row, k] * (p_WS[i] - before[1 + i])
+                    work = contact_S[row, k] * (p_WS[i] - before[1 + i])
+                    energy[1] += R_WS[i, k] * (work + contact_S[row, 3 + k] * turn)
         before[0] = t[row]
-        before[1:] = p_WS
+        before[1:4], before[4:] = p_WS, R_WS.ravel()
 
 
 class PageValueCalculator:
@@ -66,7 +71,7 @@ class PageValueCalculator:
         )
         self._peak_force = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
-        self._last_row = np.full(4, np.nan)  # t, p_WS of the last row
+        self._last_row = np.full(13, np.nan)
         self._forces = np.zeros((3, 2))
 
     def page_values(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
@@ -91,7 +96,7 @@ class PageValueCalculator:
             "energy": _round_or_zero_if_not_finite(self._energy, 5),
             "words": list(dict.fromkeys(self._warning_texts(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
-            "tool": _round_or_zero_if_not_finite(self._last_row[1:], 5),
+            "tool": _round_or_zero_if_not_finite(self._last_row[1:4], 5),
             "stylus": _round_or_zero_if_not_finite(rows["pose_master"][-1, 4:], 5),
         }
 

@@ -128,7 +128,7 @@ class VirtualDevice:
         self.energy, self._t = 0.0, 0.0
 
     def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
-        """Advance the simulation by `seconds` under a constant rendered force (3,) [N]."""
+        """Simulate `seconds` under a constant rendered force (3,) [N]."""
         steps = max(math.ceil(seconds * 1e3 * _SIMULATION_STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps
         for _ in range(steps):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ _CLUTCH_OPEN_AT_CONNECT_S = 0.05
 class DeviceLink:
     """UDP link to one device client on this machine; another may follow after 50 ms of silence.
 
-    An address haply://HOST:PORT also starts the client, as a child process.
+    An address haply://HOST:PORT also starts the client.
 
     Attributes:
         refused: number of invalid packets and packets of other senders.
@@ -132,15 +133,11 @@ class DeviceLink:
             values["clutch"] = 0
         return values
 
-    def link_statistics(self, now: float) -> dict[str, float]:
-        """Return packet rate [Hz], lost packets, percentiles of lateness and age of forces [ms]."""
+    def link_statistics(self) -> dict[str, float]:
+        """Return lost packets, percentiles of lateness and age of forces [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
-        elapsed = np.inf
-        if len(self._latencies) > 1:
-            elapsed = min(now - self._connected_at, 1e-3 * _NUM_PACKETS_OF_LINK_STATISTICS)
         return {
-            "rate_hz": float(len(late) / max(elapsed, 1e-3)),
             "late_p99_ms": float(1e3 * (np.percentile(late, 99) - late.min())),
             "behind_p50_ms": float(1e3 * np.median(behind)),
             "behind_p99_ms": float(1e3 * np.percentile(behind, 99)),
@@ -154,11 +151,10 @@ class DeviceLink:
         return f"{self._describe_link()}. Refused packets: {self.refused}; {reason}"
 
     def _describe_link(self) -> str:
-        now = self._polled_at
-        if self.is_device_silent(now):
+        if self.is_device_silent(self._polled_at):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"
-        figures = self.link_statistics(now)
+        figures = self.link_statistics()
         text = f"Device: packets arrive up to {figures['late_p99_ms']:.1f} ms late (99 of 100)"
         if figures["behind_p99_ms"] > 0.0:
             text += (
@@ -180,9 +176,6 @@ class DeviceLink:
 
 
 def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    with suppress(ValueError):
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    return False

@@ -68,14 +68,8 @@ class HaplyDevice:
         try:
             parts = urlsplit(address)
             url = f"ws://{parts.hostname or 'localhost'}:{parts.port or 10001}"
-            opened = connect(
-                url,
-                max_size=_MAX_MESSAGE_BYTES,
-                open_timeout=2,
-                close_timeout=1,
-                compression=None,
-                proxy=None,
-            )
+            limits: Any = {"max_size": _MAX_MESSAGE_BYTES, "open_timeout": 2, "close_timeout": 1}
+            opened = connect(url, **limits, compression=None, proxy=None)
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             what = f"Haply's service does not answer ({error})"

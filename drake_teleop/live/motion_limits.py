@@ -25,7 +25,7 @@ class RateInputs:
         self._end_time = 0.0
 
     def set_rates(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Set new rates by input name [input units/s] for 1 s; return the inputs at this time."""
+        """Set new rates by input name [input units/s] for 1 s; return the inputs."""
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES_S}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES_S}

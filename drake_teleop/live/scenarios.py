@@ -77,11 +77,9 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
     changes: dict[str, object] = {"passivity__method": method}
     changes["operator__grip"] = list(GRIP_IMPEDANCES)[inputs.grip]
     if method == "wave" != scenario.passivity.method:
-        along, turning = scenario.passivity.wave.impedance
+        along, turning = (wave := scenario.passivity.wave).impedance
         impedance = [along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD)]
-        changes["passivity__wave"] = dataclasses.replace(
-            scenario.passivity.wave, impedance=impedance
-        )
+        changes["passivity__wave"] = dataclasses.replace(wave, impedance=impedance)
     name = NETWORKS[inputs.network]
     if name == "custom":
         delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter

@@ -132,8 +132,7 @@ class _Station:
         return block, block.GetMyMutableContextFromRoot(self.context)
 
     def signal_value(self, signal: str) -> Array:
-        values: Array = self.station.GetOutputPort(signal).Eval(self.context).copy()
-        return values
+        return np.array(self.station.GetOutputPort(signal).Eval(self.context))
 
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
@@ -363,7 +362,8 @@ def read_drive(folder: str | Path) -> RecordedDrive:
     changes = read_inputs(folder / DRIVE_INPUTS_FILE_NAME, versions_and_file_digest(scenario))
     load = read_cached_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
-    if not known or (load is None and (folder / LOAD_FILE).exists()):
+    is_required = not scenario.load_estimator.enabled or (folder / LOAD_FILE).exists()
+    if not known or (load is None and is_required):
         what = "is not an identified load (16 finite parameters)"
         remedy = "record the session again"
         raise DrakeTeleopError(what, where=str(folder / LOAD_FILE), remedy=remedy)

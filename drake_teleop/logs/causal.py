@@ -38,22 +38,24 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
 
     Extrapolate the output over `ahead_s` [s] by its slope. A cut-off of None returns x.
     """
-    if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
-        if ahead_s != 0.0:
-            limit = f"{0.5 / dt:g} Hz, half the rate of the log"
-            what = f"{cutoff_hz} is not below {limit}, as causal mode `predicted` requires"
-            remedy = "give a lower cut-off, or causal mode `delayed`"
-            raise DrakeTeleopError(what, where="cutoff", remedy=remedy)
+    low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead_s)
+    if not len(low_pass):
         return x
     from scipy.signal import lfilter
 
-    low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead_s)
     b, a, settled = low_pass[:3], [1.0, *low_pass[3:5]], low_pass[5:]
     at_first = settled.reshape(2, *[1] * (x.ndim - 1)) * x[:1]
     return lfilter(b, a, x, axis=0, zi=at_first)[0]
 
 
-def low_pass_and_settled_state(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> Array:
+def low_pass_and_settled_state(dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
+    """Return the low-pass (7,); (0,) without cut-off below half the rate."""
+    if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
+        if ahead_s != 0.0:
+            what = f"{cutoff_hz} is not below {0.5 / dt:g} Hz, half the rate, for a prediction"
+            remedy = "give a lower cut-off, or remove `predicted`"
+            raise DrakeTeleopError(what, where="cutoff", remedy=remedy)
+        return np.empty(0)
     low_pass = np.empty(7)
     design_low_pass(dt, math.tan(math.pi * cutoff_hz * dt), ahead_s, low_pass)
     return low_pass

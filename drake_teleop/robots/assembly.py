@@ -341,7 +341,7 @@ class ReadingAssembler(Source):
         self.lag_s = max(0.0, half_window_s + delay_s)
         self._clocks = _ClockOffsetEstimator(), _ClockOffsetEstimator()
         self._motions: deque[tuple[float, Array]] = deque()
-        self._pending: deque[Reading] = deque(maxlen=round(_STREAM_BUFFER_S / self.dt))
+        self._pending = deque[Reading](maxlen=max(1, round(_STREAM_BUFFER_S / self.dt)))
 
     @property
     def delay_s(self) -> float:

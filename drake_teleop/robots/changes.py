@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -55,6 +56,7 @@ class ZeroAndLoadMonitor:
             return
         if not 0.0 < reading.t - self._last < MIN_CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
+            self._reported = [t for t in self._reported if t < reading.t]  # of the same clock
         t = self._last = reading.t
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
@@ -81,10 +83,9 @@ class ZeroAndLoadMonitor:
         self._executor.shutdown()
 
     def _rows_in_time_order(self) -> Array:
-        first = self._count % len(self._rows)
         if self._count <= len(self._rows):
             return self._rows[: self._count].copy()
-        return np.concatenate([self._rows[first:], self._rows[:first]])
+        return np.roll(self._rows, -self._count, axis=0)
 
     def _report_changes(self, found: Future[list[TimedChangeText]]) -> None:
         error = found.exception()
@@ -99,14 +100,10 @@ class ZeroAndLoadMonitor:
 
 
 def _find_changes_in_subprocess(rows: Array, dt: float) -> list[TimedChangeText]:
-    done = subprocess.run(
-        [sys.executable, "-m", __name__, repr(dt)],
-        input=rows.tobytes(),
-        stdout=subprocess.PIPE,
-        timeout=_CHANGE_TEST_TIMEOUT_S,
-        check=True,
-        start_new_session=True,  # Ctrl-C stops the loop only
-    )
+    words = [sys.executable, "-m", __name__, repr(dt)]
+    # In a new session, so that Ctrl-C stops the loop only.
+    options: Any = {"timeout": _CHANGE_TEST_TIMEOUT_S, "check": True, "start_new_session": True}
+    done = subprocess.run(words, input=rows.tobytes(), stdout=subprocess.PIPE, **options)
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 

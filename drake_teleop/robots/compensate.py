@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
@@ -70,13 +72,10 @@ def compensate_stream(
                 report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def longest_read_timeout_s() -> float:
-        left = compensator.time_to_stale(time.monotonic())
-        return min(left, _ZERO_WRENCH_SEND_PERIOD_S) if left > 0.0 else _ZERO_WRENCH_SEND_PERIOD_S
-
     with suppress(KeyboardInterrupt), raise_interrupt_on_sigint():
         while not INTERRUPTED_EVENT.is_set():
-            if (readings := source.read(longest_read_timeout_s())) is None:
+            left_s = compensator.time_to_stale(time.monotonic()) or _ZERO_WRENCH_SEND_PERIOD_S
+            if (readings := source.read(min(left_s, _ZERO_WRENCH_SEND_PERIOD_S))) is None:
                 break
             stale = compensator.stale_output(time.monotonic()) if source.live else None
             if stale and not readings:
@@ -122,14 +121,20 @@ def run_compensate_command(
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:
-        dt = readings.dt
-        detector = None if free is None else StreamContactDetector(load, free, dt, cutoff_hz)
+        if load.weight_removed != found.weight_removed:
+            what = "has another `weight_removed` than the load at the start"
+            remedy = "end this command, and start it with the other load"
+            raise DrakeTeleopError(what, where="load", remedy=remedy)
+        dt, delay_readings = readings.dt, getattr(readings, "delay_readings", 0)
+        ahead_s = delay_readings * dt + filter_lag(dt, cutoff_hz) if predicted else 0.0
+        stream = dt, cutoff_hz, options.get("delay", "auto"), ahead_s
+        detector = None if free is None else StreamContactDetector(load, free, *stream)
         return Compensator(
             load,
             dt,
             **scales,
             cutoff_hz=cutoff_hz,
-            delay_readings=getattr(readings, "delay_readings", 0),
+            delay_readings=delay_readings,
             predicted=predicted,
             sensor_range=None if sensor_range is None else np.repeat(sensor_range, 3),
             watch=ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None,

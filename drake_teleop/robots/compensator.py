@@ -108,14 +108,13 @@ class Compensator:
     ) -> None:
         self._phi, self._zero_phi = processing.phi_with_inertia_replaced(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
-        self._scales = np.empty(4)
+        self._scales, self._is_gravity_known = np.empty(4), True
         self.set_scales(**scales)
         self.offsets = load.offsets.copy()
         self.lag_s = delay_readings * dt + filter_lag(dt, cutoff_hz)
-        self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
-        if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
-            ahead = self.lag_s if predicted else 0.0
-            self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
+        self._watch, self._detector = watch, detector
+        ahead = self.lag_s if predicted else 0.0
+        self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if sensor_range is None else np.array(sensor_range, float)
         self._largest = _MAX_ABS_READING_VALUES_SI.copy()
         self._largest[:6] = np.minimum(self._largest[:6], 2.0 * self._range)
@@ -167,9 +166,16 @@ class Compensator:
         """
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
-        if weight != inertia and self._weight_removed:
-            raise processing.weight_scale_without_effect_error("load")
+        if weight != inertia:
+            self._require_known_weight()
         kernel.set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
+
+    def _require_known_weight(self) -> None:
+        if self._weight_removed:
+            raise processing.weight_scale_without_effect_error("load")
+        if not self._is_gravity_known:
+            remedy = "use a source with poses or joint positions, or sigma alone"
+            raise unknown_gravity_error("gravity in the sensor frame", remedy)
 
     def step(self, reading: Reading, now: float) -> CompensatedWrench:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
@@ -282,11 +288,10 @@ class Compensator:
         self._delay_line.clear()
 
     def _contact_and_scaled_wrench(self, values: Array, gravity: Array | None) -> Array:
-        if gravity is None:
-            if self._scales[3] != 0.0:
-                remedy = "use a source with poses or joint positions, or --sigma alone"
-                raise unknown_gravity_error("gravity in the sensor frame", remedy)
-            gravity = _ZERO_GRAVITY
+        self._is_gravity_known = gravity is not None
+        if self._scales[3] != 0.0:
+            self._require_known_weight()
+        gravity = _ZERO_GRAVITY if gravity is None else gravity
         out = np.empty(12)
         at = self.good_readings_in_row % len(self._tare_rows)
         load = self.offsets, self._phi, self._zero_phi, self._scales

@@ -49,7 +49,8 @@ def open_source(
         _refuse_motion_options(address, **motion_options)
         path = address.removeprefix(_REPLAY_PREFIX)
         return ReplayLogSource(path, load, cutoff_hz=cutoff_hz, delay=delay, real_time=real_time)
-    source = _open_wrench_and_motion_source(address, rate_hz, **motion_options)
+    fixed_delay = None if delay in ("auto", 0.0) else delay
+    source = _open_wrench_and_motion_source(address, rate_hz, fixed_delay, **motion_options)
     weight_removed = load is not None and load.weight_removed
     if not isinstance(source, assembly.WrenchAndMotionStreams):
         if weight_removed:
@@ -116,6 +117,7 @@ def _period_s(rate_hz: float | None, address: str) -> float:
 
 def _refuse_motion_options(address: str, **motion_options: Any) -> None:
     options = {"motion": "--motion", "arm": "--model", "sensor_pose": "--sensor-pose"}
+    options["delay"] = "--delay"
     if given := [options[name] for name, value in motion_options.items() if value is not None]:
         what = "this source already contains the motion of sensor frame S"
         raise DrakeTeleopError(what, where=address, remedy=f"remove {' and '.join(given)}")
@@ -124,6 +126,7 @@ def _refuse_motion_options(address: str, **motion_options: Any) -> None:
 def _open_wrench_and_motion_source(
     address: str,
     rate_hz: float | None,
+    delay: str | float | None = None,
     *,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
@@ -133,7 +136,8 @@ def _open_wrench_and_motion_source(
     opened = [_open_registered_source(address, rate_hz, joints)]
     try:
         if WRENCH_AND_MOTION in opened[0].streams:
-            _refuse_motion_options(address, motion=motion, sensor_pose=sensor_pose, arm=arm)
+            given = {"motion": motion, "arm": arm, "sensor_pose": sensor_pose, "delay": delay}
+            _refuse_motion_options(address, **given)
             return opened[0]
         if motion is not None:
             opened.append(_open_registered_source(motion, 1.0 / opened[0].dt, joints))

@@ -56,8 +56,7 @@ class ServedCompensator:
         node.declare_parameter("load", str(load))
         node.declare_parameter("until", DEFAULT_TOLERANCES_TEXT)
         node.declare_parameter("seconds", 120.0)
-        node.add_on_set_parameters_callback(self._check_scale_parameters)
-        node.add_post_set_parameters_callback(lambda _: self._apply_scale_parameters())
+        node.add_on_set_parameters_callback(self._check_and_apply_scale_parameters)
         for service, answer in (
             ("~/tare", self._make_service_callback(lambda: self._current.tare())),
             ("~/load", self._make_service_callback(self._reload_compensator)),
@@ -80,21 +79,25 @@ class ServedCompensator:
     def _parameter_value(self, name: str) -> Any:
         return self._node.get_parameter(name).value
 
-    def _apply_scale_parameters(self) -> None:
-        sigma, gamma, *others = (self._parameter_value(name) for name in SIGMA_GAMMA_NAMES)
+    def _apply_scale_parameters(self, compensator: Compensator, **changes: float) -> None:
+        values = {name: self._parameter_value(name) for name in SIGMA_GAMMA_NAMES} | changes
+        sigma, gamma, *others = values.values()
         weight, inertia = (None if value < 0.0 else value for value in others)
-        self._current.set_scales(sigma, gamma, weight, inertia)
+        compensator.set_scales(sigma, gamma, weight, inertia)
 
-    def _check_scale_parameters(self, parameters: list[Any]) -> Any:
+    def _check_and_apply_scale_parameters(self, parameters: list[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
-        for each in parameters:
-            if each.name not in SIGMA_GAMMA_NAMES:
-                continue
+        scales = [each for each in parameters if each.name in SIGMA_GAMMA_NAMES]
+        for each in scales:
             lowest = -math.inf if each.name in SIGMA_GAMMA_NAMES[2:] else 0.0
             if not (math.isfinite(each.value) and each.value >= lowest):
                 reason = f"{each.name}: {each.value} is outside {lowest:g} to inf"
                 return SetParametersResult(successful=False, reason=reason)
+        try:
+            self._apply_scale_parameters(self._current, **{x.name: x.value for x in scales})
+        except DrakeTeleopError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _make_service_callback(self, action: Callable[[], str]) -> Callable[[Any, Any], Any]:
@@ -110,8 +113,8 @@ class ServedCompensator:
 
     def _reload_compensator(self) -> str:
         compensator = self._make(load := Identification.load(self._parameter_value("load")))
+        self._apply_scale_parameters(compensator)
         self._current = compensator
-        self._apply_scale_parameters()
         return f"done: {load.mass:.4g} kg"
 
     async def _answer_calibration_request(self, _request: Any, response: Any) -> Any:
@@ -123,27 +126,23 @@ class ServedCompensator:
             return response
         words = [sys.executable, "-c", _CALIBRATE_PYTHON_CODE]
         words += self._calibrate(self._parameter_value("until"), self._parameter_value("seconds"))
-        process = self._process = subprocess.Popen(
-            words,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,  # one signal, from `close`, also at Ctrl-C in a terminal
-        )
+        # In a new session there is one signal, from `close`, also at Ctrl-C in a terminal.
+        options: Any = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+        process = self._process = subprocess.Popen(words, stdout=subprocess.DEVNULL, **options)
         ended: Any = Future(executor=self._node.executor)
         self._pool.submit(lambda: ended.set_result(process.communicate()[1]))
-        said, status = await ended, process.returncode
+        lines, status = (await ended).strip().splitlines(), process.returncode
         self._process = None
         if status == 0:
             path = str(self._out / "identification.json")
             self._node.set_parameters([Parameter("load", value=path)])
             return self._make_service_callback(self._reload_compensator)(None, response)
         advice = "interrupted"
-        if status == 1:
+        if status == 1 and not any(line.startswith("Traceback") for line in lines):
             summary = json.loads((self._out / "summary.json").read_text(encoding="utf-8"))
             advice = f"the tolerance is not met: {summary['advice'] or summary['doubts']}"
-        elif said.strip():
-            advice = said.strip().splitlines()[-1]
+        elif lines:
+            advice = lines[-1]
         response.message = f"refused: {advice}"
         return response
 

@@ -60,7 +60,7 @@ class RtdeSource(Source):
         block = os.read(self._pipe, _READ_BLOCK_BYTES)
         if not block:
             if time.monotonic() - self._started > _MIN_READER_RESTART_PERIOD_S:
-                self._stop_reader_process()
+                self.close()
                 self._start_reader_process()
             else:
                 time.sleep(min(timeout_s, _MIN_READER_RESTART_PERIOD_S))
@@ -82,13 +82,10 @@ class RtdeSource(Source):
         os.close(into)
         self._partial, self._started = b"", time.monotonic()
 
-    def _stop_reader_process(self) -> None:
+    def close(self) -> None:
         self._child.kill()
         self._child.wait()
         os.close(self._pipe)
-
-    def close(self) -> None:
-        self._stop_reader_process()
 
 
 def readings_of_sample(sample: tuple[float, ...], dt: float, sign: float) -> list[Reading]:

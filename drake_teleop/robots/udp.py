@@ -82,9 +82,11 @@ def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
         host, port = parts.hostname or LOCALHOST, port if parts.port is None else parts.port
     except ValueError:
         host, port = "", None
-    if port is None:
-        remedy = "give one, such as udp://127.0.0.1:49152"
-        raise DrakeTeleopError("has no port from 0 to 65535", where=address, remedy=remedy)
+    what, remedy = "has no port from 0 to 65535", "give one, such as udp://127.0.0.1:49152"
+    if query := address.partition("?")[2]:
+        what, remedy = f"has the unknown parameters {query!r}", f"remove ?{query}"
+    if port is None or query:
+        raise DrakeTeleopError(what, where=address, remedy=remedy)
     return host, port
 
 
@@ -135,7 +137,7 @@ class UdpWrenchPoseSource(_PacketReceiver):
 
     def __init__(self, address: str, dt: float) -> None:
         self._sign = Address(address, None, allowed=("sign",), host=LOCALHOST).wrench_sign()
-        super().__init__(address, dt)
+        super().__init__(address.partition("?")[0], dt)
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         found: list[Reading] = []

@@ -82,7 +82,10 @@ _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
-    """Contact detector with the noise floor of the free-motion log `free`."""
+    """Contact detector with the noise floor of the free-motion log `free`.
+
+    `ahead_s`: extrapolation of the contact wrenches [s].
+    """
 
     def __init__(
         self,
@@ -91,6 +94,7 @@ class StreamContactDetector:
         dt: float,
         cutoff_hz: float | None,
         delay: str | float = "auto",
+        ahead_s: float = 0.0,
     ) -> None:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
             what = f"needs a low-pass below half the stream's rate, {0.5 / dt:g} Hz"
@@ -113,9 +117,10 @@ class StreamContactDetector:
         s, omega, alpha = np.split(values[:, 6:], 3, axis=1)
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
-        fast = causal_low_pass(np.hstack([contact, values[:, 6:]]), dt, cutoff_hz)
+        contact = causal_low_pass(contact, dt, cutoff_hz, ahead_s)
+        fast = causal_low_pass(values[:, 6:], dt, cutoff_hz)
         slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)
-        settled = np.hstack([fast, fast[:, 6:9] - slow_s])[transient:]
+        settled = np.hstack([contact, fast, fast[:, :3] - slow_s])[transient:]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
         covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)

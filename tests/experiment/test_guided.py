@@ -23,6 +23,7 @@ from drake_teleop.live.experiment.guided import (
 )
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import TrialStore
+from drake_teleop.live.inputs import Inputs
 from drake_teleop.live.session import read_drive
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.operator.task import Insert
@@ -105,6 +106,19 @@ def test_stimulus_and_measured_level_of_a_mass_agree(condition, shown):
     rows = IntervalLog(SCALED, None)
     assert made.interval_result(level, inputs, rows).level == pytest.approx(level)
     assert made.interval_result(0.0, inputs, rows).level == 0.0
+
+
+@pytest.mark.parametrize("own", [(1.0, None), (None, 0.3), (0.5, 2.0)])
+@pytest.mark.parametrize("sigma", [0.0, 0.4])
+def test_scale_of_the_condition_replaces_separate_scales_of_the_scenario(sigma, own):
+    weight, inertia = own
+    scenario = replace(
+        SCALED, force_scaling__sigma_weight=weight, force_scaling__sigma_inertia=inertia
+    )
+    made = make_apparatus(ApparentMass(), Condition(sigma=sigma), scenario, None)
+    inputs = Inputs.from_scenario(made.scenario).with_changes(made.stimulus_scales(0.0, 8.0))
+    assert inputs.force_scales["sigma_weight"] is None
+    assert inputs.force_scales["sigma_gripper"] == pytest.approx(sigma)
 
 
 def test_stimulus_and_measured_level_of_a_contact_agree():

@@ -10,6 +10,7 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.session import Session
+from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 N = 6  # joints
@@ -74,3 +75,25 @@ def test_forces_are_at_the_hands_scale_without_sensor_offset(scenario, rows):
     rows["load_estimate"] = np.tile([10.0, *np.zeros(15)], (n, 1))
     frame = PageValueCalculator(scenario).page_values(rows, Inputs(force_scale=50_000))
     assert frame["f"] == [[2.5, 6.5], [0.0, 5.0], [1.0, 2.0]] and frame["contact"]
+
+
+@pytest.mark.parametrize("p_SC", [[0.0, 0.0, 0.0], [0.1, -0.05, 0.2]])
+@pytest.mark.parametrize("joints", [[5], [3, 4, 5], range(N)])
+def test_work_on_a_contact_is_force_times_displacement_of_its_point(scenario, rows, joints, p_SC):
+    """A constant force at a point C of the tool; the joints rotate by up to 0.3 rad."""
+    arm, count, f_W = slave_arm(scenario), 400, np.array([3.0, -5.0, 8.0])
+    R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+    found = {name: np.repeat(values[:1], count, axis=0) for name, values in rows.items()}
+    found["t"], places = 1e-3 * np.arange(count), []
+    found["contact_wrench_S"] = np.zeros((count, 6))
+    for k in range(count):
+        for joint in joints:
+            found["slave_state"][k, joint] += 0.3 * k / count / (1 + joint % 2)
+        forward_kinematics(arm.table, found["slave_state"][k, :N], R_WS, p_WS)
+        places.append(p_WS + R_WS @ p_SC)
+        f_S = R_WS.T @ f_W
+        found["contact_wrench_S"][k] = *f_S, *np.cross(p_SC, f_S)
+    frame = PageValueCalculator(scenario).page_values(found, Inputs())
+    expected = f_W @ (places[-1] - places[0])
+    assert frame["energy"][1] == pytest.approx(expected, abs=2e-3 + 5e-3 * abs(expected))
+    assert frame["tool"] == pytest.approx(p_WS, abs=1e-5)

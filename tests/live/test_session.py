@@ -25,7 +25,7 @@ from drake_teleop.live.inputs import (
     csv_row,
     read_inputs,
 )
-from drake_teleop.live.record import BackgroundLog
+from drake_teleop.live.record import LOAD_FILE, BackgroundLog, SessionRecord
 from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
@@ -382,6 +382,20 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
         read_drive(tmp_path / "drive")
 
 
+@pytest.mark.parametrize("damage", [b"", b"PK", None])
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_drive_without_its_load_is_not_repeated(scenario, load, tmp_path, damage, sigma):
+    """The station with sigma = gamma = 1 would run without the load, with another log."""
+    scaled = replace(scenario, force_scaling__sigma=sigma, force_scaling__gamma=1.0)
+    SessionRecord(tmp_path, scaled, load, Inputs(), device=False).close(5, Inputs())
+    assert read_drive(tmp_path).load.estimate.tolist() == load.estimate.tolist()
+    (tmp_path / LOAD_FILE).unlink()
+    if damage is not None:
+        (tmp_path / LOAD_FILE).write_bytes(damage)
+    with pytest.raises(DrakeTeleopError, match=r"load\.npz: is not an identified load"):
+        read_drive(tmp_path)
+
+
 def test_incomplete_last_line_is_ignored(tmp_path):
     path = tmp_path / DRIVE_INPUTS_FILE_NAME
     path.write_text(
@@ -409,3 +423,21 @@ def test_weight_scale_is_separate_or_that_of_the_inertia_at_minus_one(scenario, 
     # 3.13 kg at rest, on the scale of the master
     scale = scenario.force_scaling.force_scale
     assert abs((felt[100] - felt[0]) / scale) == pytest.approx(3.13 * 9.81, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "scales",
+    [
+        {"force_scale": 2.0},
+        {"force_scale": 100.0, "sigma": 100.0, "gamma": 100.0},
+        {"sigma": 5.0, "gamma": 3.5},
+        {"sigma_weight": 4.0, "sigma_inertia": 0.0},
+    ],
+)
+def test_scales_of_a_scenario_beyond_the_page_are_recorded_and_read(scenario, tmp_path, scales):
+    own = {f"force_scaling__{name}": value for name, value in scales.items()}
+    inputs = Inputs.from_scenario(replace(scenario, **own))
+    path = tmp_path / DRIVE_INPUTS_FILE_NAME
+    path.write_text(HEADER + csv_row(0, inputs) + csv_row(5, inputs))
+    assert read_inputs(path, MADE_BY) == [(0, inputs), (5, inputs)]
+    assert inputs.with_changes({"gamma": 1e4}).gamma == 300

@@ -219,6 +219,24 @@ def test_failing_explanation_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPa
     assert messages and all("another load failed (singular)" in words for words in messages)
 
 
+@pytest.mark.parametrize("restart", [5.0, 5.7, 4.6, 0.0])
+def test_change_on_a_restarted_clock_is_reported_again(
+    monkeypatch: pytest.MonkeyPatch, restart: float
+) -> None:
+    """Each test finds the change that is 1 s after the start of the record."""
+    monkeypatch.setattr(
+        changes, "find_zero_and_load_changes", lambda rows, dt: [(float(rows[0, 0]) + 1.0, "tare")]
+    )
+    messages: list[str] = []
+    sought = ZeroAndLoadMonitor(0.01, live=False, report=messages.append)
+    for number, start in enumerate([5.0, restart], 1):
+        for k in range(1600):  # two tests each
+            reading = Reading(k, start + 0.01 * k, np.zeros(15))
+            sought.add_reading(reading, int(ReadingFlag.IN_CONTACT))
+        assert messages == ["tare"] * number
+    sought.close()
+
+
 def test_record_contains_the_last_20_s_after_a_clock_change() -> None:
     seen = []
     sought = ZeroAndLoadMonitor(DT, live=False, report=print)

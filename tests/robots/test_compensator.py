@@ -129,6 +129,28 @@ def test_separate_scales_need_gravity_in_the_readings() -> None:
         Compensator(replace(load(), weight_removed=True), DT, sigma_inertia=0.5)
 
 
+@pytest.mark.parametrize("different", [{"sigma_weight": 0.5}, {"sigma_inertia": 0.2, "sigma": 1.0}])
+def test_separate_scales_are_refused_once_the_gravity_is_unknown(different) -> None:
+    compensator, (first, second) = Compensator(load(), DT, sigma=0.3), readings(2)
+    compensator.set_scales(**different)  # nothing is known before the first reading
+    compensator.set_scales(0.3)
+    before = compensator.step(first, first.t).scaled
+    with pytest.raises(DrakeTeleopError, match="gravity in the sensor frame: is unknown"):
+        compensator.set_scales(**different)
+    assert before.any() and compensator.step(second, second.t).flags == 0
+    compensator.step(second._replace(t=second.t + DT, number=2, gravity=np.zeros(3)), 3 * DT)
+    compensator.set_scales(**different)
+
+
+@pytest.mark.parametrize(("cutoff_hz", "delay_readings"), [(None, 1), (250.0, 3), (400.0, 2)])
+def test_prediction_over_a_delay_needs_a_low_pass(cutoff_hz, delay_readings) -> None:
+    options = {"cutoff_hz": cutoff_hz, "delay_readings": delay_readings}
+    with pytest.raises(DrakeTeleopError, match="is not below 250 Hz, half the rate"):
+        Compensator(load(), DT, **options, predicted=True)
+    assert Compensator(load(), DT, **options).lag_s == delay_readings * DT
+    assert Compensator(load(), DT, cutoff_hz=cutoff_hz, predicted=True).lag_s == 0.0
+
+
 def bad_reading(reading: Reading, name: str) -> Reading:
     values = reading.values.copy()
     if name == "damaged":

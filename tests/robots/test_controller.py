@@ -227,6 +227,15 @@ def test_unusable_options_are_one_line(tmp_path, capsys, more, said):
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.parametrize("to", ["c99", "fmu"])
+@pytest.mark.parametrize("sign", ["-1", "1"])
+def test_sign_without_effect_is_refused(tmp_path, capsys, to, sign):
+    kernel.LOAD.save(tmp_path / "load.json")
+    arguments = ["export", str(tmp_path / "load.json"), "--to", to, "--out", str(tmp_path / "o")]
+    assert status([*arguments, "--rate", "500", "--sign", sign]) == 2
+    assert "--sign: has no effect here; remove it, and give the code" in capsys.readouterr().err
+
+
 def test_a_wrench_without_weight_is_refused(tmp_path, capsys):
     dataclasses.replace(kernel.LOAD, weight_removed=True).save(tmp_path / "load.json")
     assert status(["export", str(tmp_path / "load.json"), "--to", "c99", "--rate", "500"]) == 2

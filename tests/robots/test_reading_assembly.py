@@ -104,6 +104,22 @@ def test_motion_belongs_to_the_instant_of_the_wrench(lost) -> None:
     assert len(left) > 200 and np.abs(left).max() < 0.03  # of 17 N
 
 
+@pytest.mark.parametrize("rate_hz", [0.3, 1.0, 5.0, 100.0])
+def test_slow_wrenches_receive_their_motion(rate_hz: float) -> None:
+    streams = WrenchAndMotionStreams(StreamStub(WRENCH, POSE))
+    streams.dt = 1.0 / rate_hz
+    assembly, found = ReadingAssembler(streams, X_FS=X_FS), []
+    for k in range(1000):
+        t = 0.002 * k
+        pose = Reading(k, t, truth(t)[0], stream=POSE, arrival=t)
+        found += assembly.readings_completed_by(pose)
+        if k == 900:
+            found += assembly.readings_completed_by(wrench_at(t, k)._replace(arrival=t))
+    (reading,) = found
+    assert reading.flags == 0 and reading.t == 1.8
+    np.testing.assert_allclose(reading.values[6:9], truth(1.8)[1][:3], atol=0.01)
+
+
 def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
     """The removed weight has the same orientation, so that only mass times acceleration remains."""
     assembly = ReadingAssembler(

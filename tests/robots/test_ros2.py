@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,11 +20,12 @@ from typing import Any
 import numpy as np
 import pytest
 from peer import HASH
-from test_compensator import PHI, load
+from test_compensator import DT, PHI, load, readings
 from test_peers import LoopOutputs
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2 import MessageConverter
@@ -177,6 +179,79 @@ def test_missing_rclpy_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(DrakeTeleopError, match=r"rclpy, which is not installed.*\[ros2\]"):
         open_sink("ros2://contact")
+
+
+@ros
+@pytest.mark.parametrize("name", ["sigma_weight", "sigma_inertia"])
+@pytest.mark.parametrize("removed", [False, True])
+def test_scales_that_the_readings_do_not_support_are_refused(
+    tmp_path: Path, name: str, removed: bool
+) -> None:
+    """Gravity is unknown, or the weight is removed; the node continues with its load."""
+    from rclpy.parameter import Parameter
+
+    from drake_teleop.robots.ros2 import shared_node
+    from drake_teleop.robots.ros2_node import ServedCompensator
+
+    files = [tmp_path / "load.json", tmp_path / "weightless.json"]
+    load().save(files[0])
+    replace(load(), weight_removed=True).save(files[1])
+    scales = {"sigma": 0.5, "gamma": 1.0, "sigma_weight": -1.0, "sigma_inertia": -1.0}
+    node = shared_node(int(DOMAIN))
+    served = ServedCompensator(
+        node.node, lambda one: Compensator(one, DT), files[removed], lambda *_: [], tmp_path, scales
+    )
+    served.step(readings(1)[0], 0.0)
+    try:
+        (refused,) = node.node.set_parameters([Parameter(name, value=0.25)])
+        why = "the robot has removed the weight" if removed else "gravity in the sensor frame"
+        assert not refused.successful and why in refused.reason
+        (accepted,) = node.node.set_parameters([Parameter("sigma", value=0.25)])
+        assert accepted.successful and served._scales.tolist() == [0.25, 0.25, 1.0, 0.0]
+        if removed:
+            return
+        served.step(readings(2)[1]._replace(gravity=np.zeros(3)), DT)
+        names = (name, 0.75), ("load", str(files[1]))
+        done = node.node.set_parameters([Parameter(key, value=value) for key, value in names])
+        assert all(each.successful for each in done)
+        before = served._current
+        reload = served._make_service_callback(served._reload_compensator)
+        response = reload(None, SimpleNamespace())
+        assert not response.success and "the robot has removed the weight" in response.message
+        assert served._current is before
+    finally:
+        served.close()
+        node.close()
+
+
+@ros
+@pytest.mark.parametrize("earlier", [None, {"advice": "swing", "doubts": []}])
+@pytest.mark.parametrize("error", ["RuntimeError", "MemoryError"])
+def test_crashed_calibration_is_refused_and_the_node_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: dict[str, Any] | None, error: str
+) -> None:
+    from drake_teleop.robots import ros2_node
+    from drake_teleop.robots.ros2 import shared_node
+
+    monkeypatch.setattr(ros2_node, "_CALIBRATE_PYTHON_CODE", f"raise {error}('broken')")
+    if earlier is not None:
+        (tmp_path / "summary.json").write_text(json.dumps(earlier))
+    load().save(tmp_path / "load.json")
+    scales = {"sigma": 0.5, "gamma": 1.0, "sigma_weight": -1.0, "sigma_inertia": -1.0}
+    node = shared_node(int(DOMAIN))
+    served = ros2_node.ServedCompensator(
+        node.node, lambda one: Compensator(one, DT), tmp_path / "load.json",
+        lambda *_: [], tmp_path, scales,
+    )  # fmt: skip
+    answer = served._answer_calibration_request(None, SimpleNamespace())
+    task, deadline = node.node.executor.create_task(answer), time.monotonic() + 60.0
+    try:
+        while not task.done() and time.monotonic() < deadline:
+            node.spin(0.05)
+        assert task.result().message == f"refused: {error}: broken"
+    finally:
+        served.close()
+        node.close()
 
 
 NODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"

@@ -96,6 +96,19 @@ def test_wrench_is_zero_without_motion_for_50_ms(package):
     assert zero[150:300].all() and not zero[300:].any()
 
 
+@pytest.mark.parametrize("silent", [120, 700])
+def test_low_pass_restarts_after_a_silence_of_the_imu(package, silent):
+    """The wrench after the silence is independent of the one before."""
+    rows, first = inputs(1200), 200
+    with_imu = np.ones(len(rows), bool)
+    with_imu[first : first + silent] = False
+    other = rows.copy()
+    other[:first, 6:] += 20.0
+    after = slice(first + silent, None)
+    found, expected = (filtered(package, each, with_imu)[after] for each in (rows, other))
+    assert found.any(axis=1).all() and (found == expected).all()
+
+
 def test_tare_removes_a_shift_of_the_offsets(package):
     count = 1500
     rows = np.tile([0.0, 0.0, 9.81, *[0.0] * 9], (count, 1))
@@ -117,3 +130,12 @@ def test_package_names_the_library_and_its_dependencies(package):
     assert described["type"] in code and described["base_class_type"] in code
     depends = {x.text for x in ElementTree.parse(package / "package.xml").findall("depend")}
     assert f"DEPENDENCIES {' '.join(sorted(depends))})" in cmake
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_defaults_in_the_readme_are_floating_point_as_in_the_code(tmp_path, sign):
+    """ROS 2 refuses the integer 1 for a parameter of type double."""
+    export_controller(kernel.LOAD, "ros2_filter", tmp_path, rate_hz=RATE, sign=sign)
+    text = (tmp_path / "README.md").read_text()
+    assert "| 0.0, 1.0 |" in text and f"| {sign}.0 |" in text
+    assert f"WRENCH_COMPENSATOR_SIGN {sign}.0\n" in (tmp_path / "src" / "load.h").read_text()

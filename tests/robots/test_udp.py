@@ -429,6 +429,26 @@ def test_invalid_address_raises(address: str) -> None:
             open_sink(address)
 
 
+@pytest.mark.parametrize("query", ["sign=1", "wrench=scaled&domain=3", "x"])
+def test_parameters_without_effect_are_refused(query: str) -> None:
+    for open_address in (
+        lambda: open_source(f"udp://:0?{query}", load(), rate_hz=500.0),
+        lambda: open_sink(f"udp://127.0.0.1:9?{query}"),
+    ):
+        with pytest.raises(DrakeTeleopError, match=re.escape(f"{query!r}; remove ?{query}")):
+            open_address()
+    open_source("posed://:0?sign=1", load(), rate_hz=500.0).close()
+
+
+@pytest.mark.parametrize("delay", [0.02, -0.005, 1.0])
+def test_delay_of_a_source_with_its_own_motion_is_refused(delay: float) -> None:
+    with pytest.raises(DrakeTeleopError, match=r"already contains the motion .* remove --delay"):
+        open_source("udp://:0", load(), rate_hz=500.0, delay=delay)
+    for valid in ("auto", 0.0):
+        open_source("udp://:0", load(), rate_hz=500.0, delay=valid).close()
+    open_source("posed://:0", load(), rate_hz=500.0, delay=delay).close()
+
+
 def test_live_source_requires_a_rate() -> None:
     with pytest.raises(DrakeTeleopError, match="give --rate HZ"):
         open_source("udp://:0", load())

@@ -6,14 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Reading, ReadingFlag
 from drake_teleop.robots.watch import (
@@ -123,6 +126,66 @@ def test_noise_floor_rises_with_acceleration(tmp_path: Path) -> None:
     assert (flags[530:750] == ReadingFlag.IN_CONTACT).all()
     assert not flags[:500].any() and not flags[850:].any()
     assert max(abs(row.contact[0]) for row in out[1200:]) > 0.6
+
+
+@pytest.mark.parametrize(("cutoff_hz", "delay_readings"), [(30.0, 0), (20.0, 3)])
+def test_predicted_wrenches_are_compared_with_their_own_noise(
+    tmp_path: Path, cutoff_hz: float, delay_readings: int
+) -> None:
+    free, late = tmp_path / "free.parquet", {"delay_readings": delay_readings, "predicted": True}
+    t, before = readings(seed=5)
+    write_log(Log(t, *np.split(before, [6, 9, 12], axis=1)), free)
+    _, values = readings()
+    plain = Compensator(LOAD, DT, cutoff_hz=cutoff_hz, **late)
+    detector = StreamContactDetector(LOAD, free, DT, cutoff_hz, 0.0, plain.lag_s)
+    compensator = Compensator(LOAD, DT, cutoff_hz=cutoff_hz, detector=detector, **late)
+    steps = (Reading(k, float(t[k]), row) for k, row in enumerate(values))
+    assert not any(compensator.step(each, each.t).flags for each in steps)
+
+
+@pytest.mark.parametrize(("predicted", "delay"), [(False, 0.004), (True, -0.002), (True, "auto")])
+def test_command_gives_delay_and_prediction_to_the_detector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, predicted: bool, delay: float | str
+) -> None:
+    (t, values), log = readings(), tmp_path / "log.parquet"
+    write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), log)
+    LOAD.save(tmp_path / "load.json")
+    given = []
+
+    def detector(*arguments: object) -> None:
+        given.extend(arguments[3:])
+
+    monkeypatch.setattr("drake_teleop.robots.compensate.StreamContactDetector", detector)
+    loop = f"replay:{log}", tmp_path / "load.json", str(tmp_path / "out.csv")
+    run_compensate_command(*loop, free=log, predicted=predicted, delay=delay)
+    cutoff_hz, used_delay, ahead_s = given
+    delay_readings = max(0, round(delay / DT)) if delay != "auto" else 0
+    assert (cutoff_hz, used_delay) == (30.0, delay)
+    expected = delay_readings * DT + filter_lag(DT, 30.0) if predicted else 0.0
+    assert ahead_s == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_another_load_with_or_without_weight_is_refused(tmp_path: Path, removed: bool) -> None:
+    """The motion of the open source fits the load at the start."""
+    t, values = readings()
+    turn = {"q_w": np.cos(t), "q_x": np.sin(t), "q_y": 0 * t, "q_z": 0 * t}
+    write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "log.parquet")
+    columns = [pl.Series(name, column) for name, column in turn.items()]
+    table = pl.read_parquet(tmp_path / "log.parquet").with_columns(columns)
+    table.write_parquet(tmp_path / "log.parquet")
+    replace(LOAD, weight_removed=removed).save(tmp_path / "load.json")
+    refused = []
+
+    def attach(make):
+        with pytest.raises(DrakeTeleopError, match=r"has another .weight_removed. than") as error:
+            make(replace(LOAD, weight_removed=not removed))
+        refused.append(error)
+        return make(replace(LOAD, weight_removed=removed))
+
+    loop = f"replay:{tmp_path}/log.parquet", tmp_path / "load.json", str(tmp_path / "out.csv")
+    run_compensate_command(*loop, delay=0.0, attach=attach)
+    assert refused
 
 
 def test_noise_floor_requires_the_same_rate_and_a_low_pass(tmp_path: Path) -> None:

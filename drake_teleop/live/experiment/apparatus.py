@@ -85,7 +85,8 @@ def make_apparatus(
     task: design.Task, condition: design.Condition, scenario: Scenario, load: IdentifiedLoad | None
 ) -> Apparatus:
     setup = live_scenario(scenario)
-    changes: dict[str, object] = {}
+    # The condition's sigma scales weight and inertia.
+    changes: dict[str, object] = {f"force_scaling__sigma_{x}": None for x in ("weight", "inertia")}
     if condition.delay is not None:
         changes["channel"] = Channel(delay=condition.delay)
     elif condition.network != AS_IN_SCENARIO_NAME:

@@ -275,12 +275,7 @@ class ExperimentDrive(LiveDrive):
 
 
 def serve_experiment(
-    procedure: Procedure,
-    scenarios: list[Scenario],
-    *,
-    port: int,
-    browser: bool,
-    device: str | None,
+    procedure: Procedure, scenarios: list[Scenario], *, port: int, browser: bool, device: str | None
 ) -> None:
     live, who = ExperimentDrive(procedure, scenarios, port, device), procedure.participant
     if browser:

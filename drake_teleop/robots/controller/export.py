@@ -76,18 +76,14 @@ class ExportedCompensation(NamedTuple):
 
 
 def c99_files(target: ExportedCompensation) -> ExportedFiles:
+    rate, period = f"{1.0 / target.dt:g}", f"{target.dt:g}"
+    numbers = {"rate": rate, "period": period, "count": _NUM_TEST_READINGS}
     return {
         **kernel_files(target),
         "test_vector.h": _render_test_vector_header(target),
         "test_wrench_compensator.c": read_template("test_wrench_compensator.c"),
         "CMakeLists.txt": read_template("CMakeLists.txt"),
-        "README.md": render_template(
-            "README.c99.md",
-            rate=f"{1.0 / target.dt:g}",
-            period=f"{target.dt:g}",
-            notes=target.notes,
-            count=_NUM_TEST_READINGS,
-        ),
+        "README.md": render_template("README.c99.md", notes=target.notes, **numbers),
     }
 
 
@@ -158,7 +154,7 @@ def _c_literal(value: Any) -> str:
 
 
 def fmu_files(target: ExportedCompensation) -> ExportedFiles:
-    """Return FMUs for FMI 2 and 3, with sources, and Linux binaries if there is a C compiler."""
+    """Return FMUs for FMI 2 and 3, with sources, and Linux binaries if `cc` exists."""
     is_linux64 = platform.system() == "Linux" and platform.machine() == "x86_64"
     compiler = shutil.which("cc") if is_linux64 else None
     if compiler is None:
@@ -239,19 +235,14 @@ def _fmi_variables(target: ExportedCompensation) -> list[tuple[str, str, str, fl
 
 
 def ros2_filter_files(target: ExportedCompensation) -> ExportedFiles:
-    shipped = {
-        f"{_ROS2_FILTER_PACKAGE_NAME}.xml": f"{_ROS2_FILTER_PACKAGE_NAME}.xml",
-        "package.xml": "package.xml",
-        "CMakeLists.txt": "CMakeLists.txt",
-        f"src/{_ROS2_FILTER_PACKAGE_NAME}.cpp": f"{_ROS2_FILTER_PACKAGE_NAME}.cpp",
-    }
+    name, folder = _ROS2_FILTER_PACKAGE_NAME, _ROS2_FILTER_TEMPLATE_FOLDER
+    shipped = (f"{name}.xml", "package.xml", "CMakeLists.txt", f"src/{name}.cpp")
     kernel = dict(kernel_files(target))
     sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
-    folder = _ROS2_FILTER_TEMPLATE_FOLDER
     return {
-        **{name: read_template(f"{folder}/{file}") for name, file in shipped.items()},
+        **{file: read_template(f"{folder}/{Path(file).name}") for file in shipped},
         **{f"src/{name}": text for name, text in kernel.items()},
         "README.md": render_template(f"{folder}/README.md", **values),
     }

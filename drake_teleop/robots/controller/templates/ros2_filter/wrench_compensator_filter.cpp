@@ -38,8 +38,9 @@ public:
       motion_ = received_;
       new_motion_ = false;
       steps_without_motion_ = 0;
-    } else {
-      ++steps_without_motion_;
+    } else if (++steps_without_motion_ > compensator_.settings.stale_steps) {
+      motion_.fill(std::nan(""));  // invalid: zero wrench, and a restart of low-pass and tare
+      steps_without_motion_ = compensator_.settings.stale_steps;
     }
     if (tare_.exchange(false)) {
       wrench_compensator_tare(&compensator_);
@@ -49,11 +50,9 @@ public:
     const std::array<double, 6> wrench{sign_ * f.x, sign_ * f.y, sign_ * f.z,
       sign_ * tau.x, sign_ * tau.y, sign_ * tau.z};
     std::array<double, 6> contact{}, scaled{};
-    if (steps_without_motion_ <= compensator_.settings.stale_steps) {
-      wrench_compensator_step(
-        &compensator_, wrench.data(), motion_.data(), motion_.data() + 3, motion_.data() + 6,
-        nullptr, contact.data(), scaled.data());
-    }
+    wrench_compensator_step(
+      &compensator_, wrench.data(), motion_.data(), motion_.data() + 3, motion_.data() + 6,
+      nullptr, contact.data(), scaled.data());
     const auto & result = scaled_ ? scaled : contact;
     out.header = in.header;
     out.wrench.force.x = sign_ * result[0];
@@ -75,7 +74,7 @@ protected:
     scaled_ = parameter("scaled", false);
     sign_ = parameter("sign", WRENCH_COMPENSATOR_SIGN);
     wrench_compensator_init(&compensator_, &settings);
-    steps_without_motion_ = settings.stale_steps + 1;
+    steps_without_motion_ = settings.stale_steps;
     node_ = std::make_shared<rclcpp::Node>(filter_name_ + "_motion");
     subscription_ = node_->create_subscription<Imu>(
       parameter("imu_topic", std::string("imu")), rclcpp::SensorDataQoS(),
