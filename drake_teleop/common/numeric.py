@@ -198,3 +198,13 @@ def search_minimum(cost: Callable[[float], float], step: float, reach: float) ->
         return float(at[best]), False
     share = position_of_parabola_minimum(*costs[best - 1 : best + 2])
     return float(at[best]) + step * share, True
+
+
+def white_noise_deviations(x: Array) -> Array:
+    """Return standard deviations (k,) of white noise in smooth signals x (N, k); 0 for N < 4."""
+    if len(x) < 4:
+        return np.zeros(x.shape[1:])
+    # Third differences, whose factors 1, 3, 3, 1 have the square sum 20. The deviation of a normal
+    # x is median |x| / 0.6745. Column by column, to save memory.
+    medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
+    return np.array(medians) / 0.6745 / np.sqrt(20.0)

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
-from drake_teleop.common.numeric import Array, find_runs_of_true
+from drake_teleop.common.numeric import Array, find_runs_of_true, white_noise_deviations
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.explained_log import ask_about_correction
 from drake_teleop.logs.processing import check_log
-from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_num_episodes

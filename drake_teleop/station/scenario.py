@@ -131,6 +131,7 @@ class Scenario:
         return [*own, *self.environment]
 
     def without_environment(self) -> "Scenario":
+        """Return a copy of the scenario without objects to touch."""
         return replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property

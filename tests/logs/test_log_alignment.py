@@ -7,6 +7,7 @@ import pytest
 from known_motion import motion_at
 from scipy.signal import savgol_filter
 
+from drake_teleop.common.numeric import white_noise_deviations
 from drake_teleop.logs.read.alignment import (
     angular_motion,
     low_pass,
@@ -15,7 +16,6 @@ from drake_teleop.logs.read.alignment import (
     resample,
     smooth_derivatives,
     uniform_times,
-    white_noise_deviations,
 )
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.streams import Stream, resample_to_clock

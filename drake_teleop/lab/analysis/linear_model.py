@@ -82,7 +82,6 @@ class Linearization:
 
     @property
     def num_states(self) -> int:
-        """Number of states, delays included."""
         return len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
 
     def _state_matrix_with_delays(self) -> Any:

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from drake_teleop.common.numeric import Array, search_minimum
-from drake_teleop.logs.read.alignment import white_noise_deviations
+from drake_teleop.common.numeric import Array, search_minimum, white_noise_deviations
 
 MAX_NOISE_LAG = 4  # order of the autoregressive noise
 CONSTANT_COLUMN, SPECIFIC_FORCE_SIGNALS, GRAVITY_SIGNALS = 0, slice(1, 4), slice(4, 7)

@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, white_noise_deviations
 from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
 from drake_teleop.logs.causes.instants import ALPHA_SIGNALS, WRENCH_SIGNALS
 from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
 from drake_teleop.logs.causes.state import FittedModel, regularized_inverse
-from drake_teleop.logs.read.alignment import white_noise_deviations
 
 _NUM_JACKKNIFE_PARTS = 12
 _MAX_JACKKNIFE_OVER_FIT, _USUAL_JACKKNIFE_OVER_FIT = 1.5, 1.15

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, white_noise_deviations
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -33,7 +33,6 @@ from drake_teleop.logs.read.alignment import (
     low_pass_log,
     remove_delay,
     resample,
-    white_noise_deviations,
 )
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description

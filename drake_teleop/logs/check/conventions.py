@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread, white_noise_deviations
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import against_load, edits
@@ -26,7 +26,6 @@ from drake_teleop.logs.check.motion_checks import (
 )
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.read import table_files
-from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, white_noise_deviations
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
-from drake_teleop.logs.read.alignment import low_pass_log, white_noise_deviations
+from drake_teleop.logs.read.alignment import low_pass_log
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.17, 0.06

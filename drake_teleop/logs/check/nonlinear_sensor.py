@@ -1,4 +1,4 @@
-"""Test whether the sensor's error depends on its reading: dead band, curvature or hysteresis."""
+"""Test for a nonlinear sensor: dead band, curvature or hysteresis."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _fit(wrench: Array, *columns: Array) -> tuple[Array, float]:
     """Return the parameters of all columns (N, 6, p), and the squared residual."""
     A, b = np.concatenate(columns, axis=2).reshape(wrench.size, -1), wrench.ravel()
     theta = np.linalg.lstsq(A, b, rcond=1e-9)[0]
-    return theta, float(np.sum((b - A @ theta) ** 2))
+    return np.asarray(theta), float(np.sum((b - A @ theta) ** 2))
 
 
 def _play(x: Array) -> Array:

@@ -26,7 +26,6 @@ class Poses:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def with_continuous_quaternions(self) -> Poses:
-        """Return the poses with quaternions without sign jumps."""
         products = np.einsum("ki,ki->k", self.quaternion[1:], self.quaternion[:-1])
         if (products >= 0.0).all():
             return self

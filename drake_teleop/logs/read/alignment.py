@@ -157,16 +157,6 @@ def vectors_of_skew_parts(A: Array) -> Array:
     return 0.5 * np.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], axis=1)
 
 
-def white_noise_deviations(x: Array) -> Array:
-    """Return standard deviations (k,) of white noise in smooth signals x (N, k); 0 for N < 4."""
-    if len(x) < 4:
-        return np.zeros(x.shape[1:])
-    # Third differences, whose factors 1, 3, 3, 1 have the square sum 20. The deviation of a normal
-    # x is median |x| / 0.6745. Column by column, to save memory.
-    medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
-    return np.array(medians) / 0.6745 / np.sqrt(20.0)
-
-
 def low_pass_log(log: Log, cutoff_hz: float | None) -> Log:
     """Return the log with zero-phase filtered wrench and motion; unchanged for static poses."""
     if log.static:
