@@ -61,7 +61,6 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        """True if the mass is positive and `unexplained` below `GOOD_UNEXPLAINED` plus noise."""
         limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
         return self.mass > 0 and self.unexplained < limit
 

@@ -121,7 +121,6 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
 
 
 def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -> Edit:
-    """Return finding and description of an edit, with the sign of the wrench also inverted."""
     stream = "static" if description.static else "wrench"
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"

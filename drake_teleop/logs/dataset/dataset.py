@@ -315,8 +315,7 @@ def _verdict_on_episode(
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
     calm = residual - offsets
     spread, _ = episode_verdict.ln_half_width_and_centre_of_calm_half(calm, 0.1 * usual)
-    spread -= np.log(usual)
-    spread -= np.log(found.gains).repeat(3)
+    spread -= np.log(usual) + np.log(found.gains).repeat(3)
     if not faults and spread.mean() > _MAX_LN_RESIDUAL_WIDTH_OVER_USUAL:
         text = (
             "no single fault explains the wrench (possible causes: contact most of the time, or a"

@@ -96,8 +96,7 @@ def time_stamps_and_num_episodes(
     whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:
-        stamps = whole.numbers_with_nan(name, f"{where}.column")
-        if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
+        if not np.isfinite(whole.single_column(name, f"{where}.column")).any():
             whole.finite_numbers([name], 1, f"{where}.column")
     if time.unit != "s" and whole.columns[str(time.column)].dtype.kind in "mM":
         what = "the column holds dates or times of day, which have no unit"

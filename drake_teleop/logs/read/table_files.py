@@ -96,23 +96,21 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     source: Path | bytes = path
     if head.startswith(_UTF_16_BYTE_ORDER_MARKS):
         source = path.read_text("utf-16").encode()
-        head = source[:_INSPECTED_HEAD_BYTES]
     elif b"\0" not in head and not _is_utf_8(head):  # no binary file
         source = path.read_bytes().decode("cp1252", "replace").encode()
-        head = source[:_INSPECTED_HEAD_BYTES]
+    head = head if isinstance(source, Path) else source[:_INSPECTED_HEAD_BYTES]
     if (text := _normalize_line_ends_and_decimal_commas(path, source, head)) is not None:
         source, head = text, text[:_INSPECTED_HEAD_BYTES]
     lines = re.split("\r?\n", head.decode("utf-8", "replace").lstrip("\ufeff"))
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     before = next(table, 0)
-    names_line, first, units = _find_table_below_text(lines, before) or (before, before + 1, [])
-    cut = first - names_line - 1  # lines between the header and the numbers
+    before, first, units = _find_table_below_text(lines, before) or (before, before + 1, [])
+    cut = first - before - 1  # lines between the header and the numbers
     if cut > 0:
         text = path.read_bytes() if isinstance(source, Path) else source
         pieces = text.split(b"\n", first)
-        source = b"\n".join([*pieces[: names_line + 1], pieces[-1]])
-        del lines[names_line + 1 : first]
-    before = names_line
+        source = b"\n".join([*pieces[: before + 1], pieces[-1]])
+        del lines[before + 1 : first]
     rest = lines[before:]
     separator = find_separator(rest[0]) if rest else ","
     if separator == " " and any(line != " ".join(line.split()) for line in rest):
