@@ -228,7 +228,7 @@ def _inspect_stream_and_list_bad_rows(
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
     if time is not None:
-        more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, len(values), figures)
+        more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, columns, figures)
         findings += more
         if len(usable) != len(good):
             what = f"has {len(good)} rows, but {len(usable)} times"
@@ -305,13 +305,14 @@ def _repeated_rows_findings(
 
 
 def _inspect_clock_and_flag_usable_rows(
-    at: str, time: Any, table: Table, num_rows: int, figures: dict[str, Any]
+    at: str, time: Any, table: Table, columns: Sequence[str], figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
+    stamps, episodes = time_stamps_and_num_episodes(time, table, columns, at)
     if time.column is None:
-        t = time_stamps_and_num_episodes(time, table, at)[0]
-        figures |= {"rate_hz": time.rate, "duration_s": float(np.ptp(t)) if num_rows else 0.0}
-        return [], np.ones(num_rows, bool)
-    stamps, figures["episodes"] = time_stamps_and_num_episodes(time, table, at)
+        duration = float(np.ptp(stamps)) if len(stamps) else 0.0
+        figures |= {"rate_hz": time.rate / time.scale, "duration_s": duration}
+        return [], np.ones(len(stamps), bool)
+    figures["episodes"] = episodes
     before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps[:-1]]))
     usable = np.isfinite(stamps) & (stamps > before)
     t = stamps[np.isfinite(stamps)]

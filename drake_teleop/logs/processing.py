@@ -219,7 +219,8 @@ def identify_log(
     if accepted is not None and accepted.is_misfit and not causes:
         # Errors of the motion with this share of its variance reduce the load by this share.
         load_errors = np.hypot(load_errors, unexplained * natural_scales(result.phi)[6:])
-    result = explained_log.add_errors_of_load(result, load_errors)
+    if result.mass > 0.0:  # a negative mass is reported below
+        result = explained_log.add_errors_of_load(result, load_errors)
     findings = errors or causes
     if not findings and not raw.estimated:
         known_delay = None if fitted.delay_source == "undetermined" else fitted.delay_s

@@ -19,7 +19,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
-from drake_teleop.logs.dataset.dataset_files import open_dataset
+from drake_teleop.logs.dataset.dataset_files import (
+    ContactColumns,
+    open_dataset,
+    write_dataset_copy,
+)
 from drake_teleop.logs.dataset.episode_faults import list_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
@@ -351,3 +355,101 @@ def test_invalid_description_is_an_error_with_its_field(
     options: dict[str, Any] = {"identify": True, "quiet": True, "description": tmp_path / "d.yaml"}
     with pytest.raises(DrakeTeleopError, match=words):
         dataset_command(tmp_path / "demo", tmp_path / "out", **options)
+
+
+def new_columns(rows: int, unusable: int = 0) -> ContactColumns:
+    wrench = np.arange(6.0 * rows).reshape(rows, 6) + 0.25
+    wrench[:unusable] = np.nan
+    return ContactColumns(wrench, np.arange(rows) > rows // 2)
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")]
+)
+@pytest.mark.parametrize("names", [("t", "Fx"), ("t [s]", "Fx [N]"), ("time of row", "F in x")])
+@pytest.mark.parametrize("suffix", ["csv", "tsv"])
+def test_new_columns_of_text_have_its_separator_and_decimal_sign(
+    tmp_path: Path, separator: str, decimal: str, names: tuple[str, str], suffix: str
+) -> None:
+    (tmp_path / "demo").mkdir()
+    rows = [separator.join([str(k), f"{k}.5".replace(".", decimal)]) for k in range(5)]
+    path = tmp_path / "demo" / f"0.{suffix}"
+    path.write_text("\n".join([separator.join(names), *rows, ""]))
+    write_dataset_copy(open_dataset(path.parent), tmp_path / "copy", [new_columns(5)])
+    new = pl.read_csv(
+        tmp_path / "copy" / f"0.{suffix}", separator=separator, decimal_comma=decimal == ","
+    )
+    assert new.columns[:2] == list(names) and new.width == 9
+    np.testing.assert_allclose(new.to_numpy()[:, 2:8], new_columns(5).contact_wrench)
+    np.testing.assert_allclose(new.to_numpy()[:, 1], np.arange(5) + 0.5)
+
+
+@pytest.mark.parametrize("unusable", [0, 1, 180, 300, 360])
+def test_statistics_leave_out_frames_without_a_contact_wrench(
+    tmp_path: Path, unusable: int
+) -> None:
+    write_sample_dataset(tmp_path / "demo", episodes=2)
+    whole = new_columns(360, unusable)
+    columns = [ContactColumns(*(x[part] for x in whole)) for part in np.split(np.arange(360), 2)]
+    write_dataset_copy(open_dataset(tmp_path / "demo"), tmp_path / "copy", columns)
+    text = (tmp_path / "copy" / "meta" / "stats.json").read_text()
+    assert "NaN" not in text
+    stats = json.loads(text)
+    assert stats["observation.in_contact"]["count"] == [360]
+    if unusable == 360:
+        assert "observation.contact_wrench" not in stats
+        return
+    found, used = stats["observation.contact_wrench"], whole.contact_wrench[unusable:]
+    assert found["count"] == [360 - unusable]
+    np.testing.assert_allclose(found["mean"], used.mean(axis=0))
+    np.testing.assert_allclose(found["min"], used.min(axis=0))
+
+
+@pytest.mark.filterwarnings("ignore:.*onsolidated metadata:UserWarning")
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("consolidated", [False, True])
+def test_zarr_of_both_versions_lists_the_new_arrays(
+    tmp_path: Path, version: Any, consolidated: bool
+) -> None:
+    zarr = pytest.importorskip("zarr")
+    path = tmp_path / "demo.zarr"
+    root = zarr.open_group(path, mode="w", zarr_format=version)
+    root.create_array("data/force", data=np.zeros((9, 3)))
+    root.create_array("meta/episode_ends", data=np.array([5, 9]))
+    if consolidated:
+        zarr.consolidate_metadata(path, zarr_format=version)
+    before = files_of(path)
+    columns = [new_columns(5), new_columns(4)]
+    write_dataset_copy(open_dataset(path), tmp_path / "copy.zarr", columns)
+    assert files_of(path) == before
+    copied = zarr.open_group(tmp_path / "copy.zarr", mode="r")
+    np.testing.assert_array_equal(copied["data/contact_wrench"][5:], columns[1].contact_wrench)
+    assert copied["data/in_contact"].shape == (9,)
+
+
+@pytest.mark.parametrize("others", [2, 60, 400])
+def test_new_columns_have_the_length_of_the_wrench(tmp_path: Path, others: int) -> None:
+    """Other arrays of the group, such as initial states, may be shorter or longer."""
+    h5py = pytest.importorskip("h5py")
+    path, x = tmp_path / "demo.hdf5", sample_episode(0)
+    with h5py.File(path, "w") as file:
+        file.create_group("data").attrs["env_args"] = '{"env_kwargs": {"control_freq": 30}}'
+        file["data/demo_0/initial_state"] = np.zeros(others)
+        for name, values in arrays(x).items():
+            file[f"data/demo_0/obs/{name}"] = values
+    dataset = open_dataset(path)
+    streams = json.loads(described(tmp_path, "obs.").read_text())
+    log, at = command._read_log_and_row_times(dataset, streams, dataset.episodes[0])
+    assert len(at) == len(x.t) and at[-1] == pytest.approx(log.t[-1])
+
+
+@pytest.mark.parametrize(("fps", "is_kept"), [(30.0, True), (31.0, False), (10.0, False)])
+def test_results_at_another_rate_are_not_continued(
+    tmp_path: Path, fps: float, is_kept: bool
+) -> None:
+    write_sample_dataset(tmp_path / "demo", episodes=1)
+    dataset = open_dataset(tmp_path / "demo")._replace(fps=30.0)
+    work = command._open_work_folder(tmp_path / "out", dataset, [])
+    (work / "0.json").write_text("{}")
+    command._open_work_folder(tmp_path / "out", dataset._replace(fps=fps), [])
+    assert (work / "0.json").exists() == is_kept

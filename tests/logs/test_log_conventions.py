@@ -12,19 +12,25 @@ import planted
 import polars as pl
 import pytest
 import yaml
+from known_motion import motion_at
 from planted import NTNU_FRAME, findings, good, ntnu_log, written
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import conventions
-from drake_teleop.logs.check.edits import LogTables
+from drake_teleop.logs.check.against_load import (
+    _log_with_edited_wrench,
+    clock_drift_finding_and_correction,
+)
+from drake_teleop.logs.check.edits import LogTables, edit_field
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table
 
 Tables = dict[str, pl.DataFrame]
@@ -351,3 +357,57 @@ def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
         assert conventions.findings_if_load_is_suspicious(log, load, predicted, 0.0, check) == (
             reason,
         )
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("drift", [2e-3, -3e-3])
+def test_offset_of_a_drifting_pose_is_that_at_its_first_row(
+    tmp_path: Path, start: float, drift: float
+) -> None:
+    t = np.arange(0.0, 24.0, 4e-3)
+    at = motion_at(t)
+    wrench = non_contact_wrench(at.specific_force, at.omega, at.alpha, planted.PHI)
+    rows = t >= start
+    columns = {
+        "t": t,
+        "force": wrench[:, :3] + 0.05 * np.random.default_rng(1).normal(size=(len(t), 3)),
+        "torque": wrench[:, 3:],
+        "s": at.specific_force,
+        "omega": at.omega,
+        "R": at.R_WS[rows],
+        "p": at.p_WS[rows],
+        "pose_t": t[rows] + 0.02 + drift * t[rows],
+    }
+    path = written(tmp_path, columns, imu=False)
+    description = load_description(path)
+    data = LogTables(description, str(path), {})
+    (finding,), edited = clock_drift_finding_and_correction(description, data)
+    time, stamps = edited.pose.time, columns["pose_t"]
+    corrected = stamps[0] + time.scale * (stamps - stamps[0]) + time.offset
+    np.testing.assert_allclose(corrected, t[rows], atol=1e-3)
+    assert f"pose.time.offset: {time.offset:.3f}" in finding.message
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (0.5, -2.0, 1.0)])
+@pytest.mark.parametrize("order", [(2, 1, 0), (1, 2, 0), (0, 2, 1)])
+@pytest.mark.parametrize("weight", [None, (0.5, 0.0, 0.01, 0.02)])
+def test_edited_wrench_is_that_of_the_edited_description(
+    tmp_path: Path, factors: tuple[float, ...], order: tuple[int, ...], weight: Any
+) -> None:
+    path = written(tmp_path, good(), imu=False)
+    description = load_description(path)
+    for field in ("force", "torque"):
+        description = edit_field(description, f"wrench.{field}.scale", factors)
+    given = edit_field(description, "wrench.weight", weight)
+    assert given.wrench is not None
+    edited = edit_field(given, "wrench.sign", -1)
+    for field in ("force", "torque"):
+        names = getattr(given.wrench, field).columns
+        edited = edit_field(edited, f"wrench.{field}.columns", tuple(names[k] for k in order))
+    data = LogTables(given, str(path), {})
+    found = _log_with_edited_wrench(data.read_thinned_log(given), given, edited)
+    if weight is not None:
+        assert found is None  # which the caller replaces by reading
+        return
+    assert found is not None
+    np.testing.assert_allclose(found.wrench, data.read_thinned_log(edited).wrench, atol=1e-9)

@@ -446,3 +446,40 @@ def test_reading_in_a_forked_process_raises_error(tmp_path: Path) -> None:
             timeout=60,
         )
         assert says in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("is_pose_first", [False, True])
+@pytest.mark.parametrize("first_pose_row", [0, 1, 3])
+def test_rows_that_end_in_empty_cells_keep_the_header(
+    tmp_path: Path, separator: str, is_pose_first: bool, first_pose_row: int
+) -> None:
+    """Two streams share a table; most rows lack the cells of one of them."""
+    order = slice(None, None, -1 if is_pose_first else 1)
+
+    def line(first: str, *groups: list[str]) -> list[str]:
+        return [first, *(cell for group in groups[order] for cell in group)]
+
+    names = line("t", ["fx", "fy", "fz", "tx", "ty", "tz"], ["qw", "qx", "qy", "qz"])
+    lines = [
+        line(f"{row * 0.002:.3f}", [""] * 6, ["0.5"] * 4)
+        if row % 5 == first_pose_row
+        else line(f"{row * 0.002:.3f}", ["1.5"] * 6, [""] * 4)
+        for row in range(40)
+    ]
+    text = "\n".join(separator.join(cells) for cells in [names, *lines])
+    table = read_table(write(tmp_path / "x.csv", text))
+    assert list(table.columns) == names
+    np.testing.assert_allclose(table.single_column("t", ""), 0.002 * np.arange(40))
+
+
+@pytest.mark.parametrize("rows", [50, 150, 2500])
+@pytest.mark.parametrize(("early", "late"), [("0", "0.5"), ("[0, 1]", "[0.5, 1]")])
+def test_json_lines_begin_with_integers_or_without_a_field(
+    tmp_path: Path, rows: int, early: str, late: str
+) -> None:
+    lines = [f'{{"t": {k}, "f": {early}}}' for k in range(rows)]
+    lines += [f'{{"t": {rows}, "f": {late}, "g": 2}}']
+    table = read_table(write(tmp_path / "x.jsonl", "\n".join(lines)))
+    assert table.numbers_with_nan("f", "")[-1, 0] == 0.5
+    assert np.isnan(table.single_column("g", "")[:-1]).all()

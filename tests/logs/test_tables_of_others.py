@@ -24,10 +24,11 @@ from drake_teleop.logs.check.edits import (
 )
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read.clocks import join_episodes
-from drake_teleop.logs.read.description import load_description
+from drake_teleop.logs.read.clocks import join_episodes, read_clock
+from drake_teleop.logs.read.description import Time, load_description
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.tables import Table
 
 FORCE, TORQUE = ["f0", "f1", "f2"], ["m0", "m1", "m2"]
 TUM_POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
@@ -591,3 +592,102 @@ def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
             eliminate_log(path, load, untouched_s=span)
     with pytest.raises(DrakeTeleopError, match="remove one of the two"):
         eliminate_log(path, load, untouched_s=(0.2, 0.9), tare=False)
+
+
+@pytest.mark.parametrize("stride", [2, 4, 8])
+def test_arrays_of_different_length_in_a_file_have_rates(tmp_path: Path, stride: int) -> None:
+    columns = table().drop("t").to_dict(as_series=False)
+    arrays = {
+        name: np.array(x)[:: 1 if name in (*FORCE, *TORQUE) else stride]
+        for name, x in columns.items()
+    }
+    np.savez(tmp_path / "table.npz", **arrays)
+    changes: dict[str, Any] = {"wrench__time": {"rate": 500}, "pose__time": {"rate": 500 / stride}}
+    changes |= {f"{name}__file": "table.npz" for name in ("wrench", "pose")}
+    path = described(tmp_path, table(), **changes)
+    assert read_log(path).t[-1] == pytest.approx(4.0, abs=0.02)
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    assert [each["duration_s"] for each in summary["streams"].values()] == pytest.approx(
+        [4.0, 4.0], abs=0.02
+    )
+    assert summary["findings"] == []
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("us", 100.0), ("us", 1e3), ("ms", 0.01), ("s", 2e-3)])
+def test_times_in_ticks_are_inspected_and_read(tmp_path: Path, unit: str, scale: float) -> None:
+    """The pose begins later than the wrench, in a table of both."""
+    tick_s = scale * {"s": 1.0, "ms": 1e-3, "us": 1e-6}[unit]
+    wrench = table().select("t", *FORCE, *TORQUE)
+    pose = table().select("t", *POSITION, *QUATERNION).gather_every(4, 200)
+    both = pl.concat([wrench, pose], how="diagonal").sort("t")
+    both = both.with_columns(pl.col("t") / tick_s)
+    time = {"column": "t", "unit": unit, "scale": scale}
+    path = described(tmp_path, both, wrench__time=time, pose__time=time)
+    assert read_log(path).t[[0, -1]] == pytest.approx([0.4, 3.992], abs=1e-6)
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    assert summary["findings"] == []
+    assert summary["streams"]["wrench"]["rate_hz"] == pytest.approx(500.0)
+    assert summary["streams"]["pose"]["duration_s"] == pytest.approx(3.592)
+    assert abs(summary["delay_s"]) < 2e-4
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("s", 0.01), ("ms", 10.0), ("us", 100.0)])
+def test_episodes_in_ticks_are_a_second_apart(unit: str, scale: float) -> None:
+    tick_s = scale * {"s": 1.0, "ms": 1e-3, "us": 1e-6}[unit]
+    ticks = np.tile(np.round(0.01 * np.arange(40) / tick_s), 2)
+    time = Time.model_validate({"column": "t", "unit": unit, "scale": scale})
+    clock = read_clock(time, Table(Path("x.csv"), {"t": ticks, "x": ticks}), ["x"], "here")
+    assert clock.num_episodes == 2
+    assert np.diff(clock.t).max() == pytest.approx(1.0)
+
+
+def test_a_scaled_rate_is_checked() -> None:
+    time = Time.model_validate({"column": "t", "unit": "ms", "scale": 500.0})
+    t = np.arange(40.0) * 2.0
+    with pytest.raises(DrakeTeleopError, match="the median step of the time stamps is 1 s"):
+        read_clock(time, Table(Path("x.csv"), {"t": t, "x": t}), ["x"], "here")
+
+
+@pytest.mark.parametrize("column", ["f1", "m0", "m2"])
+@pytest.mark.parametrize("decimated", [1, 4])
+def test_dead_channel_beside_rows_of_another_stream_is_named(
+    tmp_path: Path, column: str, decimated: int
+) -> None:
+    wrench = table().select("t", *FORCE, *TORQUE).with_columns(pl.lit(5.0).alias(column))
+    pose = table().select("t", *POSITION, *QUATERNION).gather_every(decimated)
+    both = pl.concat([wrench, pose.with_columns(pl.col("t") + 3e-4)], how="diagonal")
+    path = described(tmp_path, both.sort("t"))
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    messages = {each["name"]: each["message"] for each in summary["findings"]}
+    assert messages["dead channel"].startswith(f"'{column}' is 5 in all rows")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("step", "unit"), [(2e-3, "s"), (2.0, "ms"), (2e3, "us"), (2e6, "ns")])
+@pytest.mark.parametrize("stride", [2, 3])
+def test_unit_of_time_is_drafted_beside_empty_cells(
+    tmp_path: Path, step: float, unit: str, stride: int
+) -> None:
+    """Rows with a wrench alternate with those of other streams."""
+    rows = np.arange(120)
+    filled = rows % stride == 0
+    names = ["ft.time", *(f"ft.force.{x}" for x in "xyz"), *(f"ft.torque.{x}" for x in "xyz")]
+    columns = {name: np.where(filled, np.cos(rows), np.nan) for name in names}
+    columns["ft.time"] = np.where(filled, rows * step / stride, np.nan)
+    draft = draft_description(Table(tmp_path / "x.csv", columns), tmp_path)
+    assert draft.streams["wrench"]["time"] == {"column": "ft.time", "unit": unit}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("row", [0, 3, 11])
+@pytest.mark.parametrize("sensor", ["gravity", "specific_force"])
+def test_pose_at_rest_without_gravity_is_no_crash(tmp_path: Path, row: int, sensor: str) -> None:
+    g = 9.81 * Rotation.random(12, random_state=3).as_matrix()[:, 2]
+    g[row] = 0.0
+    columns = dict(zip("abcdefghi", np.hstack([g, 2.0 * g + 1.0, 0.1 * g]).T, strict=True))
+    pl.DataFrame(columns).write_csv(tmp_path / "x.csv")
+    groups = {sensor: "abc", "force": "def", "torque": "ghi"}
+    static = {name: {"columns": list(letters)} for name, letters in groups.items()}
+    (tmp_path / "x.yaml").write_text(yaml.safe_dump({"static": {"file": "x.csv", **static}}))
+    summary = inspect_command(tmp_path / "x.yaml", tmp_path / "out", quiet=True)
+    assert "unusable" not in [finding["name"] for finding in summary["findings"]]

@@ -60,7 +60,6 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        """True if the mass is positive and `unexplained` below `GOOD_UNEXPLAINED` plus noise."""
         limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
         return self.mass > 0 and self.unexplained < limit
 
@@ -249,21 +248,20 @@ def _is_delay_significant(log: Log, delay: float | None) -> bool:
 
 def _log_with_edited_wrench(log: Log, old: Description, new: Description) -> Log | None:
     a, b = old.wrench, new.wrench
-    if a is None or b is None or "base" in (a.frame, b.frame):
+    if a is None or b is None or "base" in (a.frame, b.frame) or isinstance(a.weight, tuple):
         return None
     changes = {"sign": a.sign, "frame": a.frame, "force": a.force, "torque": a.torque}
     if new.model_copy(update={"wrench": b.model_copy(update=changes)}) != old:
         return None
     R_old, R_new = (np.array(w.frame) if w.frame != "sensor" else np.eye(3) for w in (a, b))
     parts = []
-    for x, force, new_columns in (
-        (log.wrench[:, :3], a.force.columns, b.force.columns),
-        (log.wrench[:, 3:], a.torque.columns, b.torque.columns),
-    ):
-        if set(force) != set(new_columns) or len(force) != 3:
+    pairs = (log.wrench[:, :3], a.force, b.force), (log.wrench[:, 3:], a.torque, b.torque)
+    for x, given, other in pairs:
+        if set(given.columns) != set(other.columns) or len(given.columns) != 3:
             return None
-        given = x @ R_old  # in the axes of the file
-        parts.append(given[:, [force.index(column) for column in new_columns]] @ R_new.T)
+        values = x @ R_old / given.scale  # in the axes of the file
+        values = values[:, [given.columns.index(column) for column in other.columns]]
+        parts.append((values * other.scale) @ R_new.T)
     return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
@@ -380,7 +378,7 @@ def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     uneven = np.std(delays - late - slope * t) > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
     if change < _MIN_DELAY_DRIFT_S or uneven or abs(slope) > 0.2:
         return None
-    return float(late + slope * log.t[0]), float(slope)
+    return float(late), float(slope)
 
 
 def _unexplained_share_after_delay_removal(log: Log) -> float:

@@ -197,7 +197,8 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
         remedy = "record 12 poses, rotated about two horizontal axes"
         text = f"{len(log)} poses at rest are too few to check the fit; {remedy}"
         return [Finding("static poses", text)]
-    up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
+    size = np.linalg.norm(log.specific_force, axis=1, keepdims=True)
+    up = log.specific_force / np.maximum(size, 1e-9)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
     if least >= _MIN_GRAVITY_DIRECTION_STD:
         return []
@@ -220,6 +221,9 @@ def _dead_or_repeated_channel_findings(
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}
+    if described is None:
+        return found
+    table = tables[described.source].rows_with_any_number(described.columns)
     for field in _WRENCH_FIELDS if stream == "wrench" else _IMU_FIELDS:
         quantity = getattr(described, field, None)
         if quantity is None:
@@ -230,7 +234,7 @@ def _dead_or_repeated_channel_findings(
             continue
         numbers: dict[str, Array] = {}
         for column in quantity.columns:
-            x = tables[described.source].numbers_with_nan(column, where).T
+            x = table.numbers_with_nan(column, where).T
             parts = [f"{column}[{i}]" for i in range(len(x))] if len(x) > 1 else [str(column)]
             numbers |= zip(parts, x, strict=True)
         remedy = f"name another column in {where}.columns, or record again"

@@ -423,7 +423,8 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
     if unit not in _ALLOWED_UNITS["time"]:
-        step = float(np.nanmedian(np.abs(np.diff(table.single_column(named[0], named[0])))))
+        times = table.single_column(named[0], named[0])
+        step = float(np.median(np.abs(np.diff(times[np.isfinite(times)]))))
         units = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6)
         unit = next((unit for unit, scale in units if step * scale <= 0.3), "ns")
     return {"column": named[0], "unit": unit}

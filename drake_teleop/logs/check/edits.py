@@ -121,7 +121,6 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
 
 
 def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -> Edit:
-    """Return finding and description of an edit, with the sign of the wrench also inverted."""
     stream = "static" if description.static else "wrench"
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
@@ -181,7 +180,7 @@ class LogTables:
     """Tables of a log in memory, complete and thinned to about 100 Hz."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
-        self._source, self.tables = source, tables
+        self._description, self._source, self.tables = description, source, tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
         for stream in description.streams.values():
@@ -202,8 +201,10 @@ class LogTables:
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
-                column = {"column": f"{_THINNED_TIME_COLUMN_PREFIX} {name}", "unit": "s"}
-                time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
+                column = f"{_THINNED_TIME_COLUMN_PREFIX} {name}"
+                scale = time.scale / getattr(self._description, name).time.scale  # of the thinned
+                changes = {"column": column, "unit": "s", "scale": scale}
+                time = time.model_copy(update=changes | {"nanoseconds": None, "rate": None})
                 stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
         return read_described_log(description, self._source, tables=self._thinned)
@@ -244,7 +245,8 @@ class LogTables:
         return self.tables[stream.source].rows_with_any_number(stream.columns)
 
     def _finite_times_and_row_indices(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
-        t, _ = time_stamps_and_num_episodes(stream.time, self._table_of_stream(stream), "time")
+        table, columns = self._table_of_stream(stream), stream.columns
+        t, _ = time_stamps_and_num_episodes(stream.time, table, columns, "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
         steps = np.diff(t)

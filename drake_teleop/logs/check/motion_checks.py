@@ -176,7 +176,7 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
     assert imu.specific_force is not None
     measured_gravity = ratio * gravity
     remedy = f"divide the columns of imu.specific_force by {ratio:.4f}, or calibrate them"
-    if imu.specific_force.unit != "g" and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
+    if imu.specific_force.unit not in ("g", "mg") and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
         remedy = f"set gravity: {measured_gravity:.4g}"
     return Finding(
         "gravity",

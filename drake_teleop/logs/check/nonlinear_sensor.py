@@ -13,6 +13,7 @@ from drake_teleop.logs.read.canonical import Log
 _MAX_COMPARED_SAMPLES, _COMPARED_RATE_HZ = 2000, 50.0
 _DEAD_BAND_OVER_LARGEST_WRENCH, _PLAY_OVER_RANGE = 0.05, 0.01
 _LEAST_EXPLAINED_SHARE, _CERTAIN_EXPLAINED_SHARE, _LEAST_RELATIVE_ERROR = 0.12, 0.3, 0.01
+_LARGEST_UNEXPLAINED_SHARE = 0.02
 _MESSAGES = {
     "dead band": "the sensor shows too little near zero (dead band); turn that off",
     "curvature": "the gain of the sensor depends on the wrench; calibrate the sensor",
@@ -53,11 +54,13 @@ def error_of_load_by_nonlinear_sensor(
         shares[name] = 1.0 - _fit(measured, load_columns, gains, *own)[1] / residual
         errors[name] = _fit(measured, load_columns, *own)[0][6:16] - plain[6:16]
     name = max(shares, key=lambda x: shares[x])
-    if not shares[name] > _LEAST_EXPLAINED_SHARE:
+    total = float(np.sum((measured - measured.mean(axis=0)) ** 2))
+    left = (1.0 - shares[name]) * residual
+    small = shares[name] < _LEAST_EXPLAINED_SHARE
+    if small or left > _LARGEST_UNEXPLAINED_SHARE * total or load.mass <= 0.0:
         return np.zeros(10), None
     scales = natural_scales(load.phi)[6:]
     if name == "hysteresis":  # its part in phase with the wrench, which no fit shows, is as large
-        total = float(np.sum((measured - measured.mean(axis=0)) ** 2))
         errors[name] = np.sqrt(shares[name] * residual / total) * scales
     worst = float(np.max(np.abs(errors[name]) / scales, initial=0.0, where=np.arange(10) < 4))
     if shares[name] < _CERTAIN_EXPLAINED_SHARE or worst < _LEAST_RELATIVE_ERROR:

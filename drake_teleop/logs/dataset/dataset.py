@@ -38,6 +38,7 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description, validation_error
 from drake_teleop.logs.read.reading import read_described_log
+from drake_teleop.logs.read.tables import Table
 from drake_teleop.logs.summaries import summarize_load
 
 # Episodes that determine load, lag and noise: fewer if they are long.
@@ -222,14 +223,18 @@ def _read_log_and_row_times(
     timed = table.rows_with_any_number(described.wrench.columns)
     clock = read_clock(described.wrench.time, timed, described.wrench.columns, source)
     rows = clock.kept_rows if timed.kept_rows is None else timed.kept_rows[clock.kept_rows]
-    at = np.interp(np.arange(table.rows), rows, clock.t - clock.t[0])
-    return log, at
+    return log, np.interp(np.arange(_num_frames(table, streams)), rows, clock.t - clock.t[0])
+
+
+def _num_frames(table: Table, streams: dict[str, Any]) -> int:
+    column = str(streams["wrench"]["force"]["columns"][0])
+    return len(table.columns[column]) if column in table.columns else table.rows
 
 
 def _open_work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
     paths = sorted({episode.file for episode in dataset.episodes})
     states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in paths]
-    key = hashlib.sha256(repr((settings, states)).encode()).hexdigest()
+    key = hashlib.sha256(repr((settings, dataset.fps, states)).encode()).hexdigest()
     work = out / _WORK_FOLDER_NAME
     if work.is_dir() and (work / "key").is_file() and (work / "key").read_text() != key:
         shutil.rmtree(work)
@@ -280,7 +285,7 @@ def _write_verdict_of_episode(task: DatasetAndLoad, work: Path, number: int) -> 
         with one_blas_thread():
             row, columns = _verdict_on_episode(task, episode)
     except DrakeTeleopError as error:
-        rows = task.dataset.read_episode(episode).rows
+        rows = _num_frames(task.dataset.read_episode(episode), task.streams)
         columns = ContactColumns(np.full((rows, 6), np.nan), np.zeros(rows, bool))
         row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
     with replace_file_on_success(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
@@ -310,8 +315,7 @@ def _verdict_on_episode(
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
     calm = residual - offsets
     spread, _ = episode_verdict.ln_half_width_and_centre_of_calm_half(calm, 0.1 * usual)
-    spread -= np.log(usual)
-    spread -= np.log(found.gains).repeat(3)
+    spread -= np.log(usual) + np.log(found.gains).repeat(3)
     if not faults and spread.mean() > _MAX_LN_RESIDUAL_WIDTH_OVER_USUAL:
         text = (
             "no single fault explains the wrench (possible causes: contact most of the time, or a"

@@ -219,15 +219,15 @@ def _write_csv_copy(path: Path, target: Path, new: ContactColumns) -> None:
     if len(rows) != len(frame) or len(frame) != len(new.in_contact) or not is_header:
         what = "columns can only be added to a file with a header and one line for each row"
         raise DrakeTeleopError(what, where=str(path), remedy="convert it to Parquet")
-    separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
+    texts = [line.decode("utf-8", "replace") for line in lines]
+    separator = table_files.find_separator(texts[head])
+    decimal = "," if table_files.has_decimal_commas(texts[first - 1 :], separator) else "."
     names = [f"{CONTACT_WRENCH_COLUMN}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT_COLUMN]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
-    numbers = [[f"{x:.6g}" for x in row] for row in cells]
-    texts = {head: names} | dict(zip(rows, numbers, strict=True))
-    for k, values in texts.items():
+    numbers = [[f"{x:.6g}".replace(".", decimal) for x in row] for row in cells]
+    for k, values in [(head, names), *zip(rows, numbers, strict=True)]:
         text = lines[k].rstrip(b"\r\n")
-        added = separator + separator.join(value.encode() for value in values)
-        lines[k] = text + added + lines[k][len(text) :]
+        lines[k] = text + separator.join(["", *values]).encode() + lines[k][len(text) :]
     with replace_file_on_success(target) as temporary:
         temporary.write_bytes(b"".join(lines))
 
@@ -257,8 +257,10 @@ def _add_columns_to_zarr(out: Path, columns: Sequence[ContactColumns]) -> None:
     group, new = zarr.open_group(out / "data", mode="r+"), _concatenate_contact_columns(columns)
     for name, values in _arrays_of_columns(new):
         group.create_array(name, data=values, overwrite=True)
-    if (out / ".zmetadata").is_file():
-        zarr.consolidate_metadata(out, zarr_format=2)
+    if any((out / name).is_file() for name in (".zmetadata", "zarr.json")):
+        root = zarr.open_group(out, mode="r").metadata
+        if root.consolidated_metadata is not None:
+            zarr.consolidate_metadata(out, zarr_format=root.zarr_format)
 
 
 def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[ContactColumns]) -> None:
@@ -275,6 +277,9 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[Contac
     with_quantiles = any("q50" in x for x in stats.values())
     for name, values in zip((CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN), new, strict=True):
         x = values.astype(float).reshape(len(values), -1)
+        x = x[np.isfinite(x).all(axis=1)]
+        if not len(x):
+            continue
         parts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
         if with_quantiles:
             parts |= {key: np.quantile(x, q, axis=0) for key, q in _LEROBOT_QUANTILES.items()}

@@ -48,10 +48,10 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 
     A row that repeats the time stamp and the values in `columns` of the previous row is removed.
     """
-    t, episodes = time_stamps_and_num_episodes(time, table, where)
+    t, episodes = time_stamps_and_num_episodes(time, table, columns, where)
     total, rows, notes = len(t), np.flatnonzero(np.isfinite(t)), []
     if time.column is None:
-        return Clock(_apply_clock_scale_and_offset(t, time), rows, total)
+        return Clock(t + time.offset, rows, total)
     if len(rows) < total:
         notes.append(f"{total - len(rows)} rows without a time stamp are removed")
     _check_stamps_go_forward(t[rows], rows, table, where)
@@ -77,41 +77,46 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         )
         t = even
     _check_sampling(t, rows, time, table, where)
-    return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
+    return Clock(t + time.offset, rows, total, tuple(notes), episodes)
 
 
-def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
-    """Return the times (N,) of a table's rows [s], NaN if absent, and the number of episodes.
+def time_stamps_and_num_episodes(
+    time: Time, table: Table, columns: Sequence[str | int], where: str
+) -> tuple[Array, int]:
+    """Return the scaled times (N,) of a table's rows [s], NaN if absent, and number of episodes.
 
-    Episodes are joined in the whole table, so that all its streams keep one clock. With
+    Whole tables are scaled and joined, so that all their streams keep one clock. With
     `time.rate`, rows without numbers of the stream are gaps, unless other streams fill them.
     """
     if time.column is None:
         assert time.rate is not None
-        rows = _row_numbers_excluding_other_streams(table)
+        rows = _row_numbers_excluding_other_streams(table, columns)
         spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
-        return rows / spacing / time.rate, 1
+        return rows * (time.scale / spacing / time.rate), 1
     whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:
-        stamps = whole.numbers_with_nan(name, f"{where}.column")
-        if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
+        if not np.isfinite(whole.single_column(name, f"{where}.column")).any():
             whole.finite_numbers([name], 1, f"{where}.column")
     if time.unit != "s" and whole.columns[str(time.column)].dtype.kind in "mM":
         what = "the column holds dates or times of day, which have no unit"
         raise DrakeTeleopError(what, where=f"{where}.unit", remedy="leave `unit` out")
-    columns = whole.numbers_with_nan_side_by_side(names, f"{where}.column")
-    t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
+    stamps = whole.numbers_with_nan_side_by_side(names, f"{where}.column")
+    t = stamps[:, 0] * SI_VALUE_OF_UNIT[time.unit]
     if time.nanoseconds is not None:
-        t = t + columns[:, 1] * SI_VALUE_OF_UNIT["ns"]
-    t, episodes = join_episodes(t)
+        t = t + stamps[:, 1] * SI_VALUE_OF_UNIT["ns"]
+    start = t[np.argmax(np.isfinite(t))]
+    t, episodes = join_episodes(start + time.scale * (t - start))
     return (t if table.kept_rows is None else t[table.kept_rows]), episodes
 
 
-def _row_numbers_excluding_other_streams(table: Table) -> NDArray[np.intp]:
+def _row_numbers_excluding_other_streams(
+    table: Table, columns: Sequence[str | int]
+) -> NDArray[np.intp]:
     whole, kept = table.whole_table, table.kept_rows
-    if whole is None or kept is None:
-        return np.arange(table.rows)
+    if whole is None or kept is None:  # arrays of other streams may have other lengths
+        lengths = (len(table.columns[x]) for x in map(str, columns) if x in table.columns)
+        return np.arange(next(lengths, table.rows))
     only_others = np.zeros(whole.rows, bool)
     for column in whole.columns.values():
         if len(column) == whole.rows and column.dtype.kind == "f":
@@ -145,10 +150,6 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     result = t.copy()
     result[finite] = joined
     return result, len(back) + 1
-
-
-def _apply_clock_scale_and_offset(t: Array, time: Time) -> Array:
-    return t[:1] + time.scale * (t - t[:1]) + time.offset
 
 
 def smooth_duplicate_stamps(t: Array) -> Array:

@@ -269,8 +269,9 @@ class Description(StrictModel):
 
     @model_validator(mode="after")
     def _check_stream_combination(self) -> Description:
-        if np.abs(self.gravity_W).max() > _MAX_GRAVITY_M_S2:
-            raise ValueError(f"gravity exceeds {_MAX_GRAVITY_M_S2:g} m/s^2: give it in m/s^2")
+        if not 0.0 < (largest := np.abs(self.gravity_W).max()) <= _MAX_GRAVITY_M_S2:
+            rule = f"more than 0, at most {_MAX_GRAVITY_M_S2:g} m/s^2"
+            raise ValueError(f"the largest component of gravity is {largest:g} ({rule})")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
             raise ValueError("gravity: auto requires a pose and no IMU: add pose, or remove imu")
         if self.static is not None:

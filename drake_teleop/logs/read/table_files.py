@@ -12,7 +12,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -96,25 +96,23 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     source: Path | bytes = path
     if head.startswith(_UTF_16_BYTE_ORDER_MARKS):
         source = path.read_text("utf-16").encode()
-        head = source[:_INSPECTED_HEAD_BYTES]
     elif b"\0" not in head and not _is_utf_8(head):  # no binary file
         source = path.read_bytes().decode("cp1252", "replace").encode()
-        head = source[:_INSPECTED_HEAD_BYTES]
+    head = head if isinstance(source, Path) else source[:_INSPECTED_HEAD_BYTES]
     if (text := _normalize_line_ends_and_decimal_commas(path, source, head)) is not None:
         source, head = text, text[:_INSPECTED_HEAD_BYTES]
     lines = re.split("\r?\n", head.decode("utf-8", "replace").lstrip("\ufeff"))
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     before = next(table, 0)
-    names_line, first, units = _find_table_below_text(lines, before) or (before, before + 1, [])
-    cut = first - names_line - 1  # lines between the header and the numbers
+    before, first, units = _find_table_below_text(lines, before) or (before, before + 1, [])
+    cut = first - before - 1  # lines between the header and the numbers
     if cut > 0:
         text = path.read_bytes() if isinstance(source, Path) else source
         pieces = text.split(b"\n", first)
-        source = b"\n".join([*pieces[: names_line + 1], pieces[-1]])
-        del lines[names_line + 1 : first]
-    before = names_line
+        source = b"\n".join([*pieces[: before + 1], pieces[-1]])
+        del lines[before + 1 : first]
     rest = lines[before:]
-    separator = _find_separator(rest[0]) if rest else ","
+    separator = find_separator(rest[0]) if rest else ","
     if separator == " " and any(line != " ".join(line.split()) for line in rest):
         text = path.read_bytes() if isinstance(source, Path) else source
         aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
@@ -122,13 +120,12 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         rest = [" ".join(line.split()) for line in rest]
     names = _header_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
-    cells = (cell for line in rest for cell in line.split(separator))
     parse = partial(
         pl.read_csv,
         source,
         has_header=header,
         separator=separator,
-        decimal_comma=separator in ";\t" and any(map(_DECIMAL_COMMA_CELL_PATTERN.fullmatch, cells)),
+        decimal_comma=has_decimal_commas(rest, separator),
         skip_lines=before,
         try_parse_dates=True,
     )
@@ -199,16 +196,16 @@ def _find_table_below_text(lines: list[str], start: int) -> tuple[int, int, list
 
 
 def _split_cells(line: str) -> list[str]:
-    separator = _find_separator(line)
-    cells = line.split() if separator == " " else line.rstrip().split(separator)
-    cells = [cell.strip(' "') for cell in cells]
-    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells or [""]
+    separator = find_separator(line)
+    cells = line.split() if separator == " " else line.split(separator)
+    return [cell.strip(' "') for cell in cells]
 
 
 def _is_data_row(cells: list[str]) -> bool:
     numbers = sum(map(_is_decimal_number, cells))
     others = [cell for cell in cells if cell and not _is_decimal_number(cell)]
-    if len(cells) < 2 or not numbers:
+    # A single number beside empty cells can be text above the table.
+    if not numbers or numbers + len(others) < (1 if len(cells) == 2 else 2):
         return False
     return all(map(_TIME_CELL_PATTERN.fullmatch, others)) or numbers >= max(3, len(cells) / 2)
 
@@ -219,11 +216,16 @@ def _is_row_of_units(cells: list[str]) -> bool:
     return len(cells) > 1 and 2 * len(known) >= len(filled) > 0
 
 
-def _find_separator(line: str) -> str:
+def find_separator(line: str) -> str:
     bare = _QUOTED_TEXT_PATTERN.sub("", line).strip()
     if ";" in bare or "\t" in bare:
         return ";" if ";" in bare else "\t"
     return " " if "," not in bare and " " in bare else ","
+
+
+def has_decimal_commas(lines: Sequence[str], separator: str) -> bool:
+    cells = (cell for line in lines for cell in line.split(separator))
+    return separator in ";\t" and any(map(_DECIMAL_COMMA_CELL_PATTERN.fullmatch, cells))
 
 
 def _header_in_comment(comments: list[str], rows: list[str], separator: str) -> list[str] | None:
@@ -265,7 +267,8 @@ def _read_with_polars(path: Path) -> dict[str, NDArray] | ColumnsOnAccess:
         check_parquet_sizes(path)
         frame = pl.scan_parquet(path)
     else:
-        read = pl.read_ipc if kind in (".arrow", ".feather") else pl.read_ndjson
+        from_json = partial(pl.read_ndjson, infer_schema_length=None)
+        read = pl.read_ipc if kind in (".arrow", ".feather") else from_json
         frame = read(path.read_bytes()).lazy()
     columns = _column_expressions(frame)
     rows = frame.select(pl.len()).collect().item()
