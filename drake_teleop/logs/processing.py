@@ -216,7 +216,7 @@ def identify_log(
     log = replace(fitted.log, notes=(*fitted.log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
-    if accepted is not None and accepted.is_misfit and not causes:
+    if not raw.static and not causes and (why is None or why.is_misfit):
         # Errors of the motion with this share of its variance reduce the load by this share.
         load_errors = np.hypot(load_errors, unexplained * natural_scales(result.phi)[6:])
     if result.mass > 0.0:  # a negative mass is reported below

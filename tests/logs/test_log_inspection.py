@@ -109,9 +109,9 @@ def test_repeated_rows_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rows_per_stamp", [1, 2, 5])
 def test_rate_counts_rows_that_share_a_time_stamp(rows_per_stamp: int) -> None:
     t, figures = 10.0 + 0.01 * np.repeat(np.arange(50.0), rows_per_stamp), dict[str, Any]()
-    time = SimpleNamespace(column="t", unit="s", nanoseconds=None)
+    time = SimpleNamespace(column="t", unit="s", nanoseconds=None, scale=1.0)
     table = Table(Path("log.csv"), {"t": t})
-    _inspect_clock_and_flag_usable_rows("log", time, table, len(t), figures)
+    _inspect_clock_and_flag_usable_rows("log", time, table, ["t"], figures)
     assert figures["rate_hz"] == pytest.approx(100.0 * rows_per_stamp)
 
 
@@ -119,9 +119,9 @@ def test_rate_counts_rows_that_share_a_time_stamp(rows_per_stamp: int) -> None:
 def test_row_after_an_empty_time_stamp_is_usable(empty: list[int], rows: int) -> None:
     t = np.arange(6.0)
     t[empty] = np.nan
-    time = SimpleNamespace(column="t", unit="s", nanoseconds=None)
+    time = SimpleNamespace(column="t", unit="s", nanoseconds=None, scale=1.0)
     table = Table(Path("log.csv"), {"t": t})
-    usable = _inspect_clock_and_flag_usable_rows("log", time, table, 6, {})[1]
+    usable = _inspect_clock_and_flag_usable_rows("log", time, table, ["t"], {})[1]
     assert usable.sum() == rows and not usable[empty].any()
 
 
