@@ -92,7 +92,7 @@ def time_stamps_and_num_episodes(
         assert time.rate is not None
         rows = _row_numbers_excluding_other_streams(table, columns)
         spacing = np.median(np.diff(rows)) if len(rows) > 1 else 1.0
-        return rows * (time.scale / spacing / time.rate), 1
+        return np.asarray(rows * (time.scale / spacing / time.rate), dtype=float), 1
     whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:
