@@ -19,7 +19,6 @@ left      slave and hand differ by at most 5 mm, 2 s and two round trips after t
 from __future__ import annotations
 
 import argparse
-import copy
 import dataclasses
 import json
 import math
@@ -119,7 +118,7 @@ def draw(seed: int, index: int) -> Drawn:
     action, sigma, gamma = choose(ACTIONS), choose((0.0, 0.5, 1.0)), 1.0 + 2.0 * rng.random()
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
-    master = Master(model=device, figures=copy.deepcopy(FIGURES.get(device)))
+    master = Master(model=device, figures=FIGURES.get(device))
     peak = master.device(0.0, 0.0).parameters.peak_force
     force = min(force, PEAK_SHARE * peak, scale * ARMS[arm][4], scale * stiffness * MAX_DEPTH)
     grips = [name for name, hand in GRIP_IMPEDANCES.items() if force / hand.stiffness < 0.04]
@@ -265,7 +264,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         base,
         simulation=dataclasses.replace(base.simulation, settle=SETTLE, duration=times.end),
         operator=OperatorConfig(grip=drawn.grip, intent=moves),
-        master=Master(model=drawn.device, figures=copy.deepcopy(FIGURES.get(drawn.device))),
+        master=Master(model=drawn.device, figures=FIGURES.get(drawn.device)),
         channel=channel,
         environment=[thing],
         force_scaling__sigma=drawn.sigma,

@@ -143,6 +143,8 @@ class _Station:
         Return the time [s] for which the clutch stays open: 0 without a new channel.
         """
         excluded = {"channel"} if new_channel else set()
+        if replaced.scenario.wrist_sensor.ideal and not self.scenario.wrist_sensor.ideal:
+            excluded.add("wrist_sensor")  # an ideal one keeps the old filters of its predecessor
         if not self.scenario.load_estimator.enabled:
             excluded.add("load_estimator")  # its configured load differs
         copy_station_state(replaced.station, replaced.context, self.station, self.context, excluded)

@@ -93,7 +93,7 @@ def write_replay(
     replay lasts at least 6 s, with a factor of at most 100.
 
     Raises:
-        DrakeTeleopError: if slave_state, measured_wrench_S or load_estimate is missing.
+        DrakeTeleopError: for a log without a required signal, or of another arm or device.
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):

@@ -111,7 +111,7 @@ def test_tool_of_a_slot_has_a_body_named_tool(tmp_path, names):
     if "tool" in names:
         assert len(AddSlavePlant(DiagramBuilder(), slave, Slot()).contact.compiled_pairs) == 7
         return
-    with pytest.raises(DrakeTeleopError, match="tool: a slot requires one body named tool"):
+    with pytest.raises(DrakeTeleopError, match=r"tool: a slot .* named tool, found 0; give"):
         AddSlavePlant(DiagramBuilder(), slave, Slot())
 
 

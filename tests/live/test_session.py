@@ -28,6 +28,7 @@ from drake_teleop.live.inputs import (
 from drake_teleop.live.record import LOAD_FILE, BackgroundLog, SessionRecord
 from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
+from drake_teleop.load.regressor import sample_size
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
@@ -227,6 +228,19 @@ def test_new_grip_object_and_sensor_continue_the_state(scenario, load):
         assert np.abs(np.diff(log["slave_state"][k - 1 : k + 5, :6], axis=0)).max() < 1e-3
     mass = log["load_estimate"][:, 6]
     assert mass[ends[1] + 1] - mass[ends[1]] == pytest.approx(0.8)
+
+
+@pytest.mark.slow
+def test_filters_of_a_sensor_restart_after_an_ideal_one(scenario, load):
+    """The memory of a sensor before the ideal one belongs to an old motion."""
+    session = Session(scenario, load)
+    for sensor in (2, 1, 2):
+        session.apply_inputs(session.inputs.with_changes({"sensor": sensor}))
+        session.advance(30)
+    _, context = session._station.block_and_context("wrist_sensor")
+    chain_start = 2 * sample_size(slave_arm(scenario).num_joints)
+    count = context.get_discrete_state_vector().value()[chain_start]
+    assert count == pytest.approx(0.03 * scenario.rates.sensor_hz, abs=20)
 
 
 @pytest.mark.slow

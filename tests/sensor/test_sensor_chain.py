@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import re
 import runpy
@@ -490,7 +489,7 @@ def test_invalid_sensor_is_rejected(changes, message):
 
 def loaded(text):
     data = yaml_load(data=text)
-    preset = copy.deepcopy(PRESETS.get(data.get("preset"), WristSensorConfig()))
+    preset = PRESETS.get(data.get("preset"), WristSensorConfig())
     config = settings_without_range_check(WristSensorConfig, data, "sensor", preset)
     check_all_field_values(config, "sensor")
     return config

@@ -84,9 +84,19 @@ def test_invalid_sets_are_refused(arguments, where):
 
 @pytest.mark.parametrize("network", [None, "ideal"])
 def test_scenario_without_network_is_refused_before_the_runs(tmp_path, network):
-    with pytest.raises(DrakeTeleopError, match=r"^network: .* neither .*; choose among lan, wan"):
+    with pytest.raises(DrakeTeleopError, match=r"^network: .* no network.*; choose among lan, wan"):
         tune("press", tmp_path / "out", network=network)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "passivity", [PassivityConfig(force_limit=20.0), PassivityConfig(method="ledger")]
+)
+def test_ideal_network_is_refused_for_each_passivity(passivity):
+    """Runs with the candidate method "none" would have no energy balance."""
+    scenario = replace(LoadScenario("contact_transition"), passivity=passivity)
+    with pytest.raises(DrakeTeleopError, match=r"^network: the scenario has no network"):
+        without_task_and_method(scenario, "ideal")
 
 
 def test_slave_that_does_not_translate_is_refused():

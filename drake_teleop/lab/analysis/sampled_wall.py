@@ -40,8 +40,8 @@ def stable_stiffness(
     """
     device = mass, damping, hand_stiffness
     push = _sampled_device_responses_to_unit_x_v_f(*device, period)[..., 2]
-    # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     B = finite_array("wall_damping", wall_damping, *np.shape(wall_damping))
+    # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     high = 5 / push[..., 0] + np.abs(B) / period
     low = np.zeros_like(high)
     for _ in range(_NUM_STIFFNESS_BISECTIONS):

@@ -110,6 +110,7 @@ def task_direction(
 
 
 def check_can_press(scenario: Scenario) -> None:
+    """Raise DrakeTeleopError if the scale of the translation is 0."""
     if scenario.kinematic_scaling.translation_scale == 0.0:
         what, remedy = "is 0, so that the slave cannot press", "choose a scale above 0"
         raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)

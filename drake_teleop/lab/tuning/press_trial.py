@@ -132,9 +132,9 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
     if network is not None:
         _check_names_are_known("network", [network], tuple(PRESETS))
         scenario = replace(scenario, channel=Channel(network=network))
-    if scenario.has_no_network_or_passivity:
-        what = "the scenario has neither network nor passivity method"
-        what += ", which the energy balances of the runs need"
+    scenario = replace(scenario, passivity=PassivityConfig())
+    if scenario.has_no_network_or_passivity:  # the method "none" is among the candidates
+        what = "the scenario has no network, which the energy balances of the runs need"
         remedy = f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}"
         raise DrakeTeleopError(what, where="network", remedy=remedy)
     check_can_press(scenario)
@@ -143,7 +143,6 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
     return replace(
         scenario.without_environment(),
         simulation=simulation,
-        passivity=PassivityConfig(),
         force_scaling=ForceScalingConfig(sigma=0.0, force_scale=force_scale),
         contact_detection=None,
         operator__intent=[],

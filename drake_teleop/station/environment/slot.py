@@ -88,11 +88,9 @@ class Slot(Environment):
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():
             return
-        if plant.NumBodiesWithName("tool") != 1:
-            what, remedy = (
-                "a slot requires one body named tool",
-                "give one link of the tool this name",
-            )
+        if (count := plant.NumBodiesWithName("tool")) != 1:
+            what = f"a slot requires one body named tool, found {count}"
+            remedy = "give this name to one link of the tool, and to no link of the arm"
             raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
         tool = plant.GetBodyByName("tool")
         above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])

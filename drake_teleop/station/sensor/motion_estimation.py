@@ -184,6 +184,7 @@ def _accelerometer_std(sensor: WristSensorConfig) -> tuple[Array, Array]:
 def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[Records, Array]:
+    """Return constants and initial memory of `estimate_sample_into`."""
     *paths, sample = path_delays(config, sensor, period)
     used = np.array([True, config.source != "encoders", True])
     waits = np.where(used, sample - np.array(paths), 0.0) / period

@@ -108,7 +108,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
-        """Return pairs of overlapping bodies with their signed distance [m] (minus the depth)."""
+        """Return pairs that overlap, not by design, and their distance [m] (minus the depth)."""
         body, found = self.plant.get_body, self._overlap_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
         return [(body(first), body(second), found[first, second]) for first, second in pairs]

@@ -208,10 +208,8 @@ def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
-        # Drake omits motors without effort.
-        if not text or (
-            name == "effort" and parse_number(text) == 0 and not model.purpose.is_scene
-        ):
+        is_motor = name == "effort" and not model.purpose.is_scene
+        if not text or (is_motor and parse_number(text) == 0):  # Drake omits motors of effort 0
             limit.attrib.pop(name, None)
             for inner in limit.findall(name):
                 limit.remove(inner)
