@@ -366,7 +366,7 @@ def read_drive(folder: str | Path) -> RecordedDrive:
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     is_required = not scenario.load_estimator.enabled or (folder / LOAD_FILE).exists()
     if not known or (load is None and is_required):
-        what = "is not an identified load (16 finite parameters)"
+        what = "is not an identified load (16 finite parameters), or is missing"
         remedy = "record the session again"
         raise DrakeTeleopError(what, where=str(folder / LOAD_FILE), remedy=remedy)
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])

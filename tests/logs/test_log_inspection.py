@@ -125,6 +125,13 @@ def test_row_after_an_empty_time_stamp_is_usable(empty: list[int], rows: int) ->
     assert usable.sum() == rows and not usable[empty].any()
 
 
+def test_channel_without_any_number_is_no_crash(tmp_path: Path) -> None:
+    columns = good()
+    columns["force"][:, 0] = np.nan
+    found = findings(tmp_path, columns)
+    assert "2000 rows contain NaN" in found["nan"] and "0 samples in" in found["unusable"]
+
+
 def test_a_wrong_clock_is_named_to_the_millisecond(tmp_path: Path) -> None:
     columns = good()
     columns["wrench_t"] = columns["t"] + 0.507

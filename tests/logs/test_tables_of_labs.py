@@ -70,6 +70,28 @@ def test_table_below_text_is_read(
     assert float(row.split(separator)[0].replace(",", ".")) == pytest.approx(numbers[4, 0])
 
 
+@pytest.mark.parametrize("separator", [";", ",", "\t"])
+@pytest.mark.parametrize("preamble", PREAMBLES)
+def test_header_below_text_can_end_in_a_separator(
+    tmp_path: Path, preamble: str, separator: str
+) -> None:
+    names = separator.join(NAMES)
+    text = lab_table(preamble, "none", separator, np.random.default_rng(3).normal(size=(40, 7)))
+    (tmp_path / "x.csv").write_text(text.replace(names, names + separator))
+    assert [name for name in read_table(tmp_path / "x.csv").columns if name] == NAMES
+
+
+@pytest.mark.parametrize("blank", ["", "\t" * 6, " \t "])
+def test_blank_line_below_the_header_is_skipped(tmp_path: Path, blank: str) -> None:
+    numbers = np.round(np.random.default_rng(3).normal(size=(40, 7)), 6)
+    lines = lab_table("fields", "none", "\t", numbers).splitlines()
+    lines.insert(len(PREAMBLES["fields"]) + 1, blank)
+    (tmp_path / "x.csv").write_text("\n".join(lines))
+    table = read_table(tmp_path / "x.csv")
+    assert list(table.columns) == NAMES
+    np.testing.assert_allclose(table.finite_numbers(NAMES, 7, "here"), numbers, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["Kraft x [°]", "Beschl. [m/s²]", "Zeit [µs]"])
 def test_names_in_the_windows_code_page_are_read(tmp_path: Path, name: str) -> None:
     (tmp_path / "x.csv").write_bytes(f"{name};b\n1,5;2\n2,5;3\n".encode("cp1252"))

@@ -105,7 +105,7 @@ def time_stamps_and_num_episodes(
     t = stamps[:, 0] * SI_VALUE_OF_UNIT[time.unit]
     if time.nanoseconds is not None:
         t = t + stamps[:, 1] * SI_VALUE_OF_UNIT["ns"]
-    start = t[np.argmax(np.isfinite(t))]
+    start = next(iter(t[np.isfinite(t)]), 0.0)
     t, episodes = join_episodes(start + time.scale * (t - start))
     return (t if table.kept_rows is None else t[table.kept_rows]), episodes
 

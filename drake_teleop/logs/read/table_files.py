@@ -185,8 +185,9 @@ def _find_table_below_text(lines: list[str], start: int) -> tuple[int, int, list
     width, above = len(rows[first]), range(first - 1, start - 1, -1)
     if first <= start + 1 or any(len(rows[k]) == width and _is_data_row(rows[k]) for k in above):
         return None
-    names = [k for k in above if len(rows[k]) == width and not _is_row_of_units(rows[k])]
-    whole = [k for k in names if len(set(rows[k])) == width]
+    wide = (k for k in above if width in (len(rows[k]), len(rows[k]) - (not rows[k][-1])))
+    names = [k for k in wide if not _is_row_of_units(rows[k])]
+    whole = [k for k in names if len(set(rows[k])) == len(rows[k])]
     header = (whole or names or [first])[0]
     between = [rows[k] for k in above if k > header and rows[k] != [""]]
     if not all(map(_is_row_of_units, between)):
@@ -197,8 +198,7 @@ def _find_table_below_text(lines: list[str], start: int) -> tuple[int, int, list
 
 def _split_cells(line: str) -> list[str]:
     separator = find_separator(line)
-    cells = line.split() if separator == " " else line.split(separator)
-    return [cell.strip(' "') for cell in cells]
+    return [x.strip(' \t"') for x in line.split(None if separator == " " else separator)]
 
 
 def _is_data_row(cells: list[str]) -> bool:
