@@ -218,7 +218,9 @@ def identify_log(
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     if not raw.static and not causes and (why is None or why.is_misfit):
         # Errors of the motion with this share of its variance reduce the load by this share.
-        load_errors = np.hypot(load_errors, unexplained * natural_scales(result.phi)[6:])
+        kept = ~fitted.fit.rejected
+        share = against_load.unexplained_share(log.wrench[kept], (log.wrench - predicted)[kept])
+        load_errors = np.hypot(load_errors, share * natural_scales(result.phi)[6:])
     if result.mass > 0.0:  # a negative mass is reported below
         result = explained_log.add_errors_of_load(result, load_errors)
     findings = errors or causes

@@ -63,3 +63,15 @@ def test_aliased_vibration_gives_no_precise_wrong_load(tmp_path: Path, size_m_s2
     path = written(tmp_path, columns, pose=False)
     assert abs(identify_log(path).identification.mass - PHI[0]) > 0.002 * PHI[0]
     assert is_within_five_deviations(path).all()
+
+
+@pytest.mark.slow
+def test_pushes_that_the_fit_rejects_do_not_widen_the_intervals(tmp_path: Path) -> None:
+    """The pushes have about 40 % of the variance, which alone is a deviation of 1.2 kg."""
+    rng, columns = np.random.default_rng(0), good()
+    count = len(columns["t"]) // 40 + 1
+    pushed = (rng.random(count) < 0.2)[:, None] * 90.0 * rng.normal(size=(count, 3))
+    columns["force"] = columns["force"] + np.repeat(pushed, 40, axis=0)[: len(columns["t"])]
+    load = identify_log(written(tmp_path, columns, pose=False)).identification
+    assert load.mass == pytest.approx(PHI[0], rel=0.01)
+    assert np.sqrt(load.covariance[6, 6]) < 1.0

@@ -47,7 +47,7 @@ def error_of_load_by_nonlinear_sensor(
     gains = _one_column_per_channel(unit)
     measured = few.wrench / scale
     plain, _ = _fit(measured, load_columns)
-    _, residual = _fit(measured, load_columns, gains)
+    residual = _fit(measured, load_columns, gains)[1] + 1e-300
     shares, errors = {}, {}
     for name, columns in functions.items():
         own = [_one_column_per_channel(x) for x in columns]
