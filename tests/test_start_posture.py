@@ -515,7 +515,7 @@ def test_joints_of_a_mobile_base_may_be_at_the_base_plane(low: float) -> None:
     kept, region = select_suitable_postures(
         Postures(np.zeros((count, 4)), origins, axes, R_WS, p_WS), 0.0, 0.1
     )
-    assert region.is_joint_above_plane.tolist() == [False, False, True, True]
+    assert region.can_joint_be_above_plane.tolist() == [False, False, True, True]
     assert region.removed_counts[2] == ("a joint is below the base plane", 20)
     assert (kept.origins[:, 3, 2] > 0.0).all() and len(kept.q) > 0
 

@@ -71,7 +71,7 @@ def scenario_of_scene(name: str, user_scenario: Scenario) -> Scenario:
 def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
     """Return the scenario with the driver's choices (network, grip ...) in `inputs`.
 
-    Contact detection is off if `load` has no noise floor or the inputs select another sensor.
+    Contact detection is off if `load` has no noise floor or the inputs replace the sensor.
     """
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {"passivity__method": method}

@@ -167,7 +167,7 @@ def _correct_fields_by_cause(
             for name in [x for x in fields if x.endswith(".time.scale")]:
                 fields[name] = fields[name] / values["ratio"]
         case "torque factor":
-            _correct_unit_or_torque_scale(fields, values["factor"])
+            _correct_wrench_unit_or_torque_scale(fields, values["factor"])
         case "pose frame":
             for name in set(_POSITION_FIELDS) & set(fields):
                 fields[name] = fields[name] + values["position_in_sensor"]
@@ -188,7 +188,7 @@ def _correct_wrench_sign_and_frame(fields: DescriptionFields, Q: Array) -> None:
         fields["wrench.frame"] = sign * Q.T @ fields["wrench.frame"]
 
 
-def _correct_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
+def _correct_wrench_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
     force = SI_VALUE_OF_UNIT[fields["wrench.force.unit"]]
     torque = SI_VALUE_OF_UNIT[fields["wrench.torque.unit"]]
     ratios = [(torque / SI_VALUE_OF_UNIT[u], "wrench.torque.unit", u) for u in _TRIED_TORQUE_UNITS]
@@ -293,7 +293,7 @@ def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> I
 
 
 def add_errors_of_load(load: Identification, errors: Array) -> Identification:
-    """Return `load` with intervals widened by likely `errors` (10,) of phi."""
+    """Return `load` with intervals widened by `errors` (10,) of phi."""
     variances = np.append(np.zeros(6), errors**2)
     return _replace_covariance_of_load(load, load.covariance + np.diag(variances))
 

@@ -105,7 +105,7 @@ def _dds_type_name(message_type: str) -> str:
 
 
 class CdrConverter(MessageConverter):
-    """Converter of ROS 2 messages in CDR (common data representation)."""
+    """Converter from CDR (common data representation) of ROS 2 to readings."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()

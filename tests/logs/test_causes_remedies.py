@@ -19,7 +19,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.explained_log import (
-    _correct_unit_or_torque_scale,
+    _correct_wrench_unit_or_torque_scale,
     add_description_lines,
     implausible_mass_message,
 )
@@ -316,7 +316,7 @@ def test_unit_of_force_or_torque_follows_from_the_factor(force, torque, factor, 
     fields = {"wrench.force.unit": force, "wrench.torque.unit": torque}
     fields |= {"wrench.force.scale": np.ones(3), "wrench.torque.scale": np.full(3, 2.0)}
     expected = fields | {name: value}
-    _correct_unit_or_torque_scale(fields, factor)
+    _correct_wrench_unit_or_torque_scale(fields, factor)
     assert fields.keys() == expected.keys()
     for key in fields:
         assert fields[key] == pytest.approx(expected[key])

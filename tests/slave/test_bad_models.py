@@ -175,7 +175,7 @@ ERRORS = {
     "in mm": ("urdf", scaled(1000), "is 1.25e.03 m long; give lengths in m"),
     "in km": ("urdf", scaled(0.001), "is 0.00125 m long; give lengths in m"),
     "inertia in kg mm^2": ("urdf", with_inertial(('"0.02"', '"2e4"'), ('"0.01"', '"1e4"')),
-                           r"the mass moved by j\d is \d+\.?\d* m away from it"),
+                           r"the mass that j\d moves is \d+\.?\d* m away from j\d"),
     # MJCF, SDF, directives
     "MJCF without bodies": ("xml", mjcf(""), "no frames are named 'l6'; give a model"),
     "MJCF of a loop": ("xml", TWO.format("").replace(

@@ -76,7 +76,7 @@ def linearize(
     displacement_B = finite_array("displacement", displacement, 3)
     period = _PeriodSimulator(scenario, load_estimate)
     x, A, C = period.find_rest_state_and_derivatives(displacement_B)
-    B = period.differentiate_by_input(x)
+    B = period.differentiate_next_state_by_input(x)
     affects = _states_affecting_outputs(A, C)
     names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
     inputs, outputs = port_component_names(*_INPUT_PORTS), port_component_names(*_OUTPUT_PORTS)
@@ -359,7 +359,7 @@ class _PeriodSimulator:
         C, A = np.split(_central_difference_jacobian(outputs_and_end_state, self._steps), [30])
         return A, C
 
-    def differentiate_by_input(self, x: Array) -> Array:
+    def differentiate_next_state_by_input(self, x: Array) -> Array:
         def end_state(change: Array) -> Array:
             self._set_state(x)
             self._apply_input_changes(change)

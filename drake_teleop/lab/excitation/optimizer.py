@@ -128,7 +128,7 @@ class DesignProblem:
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
 USABLE_LIMIT_SHARE = 0.985
-_MAX_LIMIT_USE_OF_FEASIBLE_MOTION = 0.9885  # on the grid
+_MAX_FEASIBLE_LIMIT_USE_ON_GRID = 0.9885  # on the grid
 
 # Number of candidates in a batch, and number of them from which a descent starts.
 _START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8
@@ -271,7 +271,7 @@ class _DescentSearch:
             self._count_evaluation_and_check_time()
             self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
             self._key = key
-            if self._last.largest_limit_use <= _MAX_LIMIT_USE_OF_FEASIBLE_MOTION:
+            if self._last.largest_limit_use <= _MAX_FEASIBLE_LIMIT_USE_ON_GRID:
                 self._record_iterate_if_improved(x)
             elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and np.isinf(self._best_of_start):
                 raise _InfeasibleStartError

@@ -67,7 +67,7 @@ class StartRegion:
         first_joint_W: (3,) origin of the first joint, p_W [m].
         plane_height: height z_W of the base plane [m].
         reach: horizontal distance that the arm reaches from its first joint [m].
-        is_joint_above_plane: (n,) True for joints that can be above the plane, except the first.
+        can_joint_be_above_plane: (n,) True for joints (not the first) that can be above the plane.
         side_direction_rad: direction of the region about z_W, from x_W [rad].
         removed_counts: (condition, number of postures that it removed).
     """
@@ -76,7 +76,7 @@ class StartRegion:
     tool_length: float
     first_joint_W: Array
     reach: float
-    is_joint_above_plane: NDArray[np.bool_]
+    can_joint_be_above_plane: NDArray[np.bool_]
     side_direction_rad: float = 0.0
     removed_counts: tuple[tuple[str, int], ...] = ()
 
@@ -174,7 +174,7 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
     upward = upward_share_of_elbow_offset(postures, region.reach)
     elbow = np.minimum(upward, _SUFFICIENT_ELBOW_UP_SHARE) / _SUFFICIENT_ELBOW_UP_SHARE
-    origins = postures.origins[:, region.is_joint_above_plane, 2]
+    origins = postures.origins[:, region.can_joint_be_above_plane, 2]
     low = np.maximum(region.plane_height + _MIN_JOINT_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach
     return margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away

@@ -174,7 +174,7 @@ def figure_captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """Return the rows of the identification table; arguments: offsets, then phi, (16,), in SI."""
+    """Return table rows of [offsets; phi] (16,) [SI]: true values, estimates, deviations."""
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
     for (symbol, index, unit, scale), values in zip(PARAMETER_FORMATS, columns, strict=True):

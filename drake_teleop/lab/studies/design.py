@@ -44,7 +44,7 @@ class Factor:
         return self.values or self.words or self.flags or self.vectors
 
     def value_at_share(self, share: float) -> FactorValue:
-        """Return the value at a share (0 to 1) of the range `low` to `high`, or of the list."""
+        """Return the value at a share (0 to 1) of `low` to `high`, or of the listed values."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.level_values()

@@ -39,7 +39,7 @@ def missing_value_reasons(
 ) -> list[str]:
     """Return why each level or cell has no value; "" where `compared` is True.
 
-    `points` and `successes` count its points, and its runs with a value.
+    `points` and `successes`: number of points of each, and of its runs with a value.
     """
     why = np.where(points == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
@@ -225,7 +225,7 @@ def _build_level_model(
     factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
-    failed = _excluded_level_cells_of_factor_pairs(factors, known, by_chance)
+    failed = _excluded_level_cells_by_factor_pair(factors, known, by_chance)
     codes = [_effect_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
     columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
@@ -246,7 +246,7 @@ def _build_level_model(
     return LevelModel(factors, codes, places, failed, X, v.T / size @ u.T)
 
 
-def _excluded_level_cells_of_factor_pairs(
+def _excluded_level_cells_by_factor_pair(
     factors: list[Levels], has_value: BooleanArray, missing_by_chance: bool
 ) -> dict[tuple[int, int], BooleanArray]:
     excluded = {}

@@ -74,7 +74,7 @@ def study_command(
     """Run the remaining runs of a study; write summary, effects and pictures; return the summary.
 
     `shard` "K/N" is every N-th group of runs; `merge` collects the rows of all shards and runs
-    nothing; `yes` permits more than 1e5 runs, or asks the user.
+    nothing; `yes`: consent to more than 1e5 runs, or a function that asks.
     """
     for first, second, both in (
         ("shard", "merge", shard and merge),

@@ -100,7 +100,7 @@ class OperatingRange:
 
 
 def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str) -> OperatingRange:
-    """Return the operating range of these grips, walls [kN/m] and this task."""
+    """Return the required operating range: these grips, walls [kN/m] and task."""
     _check_names_are_known("hands", hands, tuple(GRIP_IMPEDANCES))
     _check_names_are_known("task", [task], tuple(REQUIREMENTS_OF_TASK))
     for where, given, example in (("hands", hands, "light"), ("walls", walls, "0.5,20 (kN/m)")):

@@ -27,7 +27,7 @@ def error_of_load_by_nonlinear_sensor(
 ) -> tuple[Array, Finding | None]:
     """Return likely errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
 
-    The errors are 0 if no function of the load's wrench in each channel explains the residual. The
+    The errors are 0 if no function of the wrench in each channel explains the residual. The
     log is without delay.
     """
     step = max(1, round(1.0 / (_COMPARED_RATE_HZ * log.dt)), -(-len(log) // _MAX_COMPARED_SAMPLES))

@@ -322,7 +322,7 @@ def _verdict_on_episode(
             " change of the load)"
         )
         faults.append(EpisodeFault("unexplained", text, None))
-    contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
+    contact, touched = _contact_wrench_and_contact_flags(shared, signals, found, residual - offsets)
     rows = resample(at, log.t, contact)
     nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)
     free = contact[~touched]
@@ -341,7 +341,7 @@ def _verdict_on_episode(
     return row, ContactColumns(rows.astype(np.float32), touched[nearest])
 
 
-def _contact_wrench_and_flags(
+def _contact_wrench_and_contact_flags(
     shared: SharedLoad, signals: EpisodeSignals, found: WrenchHypothesis, residual: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     for _ in range(3):

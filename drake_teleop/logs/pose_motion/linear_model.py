@@ -171,7 +171,7 @@ def find_best_delay_and_cost(
 
 
 def delay_std(spectra: Spectra) -> float:
-    """Return the standard deviation of the delay [s]; inf if undetermined."""
+    """Return the standard deviation of `spectra.delay` [s]; inf if undetermined."""
     reach = spectra.window.delay_search_half_range_s
     beside = np.array([-_FINE_DELAY_STEP_S, 0.0, _FINE_DELAY_STEP_S])
     left, least, right = _costs_at_delays(spectra, spectra.delay + beside)

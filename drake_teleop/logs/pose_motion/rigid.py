@@ -45,7 +45,7 @@ class RigidFit:
     """Fit of a rigid load to wrench and poses.
 
     Attributes:
-        parameters: estimated; `delay_s` is relative to the delay of the moments.
+        parameters: estimated; `delay_s` is relative to the delay of the `Spectra`.
         covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
             if undetermined, 0 if not free.
         misfit: twice the log likelihood ratio to the linear model.
@@ -97,13 +97,13 @@ def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None)
     """
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
-    def wrench_coefficients(phi: Array) -> Array:
+    def matrix_from_motion_signals_to_wrench(phi: Array) -> Array:
         theta = np.concatenate([np.zeros(6), phi])
         return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
 
-    C = wrench_coefficients(phi)
+    C = matrix_from_motion_signals_to_wrench(phi)
     if removed_weight is not None:
-        weight = wrench_coefficients(np.concatenate([removed_weight, np.zeros(6)]))
+        weight = matrix_from_motion_signals_to_wrench(np.concatenate([removed_weight, np.zeros(6)]))
         C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 

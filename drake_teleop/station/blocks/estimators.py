@@ -21,7 +21,7 @@ class _SampleInputPorts:
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
 
     def Eval(self, context: Context) -> Array:
-        """Return the sample that the values of all ports form."""
+        """Return the sample composed of the values of all input ports."""
         sample, first = np.zeros(regressor.FIRST_JOINT_INDEX), 0
         for port in self._ports:
             # Unconnected: `saturated` is 0.

@@ -104,7 +104,7 @@ METHODS = Registry(
 )
 """All methods by name."""
 
-_DEFAULT_MASS_AND_INERTIA = [15.13, 0.5]  # kg, kg m^2 (E)
+_DEFAULT_SLAVE_MASS_AND_INERTIA = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
 @settings
@@ -191,7 +191,9 @@ def method_parameters(
     p[slots.WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[slots.SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
     p[slots.SERVO_D] = np.multiply(config.servo_damping, power_scale)
-    p[slots.SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_MASS_AND_INERTIA, power_scale)
+    p[slots.SLAVE_MASS] = np.multiply(
+        config.slave_mass or _DEFAULT_SLAVE_MASS_AND_INERTIA, power_scale
+    )
     p[slots.SLAVE_PER_MASTER_MOTION] = motion_scale
     fades = config.method != "none"
     p[slots.FORCE_FADE_HAND_SPEED] = np.multiply(config.retreat, motion_scale) if fades else np.inf

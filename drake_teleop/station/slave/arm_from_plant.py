@@ -230,5 +230,5 @@ def check_arm_lengths(arm: ArmModel, where: str) -> None:
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
         if distance > _MAX_ARM_LENGTH_M:
-            what = f"the mass moved by {name} is {distance:.3g} m away from it"
+            what = f"the mass that {name} moves is {distance:.3g} m away from {name}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

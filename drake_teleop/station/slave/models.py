@@ -194,7 +194,7 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> None:
-    """Parse surroundings into a plant; raise DrakeTeleopError for mimic joints, floating links."""
+    """Parse surroundings; raise DrakeTeleopError for mimic joints, links that float on links."""
     _, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():
         remedy = "remove this dependence; surroundings need independent joints and links"
