@@ -233,8 +233,8 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     console.print(f"written to {out}; 3D replay: {replay}", highlight=False, markup=False)
 
 
-def _format_ms(delay: float | None) -> str:
-    return "never" if delay is None else f"{delay:.1f} ms"
+def _format_ms(delay_ms: float | None) -> str:
+    return "never" if delay_ms is None else f"{delay_ms:.1f} ms"
 
 
 def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:

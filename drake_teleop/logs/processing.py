@@ -390,7 +390,7 @@ def _unexplained_misfit(
     corrections: list[Finding],
     unexplained: float,
 ) -> MisfitExplanation | None:
-    """Return `why` if its residual is neither noise nor an effect of unknown accelerations."""
+    """Return `why` if neither noise, vibrations nor unknown accelerations explain the residual."""
     if why is None or not why.is_misfit or why.is_acceleration_missing:
         return None
     useless = not why.causes and unexplained > 0.5

@@ -50,12 +50,12 @@ def stability_map(
     """
     xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
-    def evaluate(x: Array, y: Array) -> tuple[OneAxis, CutLoop, NDArray[np.int64]]:
+    def cut_loop_and_num_unstable(x: Array, y: Array) -> tuple[OneAxis, CutLoop, NDArray[np.int64]]:
         changed_axis, loop = _apply_values_and_cut_loop(axis, sampling, {x_name: x, y_name: y})
         return changed_axis, loop, cut_loop.count_unstable_multipliers(loop, changed_axis.delay)
 
     points = np.stack(np.meshgrid(xs, ys), axis=-1)
-    changed_axis, loop, unstable = evaluate(xs, ys[:, None])
+    changed_axis, loop, unstable = cut_loop_and_num_unstable(xs, ys[:, None])
     unstable = np.broadcast_to(unstable, points.shape[:2])
     stable = unstable == 0
     # Neighbours in a row, then neighbours in a column.
@@ -65,7 +65,7 @@ def stability_map(
     stable_at_low = np.concatenate([stable[:, :-1][across], stable[:-1][along]])
     for _ in range(_NUM_STABILITY_LIMIT_BISECTIONS if len(low) else 0):
         middle = 0.5 * (low + high)
-        as_low = ((evaluate(*middle.T)[2] == 0) == stable_at_low)[:, None]
+        as_low = ((cut_loop_and_num_unstable(*middle.T)[2] == 0) == stable_at_low)[:, None]
         low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)
     distortion = np.broadcast_to(force_distortion(changed_axis, loop), stable.shape)
     return StabilityMap(x_name, y_name, xs, ys, unstable, distortion, 0.5 * (low + high))

@@ -128,9 +128,15 @@ class FittedModel:
     def refit(self, model: LoadModel, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
             start = model.start_parameters(self.x, self.model)
-        return fit_model(model, self._rows_for_model(model), start, self.contact_spans, **options)
+        return fit_model(
+            model,
+            self._used_rows_with_columns_of_model(model),
+            start,
+            self.contact_spans,
+            **options,
+        )
 
-    def _rows_for_model(self, model: LoadModel) -> UsedRows:
+    def _used_rows_with_columns_of_model(self, model: LoadModel) -> UsedRows:
         rows = self.rows
         if rows.step_times == model.step_times and np.array_equal(rows.columns, model.columns):
             return rows
@@ -176,7 +182,7 @@ class FittedModel:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """`gain_by_smooth_signals` per degree of freedom; about 1 or less for noise alone."""
+        """`gain_by_smooth_signals` per added parameter; about 1 or less for noise alone."""
         gain, freedom = self.gain_by_smooth_signals
         return gain / max(1, freedom - self.model.size)
 
@@ -206,7 +212,7 @@ class FittedModel:
     def score_of_larger_model(self, model: LoadModel) -> float:
         """Return the first-order gain in twice the log likelihood with a larger model."""
         x = model.start_parameters(self.x, self.model)
-        rows = self._rows_for_model(model)
+        rows = self._used_rows_with_columns_of_model(model)
         residual = self.residual if rows is self.rows else model.residual_coefficients(x)
         other = replace(self, rows=rows, residual=residual)
         return score_statistic(*other.normal_equations(model, x))[0]

@@ -77,7 +77,7 @@ _MIN_MEDIAN_OF_RAW_COUNTS = 2000.0  # median of integers that are raw counts
 _MAX_GYRO_RATE_DEG_S = 4000.0  # faster than any gyroscope measures
 _FILL_IN_TEXT, _MIN_CLOCK_ROWS = "FILL IN", 20
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
-_NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
+_NANOSECOND_PART_NAME_ENDINGS = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
 _RAW_COUNTS_NOTE = (
     "Force and torque are raw counts. scale is the value of one count in N and N m, from the"
     " manual of the sensor: 1e-6 for 1000000 counts per N. The data contain only the ratio of both."
@@ -419,7 +419,7 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
     unit = known_unit(plain[named[0]][1])
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
-    for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
+    for end in _NANOSECOND_PART_NAME_ENDINGS if start != plain[named[0]][0] else ():
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
     if unit not in _ALLOWED_UNITS["time"]:

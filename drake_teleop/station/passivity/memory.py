@@ -13,7 +13,7 @@ class SlotAllocator:
         self._size, self._next = size, first
 
     def number(self) -> int:
-        """Reserve one place and return its index."""
+        """Reserve one number of the vector; return its index."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:

@@ -1,4 +1,4 @@
-"""Parsing of arms, tools and surroundings; only the arm's joints up to the sensor move."""
+"""Parsing of arms, tools and surroundings; of arms only joints up to the sensor move."""
 
 from __future__ import annotations
 
