@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from planted import PHI, Columns, good, written
 
+from drake_teleop.logs.explained_log import add_errors_of_load
 from drake_teleop.logs.processing import identify_log
 
 
@@ -75,3 +76,13 @@ def test_pushes_that_the_fit_rejects_do_not_widen_the_intervals(tmp_path: Path) 
     load = identify_log(written(tmp_path, columns, pose=False)).identification
     assert load.mass == pytest.approx(PHI[0], rel=0.01)
     assert np.sqrt(load.covariance[6, 6]) < 1.0
+
+
+@pytest.mark.slow
+def test_errors_of_the_load_add_to_its_variances(tmp_path: Path) -> None:
+    load = identify_log(written(tmp_path, good(), imu=False)).identification
+    errors = np.arange(10.0) * 1e-3
+    wider = add_errors_of_load(load, errors)
+    added = np.diag(wider.covariance - load.covariance)
+    np.testing.assert_allclose(added, np.append(np.zeros(6), errors**2), atol=1e-12)
+    assert not add_errors_of_load(load, np.full(10, 10.0)).identifiable[6:].any()
