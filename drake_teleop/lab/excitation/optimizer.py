@@ -128,7 +128,7 @@ class DesignProblem:
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
 USABLE_LIMIT_SHARE = 0.985
-_MAX_FEASIBLE_LIMIT_USE_ON_GRID = 0.9885  # on the grid
+_MAX_FEASIBLE_LIMIT_USE_ON_GRID = 0.9885
 
 # Number of candidates in a batch, and number of them from which a descent starts.
 _START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8

@@ -243,7 +243,7 @@ def _add_predicted_force_threshold(
     human = trial.base_scenario.operator.perception
     scale = trial.base_scenario.force_scaling.force_scale
     motion_scale = trial.base_scenario.kinematic_scaling.translation_scale
-    # Of the slave's swing, as `press_scenario`.
+    # The slave swings with this amplitude and frequency in `press_scenario`.
     amplitude, frequency = 0.02 * min(motion_scale, 1.0), 2 * np.pi * 1.5
     rms_load_force = float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
     masked = row["sigma_inertia"] * scale * rms_load_force

@@ -128,13 +128,8 @@ class FittedModel:
     def refit(self, model: LoadModel, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
             start = model.start_parameters(self.x, self.model)
-        return fit_model(
-            model,
-            self._used_rows_with_columns_of_model(model),
-            start,
-            self.contact_spans,
-            **options,
-        )
+        rows = self._used_rows_with_columns_of_model(model)
+        return fit_model(model, rows, start, self.contact_spans, **options)
 
     def _used_rows_with_columns_of_model(self, model: LoadModel) -> UsedRows:
         rows = self.rows

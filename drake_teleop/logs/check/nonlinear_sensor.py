@@ -46,28 +46,27 @@ def error_of_load_by_nonlinear_sensor(
     load_columns = np.concatenate([offsets, V], axis=2) / scale[:, None]
     gains = _one_column_per_channel(unit)
     measured = few.wrench / scale
-    plain, _ = _fit(measured, load_columns)
     residual = _fit(measured, load_columns, gains)[1] + 1e-300
-    shares, errors = {}, {}
-    for name, columns in functions.items():
-        own = [_one_column_per_channel(x) for x in columns]
-        shares[name] = 1.0 - _fit(measured, load_columns, gains, *own)[1] / residual
-        errors[name] = _fit(measured, load_columns, *own)[0][6:16] - plain[6:16]
-    name = max(shares, key=lambda x: shares[x])
+    own = {name: [*map(_one_column_per_channel, x)] for name, x in functions.items()}
+    left = {name: _fit(measured, load_columns, gains, *x)[1] for name, x in own.items()}
+    name = min(left, key=lambda x: left[x])
+    share = 1.0 - left[name] / residual
     total = float(np.sum((measured - measured.mean(axis=0)) ** 2))
-    left = (1.0 - shares[name]) * residual
-    small = shares[name] < _LEAST_EXPLAINED_SHARE
-    if small or left > _LARGEST_UNEXPLAINED_SHARE * total or load.mass <= 0.0:
+    large = left[name] > _LARGEST_UNEXPLAINED_SHARE * total
+    if share < _LEAST_EXPLAINED_SHARE or large or load.mass <= 0.0:
         return np.zeros(10), None
     scales = natural_scales(load.phi)[6:]
     if name == "hysteresis":  # its part in phase with the wrench, which no fit shows, is as large
-        errors[name] = np.sqrt(shares[name] * residual / total) * scales
-    worst = float(np.max(np.abs(errors[name]) / scales, initial=0.0, where=np.arange(10) < 4))
-    if shares[name] < _CERTAIN_EXPLAINED_SHARE or worst < _LEAST_RELATIVE_ERROR:
-        return errors[name], None
-    text = f"{_MESSAGES[name]}; error of the load about {100.0 * worst:.2g} %"
-    text = f"payload not identifiable: {text}"
-    return errors[name], Finding(name, text, values={"relative_error": worst})
+        errors = np.sqrt(share * residual / total) * scales
+    else:
+        nonlinear, linear = (_fit(measured, load_columns, *x)[0] for x in (own[name], []))
+        errors = nonlinear[6:16] - linear[6:16]
+    worst = float(np.max(np.abs(errors[:4]) / scales[:4]))
+    if share < _CERTAIN_EXPLAINED_SHARE or worst < _LEAST_RELATIVE_ERROR:
+        return errors, None
+    text = f"payload not identifiable: {_MESSAGES[name]}"
+    text = f"{text}; error of the load about {100.0 * worst:.2g} %"
+    return errors, Finding(name, text, values={"relative_error": worst})
 
 
 def _one_column_per_channel(x: Array) -> Array:
