@@ -179,7 +179,7 @@ def draw_trajectory(excitation: Excitation) -> Figure:
         progress.step(*excitation.criterion_history.T, where="post", color=BLUE)
         # With --until, the criterion is the period.
         least = excitation.values.get(excitation.criterion, excitation.trajectory.period)
-        progress.set_title(f"{excitation.criterion} down to {least:.4g}")
+        progress.set_title(f"Criterion {excitation.criterion}: least value {least:.4g}")
         progress.set(xlabel="evaluations", yscale="log")
     return figure
 
