@@ -365,6 +365,22 @@ def test_packet_that_is_not_finite_starts_the_safe_state(field, bad):
     assert 5.0 < force[-1] < 10.0
 
 
+@pytest.mark.parametrize("field", ["CONTACT_FLAG", "WRENCH", "POSE"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_slave_brakes_smoothly_after_a_packet_that_is_not_finite(field, bad):
+    """The received hand moves with 0.1 m/s; the bad packet is number 300."""
+    block, rows = blocks.PassivityAtSlave(PassivityConfig(), T, START), []
+    for k in range(400):
+        packet = packet_of_slave(0.0)
+        packet[fields.POSE.start + 4] += 1e-4 * k
+        rows.append({"received": packet, "wrench_B": np.zeros(6), "pose_slave": START})
+    rows[300]["received"][getattr(fields, field)] = bad
+    steps = np.diff(stepped(block, rows, "pose_to_slave")[:, 4])
+    assert steps[299:320].max() <= steps[298] * 1.001  # it does not jump to the next pose
+    assert np.abs(np.diff(steps[290:])).max() < 2e-5  # 1.4e-4 without brake
+    assert 0.0 <= steps[320] < 0.8 * steps[298]
+
+
 @pytest.mark.parametrize(("contact", "flag"), [(np.nan, 0.0), (0.0, 0.0), (1.0, 1.0)])
 def test_contact_flag_of_a_packet_is_0_or_1(contact, flag):
     block = blocks.PassivityAtSlave(PassivityConfig(), T, START)

@@ -813,7 +813,7 @@ def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, m
 
 def test_picture_of_a_shortest_motion_states_its_period(short):
     figure = draw_trajectory(dataclasses.replace(short, criterion="period"))
-    assert figure.axes[3].get_title("left") == "period down to 2.4"
+    assert figure.axes[3].get_title("left") == "Criterion period: least value 2.4"
 
 
 @pytest.mark.long
