@@ -108,7 +108,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
         ({"methods": ["magic"]}, r"methods.*no passivity method 'magic'.*tdpa"),
         ({"methods": []}, "methods: is empty; give"),
         ({"networks": []}, "networks: is empty; give"),
-        ({"networks": ["ideal"]}, "networks: .* over 'ideal' with method 'none'; remove"),
+        ({"networks": ["ideal"]}, "networks: method 'none' over network 'ideal' .*; remove"),
         ({"networks": ["lan", "ideal"], "methods": ["tdpa", "none"]}, "networks: .*'ideal'"),
     ],
 )

@@ -77,7 +77,7 @@ def compare_command(
     for name in methods:
         METHODS.check(name, "methods")
     if "ideal" in networks and "none" in methods:
-        what = "the station has no energy balance over 'ideal' with method 'none'"
+        what = "method 'none' over network 'ideal' has no channel that measures energy"
         raise DrakeTeleopError(what, where="networks", remedy="remove the network or the method")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     make_folder(out)
