@@ -108,3 +108,18 @@ def test_nested_bars_raise_no_error(terminal):
         run_with_progress(True)
     assert "Outside" in terminal.getvalue()
     run_with_progress(True)
+
+
+@pytest.mark.parametrize("first", [0.0, 5.0])
+def test_without_a_terminal_a_long_stage_has_a_line_every_15_s(monkeypatch, capsys, first):
+    now = 100.0
+    monkeypatch.setattr(rich, "_console", Console(file=io.StringIO(), force_terminal=False))
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    with show_progress(True, after=first) as stage:
+        update = stage("Study")
+        for second in range(1, 41):
+            now = 100.0 + second
+            update(second / 40, f"{second} of 40")
+    start = round(first)
+    expected = [f"Study {k} of 40 {k / 40:.0%}" for k in (start + 15, start + 30)]
+    assert capsys.readouterr().err.splitlines() == ["Study ...", *expected]
