@@ -19,7 +19,7 @@ from drake_teleop.station.channel.channel import MAX_TIMEOUT_S, Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.environment.sheet_spring import SheetSpring
-from drake_teleop.station.environment.slot import Slot
+from drake_teleop.station.environment.slot import PEG_RADIUS_M, TIP_BALL_CENTRE_Z_S_M, Slot
 from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
@@ -35,7 +35,7 @@ from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.joint_control import POSITION_INTERFACE_PRESETS, JointControlConfig
 from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.scene import Scene
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.slave_config import Ball, Slave
 
 _T = TypeVar("_T")
 ENVIRONMENTS: Registry[type[Environment]] = Registry(
@@ -157,6 +157,12 @@ class Scenario:
             if sum(isinstance(thing, kind) for thing in self._environments) > 1:
                 what = f"the scenario has more than one {name} (one is permitted)"
                 raise DrakeTeleopError(what, where=f"{where}:environment", remedy="keep one")
+        tool, tip = self.slave.tool, Ball(PEG_RADIUS_M, [0.0, 0.0, TIP_BALL_CENTRE_Z_S_M])
+        has_slot = any(isinstance(thing, Slot) for thing in self._environments)
+        if has_slot and tool is not None and tool.mass > 0.0 and tip not in tool.shapes:
+            what = "a slot requires the ball of its peg as a shape"
+            remedy = f"add !Ball {{radius: {tip.radius:g}, position: {tip.position}}}"
+            raise DrakeTeleopError(what, where=f"{where}:slave.tool.shapes", remedy=remedy)
         _check_operator_task(self, where)
         _check_integration_step(self, where)
         _check_channel_and_passivity(self, where)

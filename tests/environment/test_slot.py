@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydrake.geometry import Sphere
+from pydrake.common.yaml import yaml_load
+from pydrake.geometry import AddCompliantHydroelasticProperties, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
-from pydrake.multibody.tree import SpatialInertia
+from pydrake.multibody.tree import SpatialInertia, default_model_instance
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.environment.environment import ContactMaterial
 from drake_teleop.station.environment.point_contact import (
     FindContactPairs,
     depth_of_sphere_in_box,
@@ -28,14 +30,15 @@ from drake_teleop.station.environment.slot import (
     _boxes_of_slot,
 )
 from drake_teleop.station.replay import ReplayScene
-from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import forward_kinematics, jacobian
 from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.station.slave.plant import AddSlavePlant, ParseSlave
 from drake_teleop.station.slave.plant_dynamics import environment_wrench_about_Wo_into
-from drake_teleop.station.slave.slave_config import Slave, Tool
+from drake_teleop.station.slave.scene import Scene
+from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 from drake_teleop.station.slave.surroundings import AddEnvironment
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -113,6 +116,58 @@ def test_tool_of_a_slot_has_a_body_named_tool(tmp_path, names):
         return
     with pytest.raises(DrakeTeleopError, match=r"tool: a slot .* named tool, found 0; give"):
         AddSlavePlant(DiagramBuilder(), slave, Slot())
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, -0.05])
+def test_peg_of_a_tool_of_several_links_has_the_slots_balls(tmp_path, offset):
+    inertia = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+    flange = f'<link name="flange"><inertial><mass value="1"/>{inertia}</inertial></link>'
+    ball = f'<geometry><sphere radius="{PEG_RADIUS_M}"/></geometry>'
+    place = f'<origin xyz="0 0 {TIP_BALL_CENTRE_Z_S_M - offset}"/>'
+    end = f'<link name="tool"><collision>{place}{ball}</collision></link>'
+    ends = f'<origin xyz="0 0 {offset}"/><parent link="flange"/><child link="tool"/>'
+    links = f'{flange}{end}<joint name="j" type="fixed">{ends}</joint>'
+    (tmp_path / "tool.urdf").write_text(f'<robot name="peg">{links}</robot>')
+    slave = Slave(tool=Tool(model=str(tmp_path / "tool.urdf")))
+    slot = Slot(stiffness=3e3, dissipation=0.7, friction=0.45)
+    contact = AddSlavePlant(DiagramBuilder(), slave, slot).contact
+    assert not len(contact.monitored_pairs)
+    (heights, counts) = np.unique(contact.compiled_pairs[:, 2].round(12), return_counts=True)
+    np.testing.assert_allclose(heights, [UPPER_BALL_CENTRE_Z_S_M, TIP_BALL_CENTRE_Z_S_M])
+    assert counts.tolist() == [7, 7]
+    law = np.tile([3e3, 0.7, 0.45, 0.45], (14, 1))
+    np.testing.assert_allclose(contact.compiled_pairs[:, 22:26], law, rtol=1e-12)
+
+
+@pytest.mark.parametrize("slot_first", [True, False])
+def test_tool_in_a_slot_keeps_its_hydroelastic_properties(slot_first):
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    tool, slot, scene = ParseSlave(plant).tool, Slot(friction=0.45), Scene(contact="hydroelastic")
+    AddEnvironment(plant, slot)
+    inertia = SpatialInertia.SolidSphereWithMass(1.0, 0.1)
+    pad = plant.AddRigidBody("pad", default_model_instance(), inertia)
+    soft = ContactMaterial(1e4, 1.0, 0.3)
+    AddCompliantHydroelasticProperties(0.05, 1e6, soft)
+    plant.RegisterCollisionGeometry(pad, RigidTransform(), Sphere(0.1), "pad", soft)
+    plant.Finalize()
+    for part in (slot, scene) if slot_first else (scene, slot):
+        part.PrepareContact(plant, scene_graph, tool)
+    for shape in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
+        found = scene_graph.model_inspector().GetProximityProperties(shape)
+        assert found.HasProperty("hydroelastic", "compliance_type")
+        assert found.GetProperty("material", "coulomb_friction").static_friction() == 0.45
+
+
+def test_tool_without_a_file_needs_the_ball_of_the_peg():
+    for shapes in ([], [Ball()], [Ball(0.01, [0.0, 0.0, TIP_BALL_CENTRE_Z_S_M])]):
+        scenario = Scenario(slot=Slot(), slave=Slave(tool=Tool(mass=0.5, shapes=shapes)))
+        with pytest.raises(
+            DrakeTeleopError, match=r"tool.shapes: a slot .* add (!Ball .*)"
+        ) as error:
+            scenario.check()
+        (ball,) = yaml_load(data=f"[{str(error.value).split(' add ')[1]}]")
+        tool = {"mass": 0.5, "shapes": [ball]}
+        ScenarioFromData({"slot": {}, "slave": {"tool": tool}}, "scenario.yaml")
 
 
 def test_contact_does_not_pull_a_fast_ball():

@@ -145,13 +145,18 @@ def ExcludeContact(
 
 
 def ContactMaterial(
-    stiffness: float, dissipation: float, friction: float
+    stiffness: float,
+    dissipation: float,
+    friction: float,
+    old: geometry.ProximityProperties | None = None,
 ) -> geometry.ProximityProperties:
-    """Return a material for Drake's point contact, with equal static and dynamic friction.
+    """Return a material for point contact, with the hydroelastic properties of `old`, if any.
 
     Units: stiffness [N/m], Hunt-Crossley dissipation [s/m], friction coefficient [1].
     """
-    properties = geometry.ProximityProperties()
+    properties = geometry.ProximityProperties(old or geometry.ProximityProperties())
+    for name in ("point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"):
+        properties.RemoveProperty("material", name)
     geometry.AddContactMaterial(
         properties, dissipation, stiffness, CoulombFriction(friction, friction)
     )

@@ -12,6 +12,7 @@ Section across the slot, M is the middle of its mouth, z up::
 """
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from pydrake.geometry import Box, ProximityProperties, RoleAssign, SceneGraph, Sphere
@@ -26,6 +27,7 @@ from drake_teleop.station.environment.environment import (
     Environment,
     FloorStand,
     NewInstance,
+    ToolShapes,
 )
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
@@ -92,7 +94,10 @@ class Slot(Environment):
             what = f"a slot requires one body named tool, found {count}"
             remedy = "give this name to one link of the tool, and to no link of the arm"
             raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
+        # The root link of a tool file has its body frame at S.
         tool = plant.GetBodyByName("tool")
+        if plant.HasJointNamed("sensor_weld"):
+            tool = plant.GetJointByName("sensor_weld").child_body()
         above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])
         ball, properties = Sphere(PEG_RADIUS_M), _slot_contact_material(self)
         plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
@@ -104,13 +109,16 @@ class Slot(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        source = plant.get_source_id()
-        for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
-            scene_graph.AssignRole(source, ball, _slot_contact_material(self), RoleAssign.kReplace)
+        source, inspector = plant.get_source_id(), scene_graph.model_inspector()
+        for ball in chain.from_iterable(ToolShapes(plant, scene_graph, tool).values()):
+            material = _slot_contact_material(self, inspector.GetProximityProperties(ball))
+            scene_graph.AssignRole(source, ball, material, RoleAssign.kReplace)
 
 
-def _slot_contact_material(slot: Slot) -> ProximityProperties:
-    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction)
+def _slot_contact_material(
+    slot: Slot, old: ProximityProperties | None = None
+) -> ProximityProperties:
+    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction, old)
 
 
 def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
