@@ -11,7 +11,7 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.yaml import yaml_load
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     PrismaticJoint,
@@ -48,6 +48,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     environment_wrench_about_Wo_into,
     tool_proximity,
 )
+from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 from drake_teleop.station.slave.slave_config import Block as ToolBox
@@ -459,6 +460,97 @@ def test_bodies_of_a_scene_keep_their_poses_in_the_file(tmp_path, fixed, yaw):
         X_WB = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(name))
         expected = X_WFile @ RigidTransform(RollPitchYaw(roll, pitch, turn), p)
         np.testing.assert_allclose(X_WB.GetAsMatrix34(), expected.GetAsMatrix34(), atol=1e-12)
+
+
+PLATE = '<link name="plate"/>'
+ON_WORLD = '<joint name="j" type="{}"><parent>world</parent><child>plate</child>{}</joint>'
+DIRECTIVES = """directives:
+- add_model: {name: m, file: "file://FOLDER/plate.sdf"}
+- add_weld: {parent: world, child: "m::plate", X_PC: {translation: [0.1, 0.2, 0.3]}}
+"""
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+@pytest.mark.parametrize("kind", ["static", "joint", "urdf", "dmd.yaml"])
+def test_links_that_the_file_fixes_to_the_world_move_with_it(tmp_path, kind, yaw):
+    own, joint = "<pose>0.1 0.2 0.3 0 0 0</pose>", ON_WORLD.format("fixed", "")
+    inside = {"static": "<static>1</static>", "joint": joint}.get(kind, "")
+    model = f'<model name="m">{own if inside else ""}{PLATE}{inside}</model>'
+    (tmp_path / "plate.sdf").write_text(f'<sdf version="1.9">{model}</sdf>')
+    end = '<origin xyz="0.1 0.2 0.3"/><parent link="world"/><child link="plate"/>'
+    text = f'<robot name="r"><link name="world"/>{PLATE}<joint name="j" type="fixed">{end}</joint>'
+    (tmp_path / "plate.urdf").write_text(f"{text}</robot>")
+    (tmp_path / "plate.dmd.yaml").write_text(DIRECTIVES.replace("FOLDER", str(tmp_path)))
+    file, plant = f"plate.{kind if '.' in kind or kind == 'urdf' else 'sdf'}", MultibodyPlant(0.0)
+    place = [0.5, -0.1, 0.2]
+    Scene(file=str(tmp_path / file), position=place, rotation=[0.0, 0.0, yaw]).AddTo(plant)
+    plant.Finalize()
+    X_WB = plant.EvalBodyPoseInWorld(plant.CreateDefaultContext(), plant.GetBodyByName("plate"))
+    expected = RigidTransform(RollPitchYaw(0, 0, yaw), place) @ np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(X_WB.translation(), expected, atol=1e-12)
+    turned = RotationMatrix.MakeZRotation(yaw).matrix()
+    np.testing.assert_allclose(X_WB.rotation().matrix(), turned, atol=1e-12)
+
+
+def test_moving_joints_and_shapes_on_the_world_refuse_a_pose_of_the_file(tmp_path):
+    hinge = ON_WORLD.format("revolute", "<axis><xyz>0 0 1</xyz></axis>")
+    sdf = f'<sdf version="1.9"><model name="m">{PLATE}{hinge}</model></sdf>'
+    mjcf = '<mujoco model="m"><worldbody><geom size="0.1"/></worldbody></mujoco>'
+    for name, text, what in (("a.sdf", sdf, "the joint j"), ("a.xml", mjcf, "a shape")):
+        (tmp_path / name).write_text(text)
+        for place, refused in (([0.5, 0.0, 0.0], True), ([0.0, 0.0, 0.0], False)):
+            scene = Scene(file=str(tmp_path / name), position=place)
+            plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+            if not refused:
+                scene.AddTo(plant)
+                continue
+            with pytest.raises(DrakeTeleopError, match=f"cannot move {what} on the world; attach"):
+                scene.AddTo(plant)
+
+
+@pytest.mark.parametrize(("limit", "friction"), [(1.9, 0.0), (1e16, 0.3), (0.5, 0.2), (1e16, 0.0)])
+def test_limits_and_friction_of_a_scene_without_effect_are_stated(tmp_path, limit, friction):
+    text = (models_dir() / "door.sdf").read_text().replace(">1.9<", f">{limit}<")
+    text = text.replace(">-1.9<", f">{-limit}<").replace(
+        "<damping>", f"<friction>{friction}</friction><damping>"
+    )
+    (tmp_path / "mine.sdf").write_text(text)
+    _, texts = start_overlap_texts(Slave(), Scene(file=str(tmp_path / "mine.sdf")))
+    stated = [each for each in texts if each.startswith("mine.sdf: no ")]
+    expected = ["dry friction"] * (friction > 0.0) + ["position limits"] * (limit < 1e4)
+    assert stated == [f"mine.sdf: no {x}, which the model has, of hinge" for x in expected]
+
+
+def test_moving_bodies_with_similar_names_have_different_names(tmp_path):
+    inertia = "<inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia>"
+    names = ["left door", "left_door", "left-door", "lid"]
+    links = "".join(
+        f'<model name="m {k}"><link name="{name}"><inertial><mass>1</mass>{inertia}</inertial>'
+        "</link></model>"
+        for k, name in enumerate(names)
+    )
+    (tmp_path / "a.sdf").write_text(f'<sdf version="1.9"><world name="w">{links}</world></sdf>')
+    scene = Scene(file=str(tmp_path / "a.sdf"), fixed=False)
+    moving = AddSlavePlant(DiagramBuilder(), Slave(), scene).contact.moving_bodies
+    assert len(set(moving.values())) == len(names)
+    assert set(moving) == {"m_0_left_door", "m_1_left_door", "m_2_left_door", "lid"}
+
+
+@pytest.mark.parametrize(
+    ("normal", "second", "first"),
+    [([0, 0, 1], 0, 1), ([0, 0, -1], 0, 1), ([1, 0, 0], 1, 2), ([0, -1, 0], 0, 2)],
+)
+def test_edges_of_a_wall_are_in_the_documented_order(normal, second, first):
+    wall = Wall(position=[0.0, 0.0, 0.0], normal=list(map(float, normal)), size=[1.0, 0.2])
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    wall.AddTo(plant)
+    plant.Finalize()
+    (shape,) = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("wall"))
+    X_WBox = plant.GetBodyByName("wall").EvalPoseInWorld(plant.CreateDefaultContext())
+    edges = (
+        np.abs(X_WBox.rotation().matrix()) @ scene_graph.model_inspector().GetShape(shape).size()
+    )
+    np.testing.assert_allclose(edges[[first, second]], [1.0, 0.2], atol=1e-12)
 
 
 @pytest.mark.parametrize(

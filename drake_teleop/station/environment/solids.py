@@ -89,7 +89,14 @@ class Wall(Surface):
 
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
     normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outwards, in W, of any length")
-    size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "edges of its face; it is 0.1 m thick")
+    size: list[float] = quantity(
+        [0.4, 0.4],
+        "m",
+        1e-3,
+        4.0,
+        "edges of its face, the second along the first axis of W that is most perpendicular to"
+        " normal (normal [0, 0, 1]: along y, x); it is 0.1 m thick",
+    )
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:

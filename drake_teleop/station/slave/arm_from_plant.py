@@ -31,7 +31,6 @@ from drake_teleop.station.slave.arm import (
 _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
 _MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi  # larger ranges may be in degrees
-_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4  # larger: no limit; SDF specifies 1e16
 _TIME_TO_SPEED_LIMIT_S = 0.4  # to the speed limit
 
 
@@ -98,7 +97,7 @@ def _joint_limits(
 ) -> tuple[float, float, float, float]:
     """Return lower, upper, speed and acceleration limit of a joint; infinite for no limit."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-    limit = _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M
+    limit = chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M
     # Exporters write 0 to 0 for unknown limits.
     is_unknown = isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0
     lower = -np.inf if is_unknown or lower < -limit else lower

@@ -193,12 +193,20 @@ def ParseTool(
     return roots[0], [*model.assumptions, *held_joints]
 
 
-def ParseScene(plant: MultibodyPlant, path: Path) -> None:
-    """Parse surroundings; raise DrakeTeleopError for mimic joints, links that float on links."""
-    _, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
+def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
+    """Parse surroundings; return texts about their data that are assumed or have no effect.
+
+    A DrakeTeleopError is raised for mimic joints, and links that float on links.
+    """
+    instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():
         remedy = "remove this dependence; surroundings need independent joints and links"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
+    for joint in (plant.get_joint(k) for each in instances for k in plant.GetJointIndices(each)):
+        limits = *joint.position_lower_limits(), *joint.position_upper_limits()
+        if any(abs(limit) < chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M for limit in limits):
+            model.add_assumption("no position limits, which the model has, of", joint.name())
+    return model.assumptions
 
 
 def _find_sensor_frame(

@@ -24,6 +24,7 @@ from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.chain_joints import AddSkeleton, bodies_carried_by
 from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.model.model_repair import join_names
+from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,
@@ -205,7 +206,9 @@ def _warnings_and_assumptions(key: HashableByValue) -> tuple[tuple[str, ...], tu
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
-    return tuple(overlap_warnings(shapes)), tuple(shapes.assumptions)
+    scenes = [part.path for part in parts if isinstance(part, Scene)]
+    texts = [f"{path.name}: {x}" for path in scenes for x in ParseScene(MultibodyPlant(0.0), path)]
+    return tuple(overlap_warnings(shapes)), (*shapes.assumptions, *texts)
 
 
 def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list[str]:

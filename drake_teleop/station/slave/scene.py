@@ -6,7 +6,7 @@ from pathlib import Path
 from pydrake import geometry
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, Joint, WeldJoint
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -49,6 +49,8 @@ class Scene(Environment):
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         before, path = plant.num_bodies(), self.path
+        shapes_on, world = plant.GetCollisionGeometriesForBody, plant.world_body()
+        num_world_shapes, joints_before = len(shapes_on(world)), set(plant.GetJointIndices())
         ParseScene(plant, path)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
@@ -65,6 +67,10 @@ class Scene(Environment):
         attached = {joint.child_body().index() for joint in joints}
         bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WFile = RigidTransform(RollPitchYaw(self.rotation), self.position)
+        if not X_WFile.IsExactlyIdentity():
+            own = [joint for joint in joints if joint.index() not in joints_before]
+            shape = "a shape" if len(shapes_on(world)) > num_world_shapes else ""
+            _move_welds_to_world(plant, own, X_WFile, shape, str(path))
         name = "GetDefaultFloatingBaseBodyPose"  # older versions of Drake have the second name
         pose_in_file = getattr(plant, name, None) or plant.GetDefaultFreeBodyPose
         for body in map(plant.get_body, bases):
@@ -95,6 +101,23 @@ class Scene(Environment):
                 geometry.AddCompliantHydroelasticProperties(mesh_edge, self.tool_modulus, material)
                 replace = geometry.RoleAssign.kReplace
                 scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)
+
+
+def _move_welds_to_world(
+    plant: MultibodyPlant, joints: list[Joint], X_WFile: RigidTransform, shape: str, where: str
+) -> None:
+    world = plant.world_frame()
+    on_world = [x for x in joints if x.parent_body().index() == world.body().index()]
+    moving = [f"the joint {joint.name()}" for joint in on_world if joint.num_velocities() > 0]
+    for part in filter(None, (*moving, shape)):
+        what = f"position and rotation cannot move {part} on the world"
+        remedy = "attach it to a link that is fixed to the world, or leave both fields out"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
+    for weld in on_world:
+        name, frame_M = weld.name(), weld.frame_on_child()
+        X_FileM = weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM()
+        plant.RemoveJoint(weld)
+        plant.AddJoint(WeldJoint(name, world, frame_M, X_WFile @ X_FileM))
 
 
 def has_hydroelastic_properties(properties: geometry.ProximityProperties) -> bool:

@@ -151,10 +151,13 @@ def MovingBodiesExceptLeaf(
     instances = [each for each in added.instances if each != added.leaf_instance]
     indices = [index for instance in instances for index in plant.GetBodyIndices(instance)]
     moving = [body for body in map(plant.get_body, indices) if not plant.IsAnchored(body)]
-    short = [body.name() for body in moving]
-    full = [body.scoped_name().get_full() for body in moving]
-    names = [s if short.count(s) == 1 else f for s, f in zip(short, full, strict=True)]
-    return {re.sub(r"\W+", "_", n): b.index() for n, b in zip(names, moving, strict=True)}
+    short = [re.sub(r"\W+", "_", body.name()) for body in moving]
+    full = [re.sub(r"\W+", "_", body.scoped_name().get_full()) for body in moving]
+    names = dict[str, tree.BodyIndex]()
+    for body, name, scoped in zip(moving, short, full, strict=True):
+        own = name if short.count(name) == 1 else scoped
+        names[own if own not in names else f"{own}_{int(body.index())}"] = body.index()
+    return names
 
 
 def supports_pose_conversion(joint: tree.Joint) -> bool:
