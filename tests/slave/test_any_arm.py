@@ -9,7 +9,9 @@ import numpy as np
 import odd_arms
 import pytest
 from odd_arms import other_arm_urdf
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Role
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -154,6 +156,47 @@ def test_arm_with_rx90_geometry_uses_closed_form():
     np.testing.assert_allclose(base.translation(), [0.1, -0.2, 0.3], atol=1e-15)
 
 
+MJCF_ARM = """<mujoco model="m"><worldbody><body name="base" pos="0.1 0 0.5" euler="0 20 0">{}
+<geom size="0.1"/><body name="link" pos="0 0 0.2"><joint axis="0 1 0"/><geom size="0.1"/>
+<body name="ft" pos="0 0 0.3"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *map(other_arm_urdf, ("fixed", "fixed"), ("world", "floor")),
+        *map(MJCF_ARM.format, ("", "<freejoint/>")),
+    ],
+)
+def test_base_pose_moves_an_arm_with_its_pose_in_the_file(tmp_path, text):
+    path = tmp_path / ("arm.xml" if text.startswith("<mujoco") else "arm.urdf")
+    path.write_text(text.replace('effort="40"', 'effort="400"'))
+    q = np.full(1 if path.suffix == ".xml" else 7, 0.2)
+
+    def pose(*base_pose):
+        slave = Slave(model=str(path), sensor_frame="ft", home=list(q), base_pose=list(base_pose))
+        qw, qx, qy, qz, *p = NominalSlave(slave).arm.pose(q)
+        return RigidTransform(Quaternion(qw, qx, qy, qz), p)
+
+    moved, at_rest = pose(0.3, -0.2, 0.7, 0.4, -0.3, 1.1), pose(*np.zeros(6))
+    X_WBase = RigidTransform(RollPitchYaw(0.4, -0.3, 1.1), [0.3, -0.2, 0.7])
+    assert moved.IsNearlyEqualTo(X_WBase @ at_rest, 1e-12)
+
+
+def test_base_pose_of_a_joint_on_the_world_is_one_error(tmp_path):
+    text = MJCF_ARM.format('<joint axis="0 0 1" name="turn"/>')
+    slave = Slave(model=str(tmp_path / "arm.xml"), sensor_frame="ft", base_pose=[0.1, *[0.0] * 5])
+    (tmp_path / "arm.xml").write_text(text)
+    with pytest.raises(
+        DrakeTeleopError, match=r"cannot move turn, which moves on the world; .*fix"
+    ):
+        NominalSlave(slave)
+    attached = text.replace("<worldbody>", '<worldbody><body name="floor">')
+    (tmp_path / "arm.xml").write_text(attached.replace("</worldbody>", "</body></worldbody>"))
+    slave.home = [0.0, 0.2]
+    assert NominalSlave(slave).X_WS_start[4] > 0.2
+
+
 def test_tool_from_mass_and_shapes():
     inertia = [0.02, 1e-3, -2e-3, 0.03, 1.5e-3, 0.025]
     shapes = [Ball(0.02, [0, 0, 0.1]), Block([0.02, 0.06, 0.1], [0, 0.01, 0.1], [np.pi / 2, 0, 0])]
@@ -247,7 +290,6 @@ def test_arm_without_visuals_is_shown_as_sticks(scenario):
         ({"home": HOME[:6]}, "has 6 numbers, but the arm has 7 joints; give 7, for"),
         ({"home": [9.0, *HOME[1:]]}, "joint j1 at 9 is outside its limits, -2 to 2.5"),
         ({"home": [], "position": [4.0, 0.0, 0.4]}, "cannot reach.*slave.home"),
-        ({"base_pose": [0.1, 0, 0, 0, 0, 0]}, "already welds its base base to the world"),
         ({"inverse_kinematics": "closed_form"}, "closed form requires the geometry of an RX90"),
         ({"tool": Tool(mass=90.0)}, "hold its 90.9 kg at the start: j4 needs 566 N, but its"),
         ({"torque_limits": {"j4": 5.0}}, "j4 .* its limit is 5 N;.*set slave.torque_limits"),

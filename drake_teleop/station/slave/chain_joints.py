@@ -91,17 +91,28 @@ def weld_base_and_find_chain(
 ) -> list[Joint]:
     """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
-    A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
+    `X_WBase` also moves a base that the model welds to the world; a DrakeTeleopError is raised if a
+    joint moves there.
     """
     chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
     if base.index() != plant.world_body().index():
         plant.WeldFrames(plant.world_frame(), base.body_frame(), X_WB)
     elif not X_WB.IsExactlyIdentity():
-        what = f"the model already welds its base {chain[0].child_body().name()} to the world"
-        remedy = "leave slave.base_pose out, or remove that joint from the model"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
+        if not isinstance(chain[0], WeldJoint):
+            what = f"slave.base_pose cannot move {chain[0].name()}, which moves on the world"
+            remedy = "leave it out, or attach the joint to a link without joint or with a fixed one"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
+        chain[0] = move_weld_to_world(plant, chain[0], X_WB)
     return chain
+
+
+def move_weld_to_world(plant: MultibodyPlant, weld: WeldJoint, X: RigidTransform) -> WeldJoint:
+    """Replace a weld to the world by one whose child is moved by X, a transform in W."""
+    name, frame_M = weld.name(), weld.frame_on_child()
+    X_WM = X @ weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM()
+    plant.RemoveJoint(weld)
+    return plant.AddJoint(WeldJoint(name, plant.world_frame(), frame_M, X_WM))
 
 
 def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:

@@ -6,12 +6,13 @@ from pathlib import Path
 from pydrake import geometry
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Joint, WeldJoint
+from pydrake.multibody.tree import BodyIndex, Joint
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, ToolShapes
+from drake_teleop.station.slave.chain_joints import move_weld_to_world
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
@@ -106,18 +107,15 @@ class Scene(Environment):
 def _move_welds_to_world(
     plant: MultibodyPlant, joints: list[Joint], X_WFile: RigidTransform, shape: str, where: str
 ) -> None:
-    world = plant.world_frame()
-    on_world = [x for x in joints if x.parent_body().index() == world.body().index()]
+    world = plant.world_body().index()
+    on_world = [joint for joint in joints if joint.parent_body().index() == world]
     moving = [f"the joint {joint.name()}" for joint in on_world if joint.num_velocities() > 0]
     for part in filter(None, (*moving, shape)):
         what = f"position and rotation cannot move {part} on the world"
         remedy = "attach it to a link that is fixed to the world, or leave both fields out"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for weld in on_world:
-        name, frame_M = weld.name(), weld.frame_on_child()
-        X_FileM = weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM()
-        plant.RemoveJoint(weld)
-        plant.AddJoint(WeldJoint(name, world, frame_M, X_WFile @ X_FileM))
+        move_weld_to_world(plant, weld, X_WFile)
 
 
 def has_hydroelastic_properties(properties: geometry.ProximityProperties) -> bool:
