@@ -44,6 +44,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
     ContactPlantCopy,
+    contact_and_plant_rates_into,
     contact_wrench_W,
     environment_wrench_about_Wo_into,
     tool_proximity,
@@ -162,6 +163,25 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         touched.add((bool(k % 2), bool(expected.any())))
     assert slave.contact.drake_contact_reason == ""
     assert len(touched) == 4  # with contact of the block and without
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.01])
+def test_a_drawer_is_not_a_leaf_for_the_states_between_steps(tmp_path, depth):
+    """The states of a leaf, which does not exist, stay at zero in contact."""
+    (tmp_path / "cabinet.sdf").write_text(CABINET)
+    cabinet = Scene(file=str(tmp_path / "cabinet.sdf"))
+    first = AddSlavePlant(DiagramBuilder(), Slave(), cabinet)
+    drawer, context = first.plant.GetBodyByName("drawer"), first.plant.CreateDefaultContext()
+    p_WDrawer = drawer.EvalPoseInWorld(context).translation()
+    cabinet.position = np.add(first.p_WTip_start - p_WDrawer, depth).tolist()
+    slave = AddSlavePlant(DiagramBuilder(), Slave(), cabinet)
+    n, wrench_W = slave.arm.num_joints, np.zeros(6)
+    state = slave.plant.GetPositionsAndVelocities(slave.plant.CreateDefaultContext())
+    x = np.concatenate([slave.start, np.zeros(n + 2), state])
+    xdot, none = np.zeros(2 * n + 2), np.zeros(6)
+    contact_and_plant_rates_into(slave.physics_of_plant, x, np.zeros(n), none, wrench_W, xdot)
+    assert np.linalg.norm(wrench_W[:3]) > 1.0
+    assert xdot[n] == xdot[-1] == 0.0
 
 
 @pytest.mark.parametrize("depth", [0.001, 0.004])

@@ -86,7 +86,8 @@ def FindContactPairs(
     for body in map(plant.get_body, touched):
         row = row_bodies.index(int(body.index())) if int(body.index()) in row_bodies else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
-        direction = _prismatic_joint_direction_W(plant, context, body)
+        # A body of the joint table moves by its joint, not by the leaf's deflection.
+        direction = _prismatic_joint_direction_W(plant, context, body) if row < 0 else np.zeros(3)
         for other in plant.GetCollisionGeometriesForBody(body):
             for own, X_SOwn in tool.items():
                 has_contact = inspector.GetProximityProperties(other) is not None

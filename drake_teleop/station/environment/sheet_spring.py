@@ -23,10 +23,16 @@ class SheetSpring(environment.Environment):
     """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, middle of the unloaded leaf's top, in W"
+        [0.55, 0.0, 0.15],
+        "m",
+        -2.0,
+        2.0,
+        "p_WLeaf, on the unloaded leaf's top, 25 mm from its free end at -x_W",
     )
     length: float = quantity(0.170, "m", 0.02, 1.0, "free length of the leaf")
-    width: float = quantity(0.060, "m", 0.005, 0.5, "width of the section")
+    width: float = quantity(
+        0.060, "m", 0.005, 0.5, "width of the section; the touched face remains 170 x 60 mm"
+    )
     thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the section")
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
