@@ -22,6 +22,8 @@ from drake_teleop.station.slave.model.mjcf_meshes import Mesh, fit_shape_to_mesh
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
 from drake_teleop.station.slave.models import ParseScene, ParseTool
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Slave, Tool
 
 INERTIAL = '<inertial pos="0 0 0" mass="2" diaginertia="0.02 0.02 0.02"/>'
 SENSOR = '<body name="S" pos="0 0 0.5"/>'
@@ -482,6 +484,16 @@ def test_scene_keeps_its_bodies_and_refuses_what_drake_ignores(tmp_path):
     ):
         with pytest.raises(DrakeTeleopError, match=expected):
             ParseScene(plant, written(tmp_path, mjcf(CUP + door, tail=tail), "b.xml"))
+
+
+@pytest.mark.parametrize("place", [(0.03, 0.0, 0.15), (-0.01, 0.02, 0.3)])
+@pytest.mark.parametrize("inner", ["{}", '<body name="finger" pos="0 0.1 0">{}</body>'])
+def test_site_named_tip_is_the_tip_of_a_tool(tmp_path, place, inner):
+    site = inner.format(f'<site name="tip" pos="{" ".join(map(str, place))}"/>')
+    text = mjcf(f'<body name="hand" pos="1 2 3">{INERTIAL}{site}</body>')
+    tool = Tool(model=str(written(tmp_path, text, "a.xml")))
+    tip, offset = NominalSlave(Slave(tool=tool)).tip, [0.0, 0.1 * ("finger" in inner), 0.0]
+    np.testing.assert_allclose(tip, np.add(place, offset), atol=1e-12)
 
 
 @pytest.mark.parametrize("root", ["", "<freejoint/>"])

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 from test_bad_models import INERTIA, INERTIAL, LIMIT, arm, joint, link
@@ -376,6 +377,38 @@ def test_sdf_joint_with_the_name_of_a_link_gets_another(tmp_path, name):
     _, model, said = read(path, "ft", shapes=True)
     assert f"a new name for the joint {name} ({name}_1)" in said
     assert model.joint_names == (f"{name}_1",) and model.effort_limit[0] == 30.0
+
+
+TURN = '<joint name="turn" type="revolute"><parent>{}</parent><child>{}</child>{}{}</joint>'
+
+
+@pytest.mark.parametrize("own_pose", ["", "<pose>0.1 0 0 0 0.4 0</pose>"])
+@pytest.mark.parametrize("parent", ["base", "mount", "nested"])
+@pytest.mark.parametrize("child", ["hand", "bearing"])
+def test_sdf_joints_between_frames_are_those_of_the_file(tmp_path, parent, child, own_pose):
+    inertial = "<inertial><mass>1</mass></inertial>"
+    links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("base", "hand"))
+    frames = "".join(
+        f'<frame name="{name}" attached_to="{link}"><pose>{place}</pose></frame>'
+        for name, link, place in (
+            ("mount", "base", "0 0.1 0.2 0.3 0 0"),
+            ("nested", "mount", "0.2 0 0 0 0.1 0"),
+            ("bearing", "hand", "0 0.2 0.1 0 0.5 0.6"),
+        )
+    )
+    turn = TURN.format(parent, child, own_pose, "<axis><xyz>0.6 0 0.8</xyz></axis>")
+    text = f'<sdf version="1.9"><model name="m">{links}{frames}{turn}</model></sdf>'
+    path = written(tmp_path, text, "arm.sdf")
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
+    plant.Finalize()
+    context, (_, model, said) = plant.CreateDefaultContext(), read(path, "hand")
+    assert model.joint_names == ("turn",) and "left out" not in said
+    for q in (-0.4, 0.0, 1.3):
+        plant.SetPositions(context, [q])
+        expected = plant.GetBodyByName("hand").EvalPoseInWorld(context).GetAsMatrix34()
+        np.testing.assert_allclose(pose(model, [q]), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("outer_name", ["outer.sdf", "arm.sdf"])

@@ -45,6 +45,8 @@ def repair_mjcf(model: ModelRepair) -> None:
     is_complete = purpose.is_scene or purpose.is_in_directives
     if is_complete or not purpose.sensor_name:
         world = _split_into_one_joint_bodies(reader.read_world())
+        if purpose.is_tool:
+            _insert_sensor_frame_at_site(world, "tip", is_force_sensor_site=False)
     else:
         world = _read_world_with_only_arm(mjcf, reader)
     bodies, sensor = world.with_descendants(), purpose.sensor_name

@@ -69,6 +69,8 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
     model_numbers.replace_commas_by_blanks(model.root)
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
+        if is_sdf:
+            _attach_joints_to_links_of_frames(scope)
         _make_joint_and_link_names_unique(scope, model, is_sdf=is_sdf)
     chain, num_joints_to_link = _reduce_model_to_arm(scopes, model) or (set(), {})
     for scope in scopes:
@@ -119,6 +121,18 @@ def _reduce_model_to_arm(
         return None
     link = link_of_frame(scopes[0], purpose.sensor_name) if purpose.sensor_name else ""
     return model_tree.reduce_to_chain(scopes[0], link, model) if link else None
+
+
+def _attach_joints_to_links_of_frames(scope: Element) -> None:
+    for joint in list_joints(scope):
+        for element in (*joint.findall("parent"), *joint.findall("child")):
+            name = (element.text or "").strip()
+            link = link_of_frame(scope, name)
+            if link and link != name:
+                element.text = link
+                if element.tag == "child":  # the frame in which the joint has its pose
+                    poses = joint.findall("pose") or [SubElement(joint, "pose")]
+                    poses[0].set("relative_to", poses[0].get("relative_to") or name)
 
 
 def _make_joint_and_link_names_unique(scope: Element, model: ModelRepair, *, is_sdf: bool) -> None:
