@@ -573,6 +573,24 @@ def test_edges_of_a_wall_are_in_the_documented_order(normal, second, first):
     np.testing.assert_allclose(edges[[first, second]], [1.0, 0.2], atol=1e-12)
 
 
+NAMED_TOOL = """<robot name="block"><link name="{0}"><inertial><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><sphere radius="0.02"/></geometry></collision></link></robot>"""
+
+
+@pytest.mark.parametrize("name", ["leaf", "block", "wall", "table"])
+def test_contacts_do_not_depend_on_the_names_of_the_tools_links(tmp_path, name):
+    def touchable(link):
+        (tmp_path / "tool.urdf").write_text(NAMED_TOOL.format(link))
+        builder, slave = DiagramBuilder(), Slave(tool=Tool(model=str(tmp_path / "tool.urdf")))
+        both = SeveralObjects([Block(), Wall(), Block(position=[0.0, 0.5, 0.0]), SheetSpring()])
+        AddSlavePlant(builder, slave, both)
+        (scene_graph,) = (x for x in builder.GetSystems() if x.get_name() == "scene_graph")
+        return len(scene_graph.model_inspector().GetCollisionCandidates())
+
+    assert touchable(name) == touchable("grip")
+
+
 @pytest.mark.parametrize(
     ("thing", "what"),
     [

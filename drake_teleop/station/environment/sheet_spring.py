@@ -90,5 +90,6 @@ class SheetSpring(environment.Environment):
     ) -> None:
         tool_bodies = environment.BodiesWeldedToTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
-        shapes = plant.GetCollisionGeometriesForBody(plant.GetBodyByName("leaf"))
+        leaf = plant.GetBodyByName("leaf", plant.GetModelInstanceByName("sheet_spring"))
+        shapes = plant.GetCollisionGeometriesForBody(leaf)
         environment.ExcludeContact(plant, scene_graph, shapes, others)

@@ -164,12 +164,13 @@ class Block(Surface):
     ) -> None:
         """Exclude contact of the tool with the block's corner balls, and of others with its box."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
-        blocks = [body for body in map(plant.get_body, bodies) if body.name() == _BLOCK_BODY_NAME]
+        tool_bodies = BodiesWeldedToTool(plant, tool)
+        around = [plant.get_body(index) for index in bodies if index not in tool_bodies]
+        blocks = [body for body in around if body.name() == _BLOCK_BODY_NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]
         name = scene_graph.model_inspector().GetName
         feet = [shape for shape in shapes if _FOOT_NAME_PREFIX in name(shape)]
         boxes = [shape for shape in shapes if shape not in feet]
-        tool_bodies = BodiesWeldedToTool(plant, tool)
         ExcludeContact(plant, scene_graph, feet, tool_bodies)
         others = {*tool_bodies, *(body.index() for body in blocks)}
         ExcludeContact(plant, scene_graph, boxes, [k for k in bodies if k not in others])

@@ -86,7 +86,7 @@ class Tool:
             raise DrakeTeleopError(what, where=f"{where}.mass", remedy="leave one of them out")
         if self.mass == 0.0 and (self.shapes or any(self.inertia) or self.com != Tool().com):
             what = "shapes, inertia and com require a mass"
-            remedy = "give the mass, or remove them"
+            remedy = "remove them" if self.model else "give the mass, or remove them"
             raise DrakeTeleopError(what, where=f"{where}.mass", remedy=remedy)
         if not _tool_spatial_inertia(self).IsPhysicallyValid():
             what = "the inertia is impossible for a rigid body"
