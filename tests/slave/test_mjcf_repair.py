@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 from test_model_repairs import pose, read, written
 
@@ -477,6 +477,10 @@ def test_scene_keeps_its_bodies_and_refuses_what_drake_ignores(tmp_path):
     plant.Finalize()
     assert plant.num_velocities() == 7
     assert len(plant.GetCollisionGeometriesForBody(plant.world_body())) == 1
+    rough = mjcf(DOOR.format(' frictionloss="0.3" range="0 90"'))
+    notes = ParseScene(MultibodyPlant(0.0), written(tmp_path, rough, "c.xml"))
+    for what in ("dry friction", "position limits"):
+        assert f"no {what}, which the model has, of hinge" in notes
     for door, tail, expected in (
         (DOOR.format(' stiffness="3"'), "", "no spring, .* of hinge"),
         (DOOR.format(""), '<equality><weld body1="cup"/></equality>', "no coupling, .* by weld"),

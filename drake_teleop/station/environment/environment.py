@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from pydrake import geometry
+from pydrake.geometry import ProximityProperties
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloatingJoint, RigidBody
@@ -145,19 +146,15 @@ def ExcludeContact(
 
 
 def ContactMaterial(
-    stiffness: float,
-    dissipation: float,
-    friction: float,
-    old: geometry.ProximityProperties | None = None,
-) -> geometry.ProximityProperties:
+    stiffness: float, dissipation: float, friction: float, old: ProximityProperties | None = None
+) -> ProximityProperties:
     """Return a material for point contact, with the hydroelastic properties of `old`, if any.
 
     Units: stiffness [N/m], Hunt-Crossley dissipation [s/m], friction coefficient [1].
     """
-    properties = geometry.ProximityProperties(old or geometry.ProximityProperties())
+    properties = ProximityProperties(old or ProximityProperties())
     for name in ("point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"):
         properties.RemoveProperty("material", name)
-    geometry.AddContactMaterial(
-        properties, dissipation, stiffness, CoulombFriction(friction, friction)
-    )
+    law = CoulombFriction(friction, friction)
+    geometry.AddContactMaterial(properties, dissipation, stiffness, law)
     return properties

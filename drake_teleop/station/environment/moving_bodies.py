@@ -60,15 +60,13 @@ def MakeJointTableAndRowBodies(
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_table_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
+        rows.append(_joint_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
-def _joint_table_row(
-    plant: MultibodyPlant, context: Context, joint: tree.Joint, parent_row: int
-) -> Array:
+def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, above: int) -> Array:
     F = joint.frame_on_parent()
-    X_PF = F.CalcPoseInWorld(context) if parent_row < 0 else F.GetFixedPoseInBodyFrame()
+    X_PF = F.CalcPoseInWorld(context) if above < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _FIXED_JOINT, np.zeros(3)
     if isinstance(joint, tree.RevoluteJoint):
@@ -79,7 +77,7 @@ def _joint_table_row(
         kind = _FREE_JOINT
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
-    return np.array([parent_row, kind, *places, *axis, *poses[0], *poses[1]])
+    return np.array([above, kind, *places, *axis, *poses[0], *poses[1]])
 
 
 @njit(cache=True)

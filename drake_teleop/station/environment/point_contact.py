@@ -86,7 +86,7 @@ def FindContactPairs(
     for body in map(plant.get_body, touched):
         row = row_bodies.index(int(body.index())) if int(body.index()) in row_bodies else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
-        # A body of the joint table moves by its joint, not by the leaf's deflection.
+        # Only the leaf is not in the joint table.
         direction = _prismatic_joint_direction_W(plant, context, body) if row < 0 else np.zeros(3)
         for other in plant.GetCollisionGeometriesForBody(body):
             for own, X_SOwn in tool.items():
@@ -144,13 +144,11 @@ def _require_sphere_and_box(
 
 
 def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
-    plant.SetVelocities(context, np.zeros(plant.num_velocities()))
-    direction = np.zeros(3)
     for joint in map(plant.get_joint, plant.GetJointIndices()):
         if joint.child_body().index() == body.index() and isinstance(joint, PrismaticJoint):
             R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
-            direction = R_WF @ joint.translation_axis()
-    return direction
+            return np.asarray(R_WF @ joint.translation_axis())
+    return np.zeros(3)
 
 
 def _combined_contact_law_parameters(

@@ -94,12 +94,11 @@ class Slot(Environment):
             what = f"a slot requires one body named tool, found {count}"
             remedy = "give this name to one link of the tool, and to no link of the arm"
             raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
-        # The root link of a tool file has its body frame at S.
         tool = plant.GetBodyByName("tool")
-        if plant.HasJointNamed("sensor_weld"):
+        if plant.HasJointNamed("sensor_weld"):  # to the tool's root link, whose body frame is S
             tool = plant.GetJointByName("sensor_weld").child_body()
         above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])
-        ball, properties = Sphere(PEG_RADIUS_M), _slot_contact_material(self)
+        ball, properties = Sphere(PEG_RADIUS_M), _slot_material(self)
         plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
         plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _PEG_BALL_COLOUR_RGBA)
         for name, (X_MBox, box) in _boxes_of_slot(self).items():
@@ -111,13 +110,11 @@ class Slot(Environment):
     ) -> None:
         source, inspector = plant.get_source_id(), scene_graph.model_inspector()
         for ball in chain.from_iterable(ToolShapes(plant, scene_graph, tool).values()):
-            material = _slot_contact_material(self, inspector.GetProximityProperties(ball))
+            material = _slot_material(self, inspector.GetProximityProperties(ball))
             scene_graph.AssignRole(source, ball, material, RoleAssign.kReplace)
 
 
-def _slot_contact_material(
-    slot: Slot, old: ProximityProperties | None = None
-) -> ProximityProperties:
+def _slot_material(slot: Slot, old: ProximityProperties | None = None) -> ProximityProperties:
     return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction, old)
 
 

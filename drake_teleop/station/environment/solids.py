@@ -90,13 +90,9 @@ class Wall(Surface):
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
     normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outwards, in W, of any length")
     size: list[float] = quantity(
-        [0.4, 0.4],
-        "m",
-        1e-3,
-        4.0,
-        "edges of its face, the second along the first axis of W that is most perpendicular to"
-        " normal (normal [0, 0, 1]: along y, x); it is 0.1 m thick",
-    )
+        [0.4, 0.4], "m", 1e-3, 4.0, "edges of its face, the second along the first of x_W, y_W, z_W"
+        " that is most perpendicular to normal; it is 0.1 m thick",
+    )  # fmt: skip
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:
@@ -146,9 +142,8 @@ class Block(Surface):
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
         body = plant.AddRigidBody(_BLOCK_BODY_NAME, NewInstance(plant, _BLOCK_BODY_NAME), inertia)
         x, y, foot = self.position
-        turned = RollPitchYaw(0.0, 0.0, self.yaw)
-        X_WBlock = RigidTransform(turned, [x, y, foot + self.size[2] / 2])
-        AddFreeJoint(plant, body, X_WBlock)
+        turned, centre = RollPitchYaw(0.0, 0.0, self.yaw), [x, y, foot + self.size[2] / 2]
+        AddFreeJoint(plant, body, RigidTransform(turned, centre))
         if not plant.geometry_source_is_registered():
             return
         here, box = RigidTransform(), BoxShape(*self.size)

@@ -28,6 +28,7 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
 )
 
+OneAxisJoint = tree.RevoluteJoint | tree.PrismaticJoint
 _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
 _MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi  # larger ranges may be in degrees
@@ -92,9 +93,7 @@ def ArmModelFromPlant(
     return ArmModel(names, table, lower, upper, *rates, q_index, v_index)
 
 
-def _joint_limits(
-    joint: tree.RevoluteJoint | tree.PrismaticJoint,
-) -> tuple[float, float, float, float]:
+def _joint_limits(joint: OneAxisJoint) -> tuple[float, float, float, float]:
     """Return lower, upper, speed and acceleration limit of a joint; infinite for no limit."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     limit = chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M
@@ -105,10 +104,8 @@ def _joint_limits(
     return lower, upper, joint.velocity_upper_limits()[0], joint.acceleration_upper_limits()[0]
 
 
-def _moving_joints_to_sensor(
-    plant: MultibodyPlant, frame_S: tree.Frame
-) -> list[tree.RevoluteJoint | tree.PrismaticJoint]:
-    joints = list[tree.RevoluteJoint | tree.PrismaticJoint]()
+def _moving_joints_to_sensor(plant: MultibodyPlant, frame_S: tree.Frame) -> list[OneAxisJoint]:
+    joints = list[OneAxisJoint]()
     for joint in chain_joints.chain_to_body(plant, frame_S.body()):
         if isinstance(joint, (tree.RevoluteJoint, tree.PrismaticJoint)):
             joints.append(joint)

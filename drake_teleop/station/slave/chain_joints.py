@@ -12,18 +12,9 @@ import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import Capsule
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Frame,
-    Joint,
-    JointIndex,
-    ModelInstanceIndex,
-    PrismaticJoint,
-    RevoluteJoint,
-    RigidBody,
-    WeldJoint,
-)
+from pydrake.multibody.tree import Frame, Joint, PrismaticJoint, RevoluteJoint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -42,13 +33,13 @@ _SKELETON_CAPSULE_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
-def joints_by_child(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
+def joints_by_child(plant: MultibodyPlant) -> dict[tree.BodyIndex, Joint]:
     joints = map(plant.get_joint, plant.GetJointIndices())
     return {joint.child_body().index(): joint for joint in joints}
 
 
 def chain_to_body(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
-    """Return the joints between the base and a body, welds included, from the base outwards."""
+    """Return the joints from the base outwards to a body, welds included."""
     inboard, chain = joints_by_child(plant), list[Joint]()
     while body.index() in inboard:
         chain.append(inboard[body.index()])
@@ -64,7 +55,7 @@ def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]
 
 
 def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
-    parents: dict[BodyIndex, Joint] = {}
+    parents: dict[tree.BodyIndex, Joint] = {}
     world = plant.world_body().index()
     for joint in map(plant.get_joint, plant.GetJointIndices()):
         child = joint.child_body()
@@ -91,8 +82,7 @@ def weld_base_and_find_chain(
 ) -> list[Joint]:
     """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
-    `X_WBase` also moves a base that the model welds to the world; a DrakeTeleopError is raised if a
-    joint moves there.
+    It also moves a base that is welded there; for another joint a DrakeTeleopError is raised.
     """
     chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
@@ -107,16 +97,17 @@ def weld_base_and_find_chain(
     return chain
 
 
-def move_weld_to_world(plant: MultibodyPlant, weld: WeldJoint, X: RigidTransform) -> WeldJoint:
-    """Replace a weld to the world by one whose child is moved by X, a transform in W."""
+def move_weld_to_world(plant: MultibodyPlant, weld: WeldJoint, X_WFile: RigidTransform) -> Joint:
     name, frame_M = weld.name(), weld.frame_on_child()
-    X_WM = X @ weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM()
+    X_WM = X_WFile @ weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM()
     plant.RemoveJoint(weld)
     return plant.AddJoint(WeldJoint(name, plant.world_frame(), frame_M, X_WM))
 
 
-def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
-    """Weld bodies without a joint to the world; return a list with at most one note on them."""
+def weld_free_bodies(
+    plant: MultibodyPlant, instances: Iterable[tree.ModelInstanceIndex]
+) -> list[str]:
+    """Weld bodies without a joint to the world; return at most one note."""
     held = joints_by_child(plant)
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
@@ -147,7 +138,7 @@ def check_chain(
 
 
 def weld_held_joints(
-    plant: MultibodyPlant, frame: Frame, hold: dict[str, float], joints: Iterable[JointIndex]
+    plant: MultibodyPlant, frame: Frame, hold: dict[str, float], joints: Iterable[tree.JointIndex]
 ) -> list[str]:
     """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint.
 
@@ -174,9 +165,9 @@ def weld_held_joints(
 
 
 def weld_joints_outside_chain(
-    plant: MultibodyPlant, joints_before: set[JointIndex], chain: list[Joint]
+    plant: MultibodyPlant, joints_before: set[tree.JointIndex], chain: list[Joint]
 ) -> list[str]:
-    """Remove constraints, and weld moving joints outside `chain`; return notes for the user.
+    """Remove constraints, and weld moving joints outside `chain`; return notes.
 
     Joints in `joints_before`, which the plant had before the model was parsed, remain.
     """
@@ -276,7 +267,7 @@ def set_one_actuator_per_joint(plant: MultibodyPlant, moving: list[Joint]) -> No
 
 
 def set_torque_limits(
-    plant: MultibodyPlant, arm: ModelInstanceIndex, limits: dict[str, float]
+    plant: MultibodyPlant, arm: tree.ModelInstanceIndex, limits: dict[str, float]
 ) -> None:
     motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     known = {each.joint().name(): each for each in motors if each.model_instance() == arm}
@@ -291,7 +282,7 @@ def set_torque_limits(
 def add_rotor_inertias(
     plant: MultibodyPlant, chain: list[Joint], frame: Frame, auxiliary_bodies: set[str]
 ) -> list[str]:
-    """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
+    """Give a joint a rotor inertia if its links have no inertia; return notes.
 
     Its links extend to the next joint that is not on `auxiliary_bodies`, which the repair added.
     """

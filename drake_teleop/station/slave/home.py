@@ -35,8 +35,7 @@ def q_with_tool_down(
     middle = arm.middle_positions
     for share in _SEARCHED_JOINT_RANGE_SHARES:
         lower, upper = (middle + share * (limit - middle) for limit in (arm.lower, arm.upper))
-        inside = replace(arm, lower=lower, upper=upper)
-        q, status = find_posture(inside, pose, middle)
+        q, status = find_posture(replace(arm, lower=lower, upper=upper), pose, middle)
         if status == IkStatus.OK:
             break
     return q, status
@@ -78,9 +77,10 @@ def check_inertia_and_holding_torque(arm: ArmModel, q: Array) -> None:
     needed, limit = abs(torque[k]), arm.effort_limit[k]
     if needed > limit:
         unit = "N" if arm.table[k, IS_PRISMATIC_COLUMN] else "N m"
-        what = f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start"
-        needs = f"needs {needed:.3g} {unit}, but its limit is {limit:.3g} {unit}"
+        needs = (
+            f"{arm.joint_names[k]} needs {needed:.3g} {unit}, but its limit is {limit:.3g} {unit}"
+        )
+        what = f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {needs}"
         remedy = "give a lighter tool or payload, start nearer to the base, or set"
         remedy = f"{remedy} slave.torque_limits if the model's limits are wrong"
-        what = f"{what}: {arm.joint_names[k]} {needs}"
         raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)

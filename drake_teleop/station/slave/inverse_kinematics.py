@@ -57,9 +57,8 @@ class IkStatus(IntEnum):
 
 
 # Compiled code requires plain integers.
-_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _ = map(
-    int, IkStatus
-)
+_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, *_others = map(int, IkStatus)
+_JOINT_LIMIT, _BAD_POSE, _ = _others
 
 
 @njit(cache=True)

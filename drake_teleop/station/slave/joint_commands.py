@@ -33,8 +33,7 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 """Constructors of blocks by name, called with the arm, the start posture (n,) [rad] and the period
 [s]; the blocks have the ports of `InverseKinematics`."""
 
-# Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
-# mechanical stops of commercial arms are farther out.
+# A joint commanded to its limit overshoots slightly; mechanical stops are farther out.
 _JOINT_LIMIT_TOLERANCE_TO_RANGE_RATIO = 0.01
 
 
@@ -43,9 +42,7 @@ def used_ik_method(name: str, arm: ArmModel) -> str:
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
-        what = (
-            "the closed form requires the geometry of an RX90 with its base at the world's origin"
-        )
+        what = "the closed form requires the geometry of an RX90 with its base at the origin of W"
         remedy = f"set it to {AUTOMATIC_IK_METHOD} or numeric"
         raise DrakeTeleopError(what, where="slave.inverse_kinematics", remedy=remedy)
     return name

@@ -36,19 +36,13 @@ class PositionInterface:
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
     dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time, rounded to periods of command_hz")
-    acceleration_per_error: float = quantity(
-        300.0, "1/s^2", 1.0, 1e7, "acceleration per position error"
-    )
+    acceleration_per_error: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per error")
     lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "delay behind a command of constant speed")
     max_speed: float = quantity(
         math.pi, "rad/s", 1e-3, 100.0, "speed limit, unless the model's (or assumed) one is lower"
     )
-    max_acceleration: float = quantity(
-        40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit, in the same way"
-    )
-    drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets joint stiffness"
-    )
+    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit, likewise")
+    drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "drives' bandwidth; sets stiffness")
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""

@@ -97,8 +97,7 @@ def _add_directives(parser: parsing.Parser, model: ModelRepair) -> list[ModelIns
         reasons = parts[file].dependence_reasons
         model.dependence_reasons |= {f"{added.name}::{k}": why for k, why in reasons.items()}
     with raise_logged_errors():
-        models = parsing.ProcessModelDirectives(directives, parser)
-    return [each.model_instance for each in models]
+        return [x.model_instance for x in parsing.ProcessModelDirectives(directives, parser)]
 
 
 def _repair_model_text(model: ModelRepair) -> None:
@@ -194,9 +193,9 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
-    """Parse surroundings; return texts about their data that are assumed or have no effect.
+    """Parse surroundings; return texts about data that are assumed or have no effect.
 
-    A DrakeTeleopError is raised for mimic joints, and links that float on links.
+    A DrakeTeleopError is raised for mimic joints, links that float on links.
     """
     instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():

@@ -42,9 +42,8 @@ _MIN_GRADIENT_TO_ERROR_RATIO_M = 1e-3
 _MIN_OUT_OF_REACH_ERROR_M = 5e-6
 # The same for `find_posture`, which stops the search earlier [m].
 _MIN_OUT_OF_REACH_SEARCH_ERROR_M = 1e-3
-# Position error above which a pose is out of reach for an arm with fewer than 6 joints, which
-# always misses a part of the orientation [m]. 1 mm is visible at the tool, and about the
-# repeatability of small arms.
+# The same for the position [m] of an arm with fewer than 6 joints, which always misses a part of
+# the orientation. 1 mm is visible at the tool, and about the repeatability of small arms.
 _MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3

@@ -20,14 +20,8 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave import home
+from drake_teleop.station.slave import arm_from_plant, home
 from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, JointFriction
-from drake_teleop.station.slave.arm_from_plant import (
-    ArmModelFromPlant,
-    check_arm_lengths,
-    fill_missing_joint_limits,
-    values_per_joint,
-)
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, end_of_tool_shapes
@@ -99,7 +93,9 @@ class SlavePlant:
 
     @property
     def joint_friction(self) -> Array:
-        return values_per_joint(self.arm, self.config.friction, "slave.friction", 0.0)
+        return arm_from_plant.values_per_joint(
+            self.arm, self.config.friction, "slave.friction", 0.0
+        )
 
     @property
     def can_touch(self) -> bool:
@@ -182,7 +178,7 @@ def AddSlavePlant(
     start = home.find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
         home.check_inertia_and_holding_torque(arm, start)
-    friction = values_per_joint(arm, slave.friction, "slave.friction", 0.0)
+    friction = arm_from_plant.values_per_joint(arm, slave.friction, "slave.friction", 0.0)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
         block = builder.AddNamedSystem("joint_friction", law)
@@ -210,13 +206,13 @@ class ParsedSlave(NamedTuple):
     def arm(self) -> tuple[ArmModel, list[str]]:
         """Return the arm of the finalized plant, with default limits, and texts about these."""
         frame = self.sensor_frame
-        arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
+        arm = arm_from_plant.ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
             what = f"no body with a mass is attached to {frame.name()}"
             remedy = "set slave.tool, or a sensor_frame between the arm and the model's own tool"
             raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
-        check_arm_lengths(arm, str(self.slave.path))
-        arm, assumed = fill_missing_joint_limits(arm, str(self.slave.path))
+        arm_from_plant.check_arm_lengths(arm, str(self.slave.path))
+        arm, assumed = arm_from_plant.fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
             assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
         return arm, assumed
@@ -282,14 +278,12 @@ def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
     return hulls
 
 
-def hull_points_of(
-    inspector: geometry.SceneGraphInspector, identifier: geometry.GeometryId
-) -> Array:
+def hull_points_of(inspector: geometry.SceneGraphInspector, solid: geometry.GeometryId) -> Array:
     """Return points (k, 3) [m] whose convex hull approximates a shape, in its body's frame.
 
     Points of a round shape are the vertices of an inscribed polyhedron; a half space has none.
     """
-    shape = inspector.GetShape(identifier)
+    shape = inspector.GetShape(solid)
     if isinstance(shape, (geometry.Mesh, geometry.Convex)):
         hull = shape.GetConvexHull()
         points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
@@ -303,13 +297,13 @@ def hull_points_of(
     elif isinstance(shape, geometry.HalfSpace):
         return np.zeros((0, 3))
     else:
-        box = inspector.GetObbInGeometryFrame(identifier)
+        box = inspector.GetObbInGeometryFrame(solid)
         corners = np.array(list(product((-1.0, 1.0), repeat=3)))
         points = (box.pose() @ (corners * box.half_width()).T).T
     if isinstance(shape, (geometry.Capsule, geometry.Cylinder)):
         end = [0.0, 0.0, shape.length() / 2]
         points = np.vstack([points - end, points + end])
-    return (inspector.GetPoseInFrame(identifier) @ points.T).T
+    return (inspector.GetPoseInFrame(solid) @ points.T).T
 
 
 def _unit_sphere_points() -> Array:
@@ -328,8 +322,7 @@ def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: A
         tip = plant.GetFrameByName("tip", instance)
         if slave.tool is not None and tip.body().index() == parsed.tool:  # the body frame is S
             return tip.GetFixedPoseInBodyFrame().translation()
-        context = plant.CreateDefaultContext()
-        return tip.CalcPose(context, parsed.sensor_frame).translation()
+        return tip.CalcPose(plant.CreateDefaultContext(), parsed.sensor_frame).translation()
     if slave.tool is not None and slave.tool.mass > 0.0:
         end = end_of_tool_shapes(slave.tool)
         return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
@@ -350,6 +343,6 @@ def read_arm_without_default_limits(
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
         finalize_without_limit_warnings(plant)
-        arm = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+        arm = arm_from_plant.ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
     arm.pose(np.zeros(arm.num_joints))  # Load the compiled function before the first reading.
     return arm

@@ -73,7 +73,7 @@ class PostureShapes:
         self.has_sticks = sticks and not any(find(link) for find in shapes for link in links)
         if self.has_sticks:
             AddSkeleton(self.plant, self._parsed.sensor_frame)
-        _complete_and_bound_collision_shapes(self.plant, self._scene_graph)
+        _complete_and_bound_shapes(self.plant, self._scene_graph)
         finalize_without_limit_warnings(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
@@ -226,9 +226,7 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
     return found
 
 
-def _complete_and_bound_collision_shapes(
-    plant: MultibodyPlant, scene_graph: geometry.SceneGraph
-) -> None:
+def _complete_and_bound_shapes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
     """Add visual shapes as missing collision shapes of bodies; remove unbounded ones."""
     # Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
@@ -241,9 +239,8 @@ def _complete_and_bound_collision_shapes(
             is_limited = box is not None and max(box.half_width()) < _MAX_CHECKED_SHAPE_HALF_WIDTH_M
             here, name = RigidTransform(inspector.GetPoseInFrame(identifier)), f"solid_{k}"
             if is_curved:
-                shape = geometry.Convex(
-                    here.inverse() @ hull_points_of(inspector, identifier).T, name
-                )
+                points = hull_points_of(inspector, identifier).T
+                shape = geometry.Convex(here.inverse() @ points, name)
             if is_limited and (is_curved or not solids):
                 added.append((body, here, shape.Clone(), f"{body.name()}_{name}"))
             if solids and (is_curved or not is_limited):

@@ -29,9 +29,7 @@ class Scene(Environment):
         "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
     position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "the file's position in W")
-    rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of the file in W"
-    )
+    rotation: list[float] = quantity([0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W")
     fixed: bool = plain(True, "weld free roots at their poses in the file; false: they float")
     contact: str = choice(
         "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
@@ -98,8 +96,8 @@ class Scene(Environment):
         for shape in own:
             material = geometry.ProximityProperties(inspector.GetProximityProperties(shape))
             if not has_hydroelastic_properties(material):
-                mesh_edge = _TOOL_BALL_MESH_EDGE_M
-                geometry.AddCompliantHydroelasticProperties(mesh_edge, self.tool_modulus, material)
+                edge, modulus = _TOOL_BALL_MESH_EDGE_M, self.tool_modulus
+                geometry.AddCompliantHydroelasticProperties(edge, modulus, material)
                 replace = geometry.RoleAssign.kReplace
                 scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)
 

@@ -18,7 +18,7 @@ from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, IK_ME
 from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.models import ParseTool
 
-_STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
+_STEEL_DENSITY_KG_M3 = 7850.0
 _TOOL_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _TOOL_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
@@ -165,8 +165,7 @@ class Slave:
 
     def model_files(self) -> list[Path]:
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
-        folders = self.package_folders
-        return [file for path in paths for file in list_model_files(path, folders)]
+        return [file for path in paths for file in list_model_files(path, self.package_folders)]
 
     def check(self, where: str) -> None:
         if len(self.tip) not in (0, 3):

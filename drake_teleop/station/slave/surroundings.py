@@ -17,18 +17,8 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.environment import moving_bodies, point_contact
 from drake_teleop.station.environment.environment import Environment, ToolShapes
-from drake_teleop.station.environment.moving_bodies import (
-    BODY_STATE_SIZE,
-    NUM_JOINT_COLUMNS,
-    MakeJointTableAndRowBodies,
-    poses_and_twists_into,
-)
-from drake_teleop.station.environment.point_contact import (
-    NUM_MONITORED_COLUMNS,
-    NUM_PAIR_COLUMNS,
-    FindContactPairs,
-)
 
 _IDENTITY_POSE_TOLERANCE = 1e-12  # rounding of frames
 _MIN_MASS_MATRIX_EIGENVALUE_SI = 1e-12  # kg or kg m^2, smallest valid eigenvalue
@@ -56,9 +46,9 @@ class ToolContactModel(NamedTuple):
         moving_bodies: indices of other moving bodies, by name.
     """
 
-    compiled_pairs: Array = np.zeros((0, NUM_PAIR_COLUMNS))
-    monitored_pairs: Array = np.zeros((0, NUM_MONITORED_COLUMNS))
-    joint_table: Array = np.zeros((0, NUM_JOINT_COLUMNS))
+    compiled_pairs: Array = np.zeros((0, point_contact.NUM_PAIR_COLUMNS))
+    monitored_pairs: Array = np.zeros((0, point_contact.NUM_MONITORED_COLUMNS))
+    joint_table: Array = np.zeros((0, moving_bodies.NUM_JOINT_COLUMNS))
     plant_state_size: int = 0
     drake_contact_reason: str = ""
     tool_bodies: frozenset[int] = frozenset()
@@ -105,9 +95,7 @@ def MakeToolContactModel(
         if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE_SI:
             bodies = {name: plant.get_body(k) for name, k in contact.moving_bodies.items()}
             names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
-            what = (
-                f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
-            )
+            what = f"the body {' or '.join(names or bodies)} can move, but has no mass or inertia"
             raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
     for part in environment.parts:
         if part.moving_part is not None:
@@ -119,7 +107,8 @@ def MakeToolContactModel(
         return contact._replace(drake_contact_reason="the sheet spring is not the only object")
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
-        joints, order = MakeJointTableAndRowBodies(plant, contact.moving_bodies.values())
+        moving = contact.moving_bodies.values()
+        joints, order = moving_bodies.MakeJointTableAndRowBodies(plant, moving)
     from_S = dict[GeometryId, RigidTransform]()
     for index, own in shapes.items():
         frame = plant.get_body(index).body_frame()
@@ -129,7 +118,7 @@ def MakeToolContactModel(
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     touched = [*added.instances, tree.world_model_instance()]  # a link "world" may have shapes
     try:
-        compiled, monitored, reason = FindContactPairs(
+        compiled, monitored, reason = point_contact.FindContactPairs(
             plant, inspector, from_S, touched, slip_speed, order
         )
     except DrakeTeleopError as error:
@@ -153,11 +142,10 @@ def MovingBodiesExceptLeaf(
     moving = [body for body in map(plant.get_body, indices) if not plant.IsAnchored(body)]
     short = [re.sub(r"\W+", "_", body.name()) for body in moving]
     full = [re.sub(r"\W+", "_", body.scoped_name().get_full()) for body in moving]
-    names = dict[str, tree.BodyIndex]()
-    for body, name, scoped in zip(moving, short, full, strict=True):
-        own = name if short.count(name) == 1 else scoped
-        names[own if own not in names else f"{own}_{int(body.index())}"] = body.index()
-    return names
+    names = [s if short.count(s) == 1 else f for s, f in zip(short, full, strict=True)]
+    numbers = [int(body.index()) for body in moving]
+    unique = [n if names.count(n) == 1 else f"{n}_{k}" for n, k in zip(names, numbers, strict=True)]
+    return dict(zip(unique, map(tree.BodyIndex, numbers), strict=True))
 
 
 def supports_pose_conversion(joint: tree.Joint) -> bool:
@@ -183,11 +171,11 @@ class MovingBodyPose(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, body: tree.BodyIndex) -> None:
         super().__init__()
-        self._joints, order = MakeJointTableAndRowBodies(plant, [body])
-        self._bodies = np.empty((len(order), BODY_STATE_SIZE))
+        self._joints, order = moving_bodies.MakeJointTableAndRowBodies(plant, [body])
+        self._bodies = np.empty((len(order), moving_bodies.BODY_STATE_SIZE))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc_body_pose))
 
     def _calc_body_pose(self, context: Context, output: BasicVector) -> None:
-        poses_and_twists_into(self._joints, self._state.Eval(context), self._bodies)
+        moving_bodies.poses_and_twists_into(self._joints, self._state.Eval(context), self._bodies)
         output.SetFromVector(self._bodies[-1, :7])  # the body is last in its chain

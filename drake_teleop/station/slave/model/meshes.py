@@ -16,13 +16,8 @@ from pydrake.geometry import Mesh
 
 from drake_teleop.common.errors import silent_stderr
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model import model_references
+from drake_teleop.station.slave.model import model_references, model_repair
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
-from drake_teleop.station.slave.model.model_repair import (
-    MISSING_SHAPES_TEXT,
-    ModelRepair,
-    join_names,
-)
 
 _NUM_VALUES_BY_SHAPE_AND_SIZE = {
     "box": {"size": 3},
@@ -34,11 +29,10 @@ _NUM_VALUES_BY_SHAPE_AND_SIZE = {
     "plane": {},
 }
 # Triangle of a binary STL file.
-_STL_TRIANGLE_FIELDS = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
-_STL_TRIANGLE_DTYPE = np.dtype(_STL_TRIANGLE_FIELDS)
+_STL_TRIANGLE_DTYPE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("flags", "<u2")])
 
 
-def remove_unusable_shapes(model: ModelRepair) -> None:
+def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
     """Remove shapes that Drake cannot read, or all shapes if the plant has no SceneGraph.
 
     Relative mesh addresses become absolute. STL meshes are converted to convex hulls, because Drake
@@ -64,7 +58,8 @@ def remove_unusable_shapes(model: ModelRepair) -> None:
             for shape in [*link.findall("collision"), *link.findall("visual")]:
                 link.remove(shape)
     for fault, links in lost.items():
-        model.add_repair(MISSING_SHAPES_TEXT, f"{join_names(links)}: {fault}")
+        names = model_repair.join_names(links)
+        model.add_repair(model_repair.MISSING_SHAPES_TEXT, f"{names}: {fault}")
 
 
 def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:
@@ -88,7 +83,7 @@ def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:
     return None if valid else "a pose or scale is no list of finite numbers"
 
 
-def _resolve_mesh_file(shape: ElementTree.Element, model: ModelRepair) -> str | None:
+def _resolve_mesh_file(shape: ElementTree.Element, model: model_repair.ModelRepair) -> str | None:
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None

@@ -175,8 +175,7 @@ class BodyReader:
         mass = float(given.vector("mass", (0.0,))[0])
         if mass < 0.0:
             self._mjcf.model.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
-        moments = given.vector("diaginertia", (0.0, 0.0, 0.0))
-        inertia = np.diag(moments)
+        inertia = np.diag(given.vector("diaginertia", (0.0, 0.0, 0.0)))
         if "fullinertia" in given:
             xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -235,8 +234,7 @@ class MjcfWriter:
 
     def write(self, world: Body, efforts: dict[str, float]) -> str:
         """Return the MJCF text of a world body; joints in `efforts` get motors of these limits."""
-        top = SubElement(self._root, "worldbody")
-        self._write_joints_geoms_and_children(top, world)
+        self._write_joints_geoms_and_children(SubElement(self._root, "worldbody"), world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
         for each in self._mjcf.elements_in("contact"):

@@ -36,14 +36,14 @@ class Attributes(dict[str, str]):
         self.label, self._model = label, model
 
     def numbers(
-        self, name: str, default: tuple[float, ...], largest: float = math.inf
+        self, name: str, default: tuple[float, ...], limit: float = math.inf
     ) -> list[float]:
         """Return the numbers in attribute `name`; the end of `default` supplies missing numbers."""
         values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
             fault = "is not a list of numbers"
-        elif max(map(abs, values), default=0.0) > largest:
-            fault = f"exceeds {largest:g}"
+        elif max(map(abs, values), default=0.0) > limit:
+            fault = f"exceeds {limit:g}"
         if fault:
             self._model.add_fault(f"{self.label}: {name} {self[name]!r} {fault}")
             return list(default)
@@ -115,8 +115,7 @@ class Mjcf:
             yield from element
 
     def angle_in_rad(self, value: float) -> float:
-        degrees = self.compiler.get("angle", "degree") == "degree"
-        return math.radians(value) if degrees else value
+        return math.radians(value) if self.compiler.get("angle", "degree") == "degree" else value
 
     def attributes_of(self, element: Element, childclass: str, label: str) -> Attributes:
         """Return an element's attributes, with defaults of its class, otherwise of `childclass`."""

@@ -12,14 +12,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model import model_references
-from drake_teleop.station.slave.model.meshes import (
-    Triangles,
-    check_triangle_vertices,
-    convex_hull,
-    obj_text,
-    read_triangles,
-)
+from drake_teleop.station.slave.model import meshes, model_references
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
 
@@ -82,7 +75,7 @@ def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
     """
     triangles = mesh.triangles
     if mesh.inertia == "convex":
-        triangles = convex_hull(triangles.vertices)
+        triangles = meshes.convex_hull(triangles.vertices)
     corners = triangles.vertices[triangles.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1) / 2
@@ -135,9 +128,8 @@ def _mass_properties_of_simplices(
     total = corners.sum(axis=1)
     second = np.einsum("nai,naj->nij", corners, corners) + np.einsum("ni,nj->nij", total, total)
     products = np.einsum("n,nij->ij", weight, second) / (count * (count + 1))
-    mass = float(weight.sum())
     inertia = np.trace(products) * np.eye(3) - products
-    return MassProperties(mass, centre, inertia)
+    return MassProperties(float(weight.sum()), centre, inertia)
 
 
 def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
@@ -163,15 +155,15 @@ class Mesh:
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
     @cached_property
-    def triangles(self) -> Triangles:
+    def triangles(self) -> meshes.Triangles:
         if self.file is not None:
-            vertices, faces = read_triangles(self.file)
+            vertices, faces = meshes.read_triangles(self.file)
         else:
-            vertices, faces = check_triangle_vertices(_read_inline_mesh(self._attributes))
+            vertices, faces = meshes.check_triangle_vertices(_read_inline_mesh(self._attributes))
         moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
         if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
             faces = faces[:, ::-1]
-        return Triangles(moved, faces)
+        return meshes.Triangles(moved, faces)
 
     def find_or_write_obj(self) -> Path:
         """Return the path of an .obj file of the mesh for Drake; write it if necessary."""
@@ -180,11 +172,11 @@ class Mesh:
         return self._write_obj_file(self.triangles)
 
     def write_hull(self) -> Path:
-        return self._write_obj_file(convex_hull(self.triangles.vertices))
+        return self._write_obj_file(meshes.convex_hull(self.triangles.vertices))
 
-    def _write_obj_file(self, triangles: Triangles) -> Path:
+    def _write_obj_file(self, triangles: meshes.Triangles) -> Path:
         name = re.sub(r"[^A-Za-z0-9_-]", "_", self.name)[:40]
-        return self._model.write_file(f"{name}.obj", obj_text(triangles))
+        return self._model.write_file(f"{name}.obj", meshes.obj_text(triangles))
 
 
 class MeshLibrary:
@@ -221,8 +213,7 @@ class MeshLibrary:
         if compiler.get("strippath") == "true":
             name = re.split(r"[/\\]", name)[-1]
         own = "meshdir" if element.tag == "mesh" else "texturedir"
-        folder = compiler.get(own, compiler.get("assetdir", ""))
-        file = self._mjcf.find_file(element, name, folder)
+        file = self._mjcf.find_file(element, name, compiler.get(own, compiler.get("assetdir", "")))
         if file is None:
             return None, model_references.MESHES_NOT_FOUND_FAULT
         if fault := self._mjcf.model.files.file_access_fault(file, f"{element.tag} files"):
@@ -231,8 +222,8 @@ class MeshLibrary:
         return file, ""
 
 
-def _read_inline_mesh(attributes: Attributes) -> Triangles:
+def _read_inline_mesh(attributes: Attributes) -> meshes.Triangles:
     vertices = np.array(attributes["vertex"].split(), dtype=float).reshape(-1, 3)
     if "face" not in attributes:
-        return convex_hull(vertices)
-    return Triangles(vertices, np.array(attributes["face"].split(), np.intp).reshape(-1, 3))
+        return meshes.convex_hull(vertices)
+    return meshes.Triangles(vertices, np.array(attributes["face"].split(), np.intp).reshape(-1, 3))

@@ -14,22 +14,17 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_teleop.station.slave.model import model_numbers
+from drake_teleop.station.slave.model import model_numbers, model_repair
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint, MjcfWriter
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
-from drake_teleop.station.slave.model.model_repair import (
-    MISSING_SHAPES_TEXT,
-    ModelRepair,
-    join_names,
-)
 
 _DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 # Dynamics whose output has no range.
 _DYNTYPES_WITH_UNBOUNDED_OUTPUT = ("integrator", "muscle", "user", "dcmotor")
 
 
-def repair_mjcf(model: ModelRepair) -> None:
+def repair_mjcf(model: model_repair.ModelRepair) -> None:
     """Set `model.text` to an MJCF text that Drake reads, with converted meshes.
 
     Only scenes, and files that model directives add, keep all bodies and joints.
@@ -61,14 +56,14 @@ def repair_mjcf(model: ModelRepair) -> None:
         world.geoms.clear()
         what = "left out, because the tool does not carry them: shapes of"
         model.add_assumption(what, "the world")
-    _check_unique_names_and_generator_tags(bodies, model)
-    _set_mass_properties_of_bodies(world, reader, set(moving), mjcf)
+    _check_names_and_generator_tags(bodies, model)
+    _set_mass_properties(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
     efforts = {} if purpose.is_scene else _effort_limits(mjcf, with_motor)
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if shape.has_contact or not body.geoms:
-                model.add_repair(f"{fault}; {MISSING_SHAPES_TEXT}", body.name)
+                model.add_repair(f"{fault}; {model_repair.MISSING_SHAPES_TEXT}", body.name)
     model.auxiliary_bodies = {body.name for body in bodies if body.is_auxiliary}
     model.raise_faults()
     model.text = MjcfWriter(mjcf).write(world, efforts)
@@ -147,7 +142,7 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site:
 
 
 def _weld_other_joints_and_list_moving(
-    world: Body, chain: list[Body], model: ModelRepair
+    world: Body, chain: list[Body], model: model_repair.ModelRepair
 ) -> list[Joint]:
     """Weld free bodies and joints outside the chain; return the moving joints without held ones."""
     moving = list[Joint]()
@@ -206,8 +201,9 @@ def _report_unread_couplings_and_springs(joints: list[Joint], mjcf: Mjcf) -> Non
             mjcf.model.add_repair("no coupling, which Drake does not read from MJCF, by", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            what = "no spring, which Drake does not read from MJCF, of"
-            mjcf.model.add_repair(what, joint.name)
+            mjcf.model.add_repair("no spring, which Drake does not read from MJCF, of", joint.name)
+        if joint.attributes.number("frictionloss", 0.0) != 0.0:
+            mjcf.model.add_assumption("no dry friction, which the model has, of", joint.name)
 
 
 def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
@@ -219,8 +215,7 @@ def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
     for element in mjcf.elements_in("actuator"):
         given = mjcf.attributes_of(element, "", f"actuator {element.get('name', '')}")
         if name := given.get("joint") or given.get("jointinparent"):
-            limit = _effort_limit_of_actuator(mjcf, given, element.tag)
-            limits[name] = limits.get(name, 0.0) + limit
+            limits[name] = limits.get(name, 0.0) + _actuator_effort_limit(mjcf, given, element.tag)
     for joint in joints:
         names = "actuatorfrcrange", "actuatorfrclimited"
         own = _symmetric_limit_from_range(mjcf, joint.attributes, *names)
@@ -228,11 +223,11 @@ def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
     return {joint.name: limits[joint.name] for joint in joints}
 
 
-def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
+def _actuator_effort_limit(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     force = _symmetric_limit_from_range(mjcf, given, "forcerange", "forcelimited")
     if (gain := _effort_per_control_unit(given, tag)) > 0.0:
-        control = _symmetric_limit_from_range(mjcf, given, "ctrlrange", "ctrllimited")
-        force = min(force, gain * control)
+        limit = gain * _symmetric_limit_from_range(mjcf, given, "ctrlrange", "ctrllimited")
+        force = min(force, limit)
     return abs(given.numbers("gear", (1.0,))[0]) * force
 
 
@@ -256,7 +251,7 @@ def _symmetric_limit_from_range(mjcf: Mjcf, given: Attributes, name: str, flag: 
     return smaller if limits[0] < 0.0 < limits[1] else larger
 
 
-def _check_unique_names_and_generator_tags(bodies: list[Body], model: ModelRepair) -> None:
+def _check_names_and_generator_tags(bodies: list[Body], model: model_repair.ModelRepair) -> None:
     for body in bodies:
         for tag in body.generator_tags:
             model.add_fault(f"{body.name} contains <{tag}>, which is not supported; expand it")
@@ -266,12 +261,10 @@ def _check_unique_names_and_generator_tags(bodies: list[Body], model: ModelRepai
     ):
         twice = sorted(name for name, number in Counter(names).items() if number > 1)
         if twice:
-            model.add_fault(f"several {kind} are named {join_names(twice)}")
+            model.add_fault(f"several {kind} are named {model_repair.join_names(twice)}")
 
 
-def _set_mass_properties_of_bodies(
-    world: Body, reader: BodyReader, moving: set[Joint], mjcf: Mjcf
-) -> None:
+def _set_mass_properties(world: Body, reader: BodyReader, moving: set[Joint], mjcf: Mjcf) -> None:
     model, total = mjcf.model, mjcf.compiler.number("settotalmass", -1.0)
     factor = total / _sum_of_masses_in_file(model) if total > 0.0 else 1.0
 
@@ -285,8 +278,7 @@ def _set_mass_properties_of_bodies(
             scaled = given.with_mass(factor * given.mass)
             inertia = model_numbers.nearest_possible_inertia(scaled.inertia)[0]
             if body in moved:
-                correct = model_numbers.correct_impossible_inertia
-                inertia = correct(scaled.inertia, body.name, model)
+                inertia = model_numbers.correct_impossible_inertia(scaled.inertia, body.name, model)
             body.inertial = scaled._replace(inertia=inertia)
         elif body in moved and given.inertia.any():
             model.add_repair("an inertia without a mass left out of", body.name)
@@ -294,8 +286,8 @@ def _set_mass_properties_of_bodies(
             model.add_assumption("no inertia of", body.name)
 
 
-def _sum_of_masses_in_file(model: ModelRepair) -> float:
-    unchanged = ModelRepair(model.path, model.files, model.purpose, model.folder)
+def _sum_of_masses_in_file(model: model_repair.ModelRepair) -> float:
+    unchanged = model_repair.ModelRepair(model.path, model.files, model.purpose, model.folder)
     reader = BodyReader(Mjcf(unchanged))
     bodies = reader.read_world().with_descendants()[1:]
     mass = sum(reader.mass_properties_of_body(body).mass for body in bodies)

@@ -111,8 +111,7 @@ def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
         return inertia, 0.0
     moments += max(deficit, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
     moments[0] += _TRIANGLE_INEQUALITY_MARGIN_SHARE * largest
-    distance = float(np.abs(moments - given).max()) / largest
-    return (axes * moments) @ axes.T, distance
+    return (axes * moments) @ axes.T, float(np.abs(moments - given).max()) / largest
 
 
 MAX_MODEL_VALUE_SI = 1e6  # largest length, mass or inertia, SI units; limits may be larger

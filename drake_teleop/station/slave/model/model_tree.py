@@ -7,11 +7,8 @@ from xml.etree.ElementTree import Element
 from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 WORLD_NAME = "world"  # name in URDF and SDF
-_DRAKE_CONSTRAINT_TAGS = (
-    "drake:ball_constraint",
-    "drake:linear_bushing_rpy",
-    "drake:tendon_constraint",
-)
+_DRAKE_CONSTRAINTS = "ball_constraint", "linear_bushing_rpy", "tendon_constraint"
+_DRAKE_CONSTRAINT_TAGS = tuple(f"drake:{name}" for name in _DRAKE_CONSTRAINTS)
 
 
 def list_joints(scope: Element) -> list[Element]:
