@@ -23,7 +23,7 @@ class SheetSpring(environment.Environment):
     """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, on the leaf's top, 25 mm from its free end"
+        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, unloaded leaf's top, 25 mm from its free end"
     )
     length: float = quantity(0.170, "m", 0.02, 1.0, "free length of the leaf")
     width: float = quantity(

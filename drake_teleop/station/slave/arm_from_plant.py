@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
 )
 
-OneAxisJoint = tree.RevoluteJoint | tree.PrismaticJoint
+OneAxisJoint: TypeAlias = tree.RevoluteJoint | tree.PrismaticJoint
 _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
 _MAX_PLAUSIBLE_JOINT_RANGE_RAD = 8 * np.pi  # larger ranges may be in degrees
