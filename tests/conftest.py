@@ -8,6 +8,7 @@ import signal
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,8 @@ COMPILE_LITTLE = (
     *("load", "logs"),
     *("cli", "malformed_input", "master", "passivity", "theory", "vectors"),
 )
+#: Number of collected cases of each test with the mark `quick_cases`.
+COLLECTED_CASES = Counter[str]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -59,6 +62,15 @@ def pytest_configure(config: pytest.Config) -> None:
     elif config.workerinput["workerid"] == "gw1" and config.args == ["tests"]:
         paths = [path for path in TESTS.glob("[a-z]*") if path.is_dir() or path.match("test_*.py")]
         config.args[:] = sorted(map(str, paths), reverse=True)
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark all cases of a test except the first n of its mark `quick_cases(n)` as `long`."""
+    mark = item.get_closest_marker("quick_cases")
+    if mark is not None:
+        COLLECTED_CASES[test := item.nodeid.partition("[")[0]] += 1
+        if COLLECTED_CASES[test] > mark.args[0]:
+            item.add_marker("long")
 
 
 def pytest_collection_finish() -> None:

@@ -147,6 +147,7 @@ def turned(rpy, tmp_path):
     return path
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("rpy", "axis", "back"),

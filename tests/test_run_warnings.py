@@ -165,6 +165,7 @@ def test_force_that_oscillates_at_rest_without_network_is_reported(noise):
     assert warning.endswith("; reduce force_scaling.gamma or force_scale")
 
 
+@pytest.mark.quick_cases(4)
 @pytest.mark.parametrize("seed", range(10))
 def test_noise_of_the_force_at_rest_is_no_oscillation(seed):
     noise = 0.1 * np.random.default_rng(seed).normal(size=(len(T), 3))

@@ -115,6 +115,7 @@ def parse_without_tags(text: str) -> Any:
 SCHEMA = jsonschema.Draft202012Validator(json.loads(json_schema()))
 
 
+@pytest.mark.quick_cases(3)
 @pytest.mark.parametrize("name", ScenarioNames())
 def test_schema_accepts_shipped_scenarios(name: str) -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA.schema)

@@ -52,6 +52,7 @@ def movement(request):
 ALL = pytest.mark.parametrize("movement", (*MOVEMENTS, *TASKS), indirect=True)
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.slow
 @ALL
 def test_arm_and_sensor_stay_within_their_limits(movement):

@@ -169,6 +169,7 @@ AXES = [
 ]
 
 
+@pytest.mark.quick_cases(4)
 @pytest.mark.parametrize(("rpy", "axis"), AXES)
 @pytest.mark.parametrize("from_flange", [0.0, 0.1, 0.2])  # 0.2: S is at the end of the gripper
 def test_gripper_of_the_model_points_down(from_flange, rpy, axis, tmp_path):

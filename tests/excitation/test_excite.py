@@ -294,6 +294,7 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
     assert len(found.limits.capsule_pairs) > 0  # other pairs
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["contact_transition", "peg_in_slot"])
 def test_environment_of_the_scenario_is_avoided(name):
@@ -335,6 +336,7 @@ def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "said"),
@@ -765,6 +767,7 @@ def write_described(folder, t, readings, recording):
     return folder / "log.yaml"
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("write_log", [write_canonical, write_described])
 def test_identified_load_of_another_arm_is_true(other_arm, write_log, tmp_path):

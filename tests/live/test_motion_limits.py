@@ -78,6 +78,7 @@ def test_free_target_may_jump():
     assert limiter.limit_inputs(target, may_jump=False) == target
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("slow", "rates"),
@@ -139,6 +140,7 @@ def noisy(scenario) -> Scenario:
     return replace(scenario, sheet_spring=None, **sensor)
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("slow", "jumps"), [(1, True), (5, True), (10, False), (20, True)])
 def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow, jumps):
@@ -157,8 +159,9 @@ def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow,
     assert len(rendered) > 20 and max(rendered) < 0.5
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.slow
-@pytest.mark.parametrize(("rate", "burst"), [(1.0, 1), (1.0, 50), (0.5, 25), (0.12, 1), (0.12, 6)])
+@pytest.mark.parametrize(("rate", "burst"), [(0.12, 6), (1.0, 1), (1.0, 50), (0.5, 25), (0.12, 1)])
 def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
     noisy, load, rate, burst
 ):

@@ -396,6 +396,7 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
         read_drive(tmp_path / "drive")
 
 
+@pytest.mark.quick_cases(3)
 @pytest.mark.parametrize("damage", [b"", b"PK", None])
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_drive_without_its_load_is_not_repeated(scenario, load, tmp_path, damage, sigma):

@@ -21,6 +21,7 @@ ACCELERATIONS = {"m/s^2": 1.0, "g": 1 / 9.80665, "mg": 1e3 / 9.80665, "mm/s^2": 
 RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "mdeg/s": 1e3 * 180 / np.pi}
 
 
+@pytest.mark.quick_cases(4)
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(
     ("acceleration", "rate"),

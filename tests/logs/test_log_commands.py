@@ -443,6 +443,7 @@ def test_ntnu_poses_give_mass_centre_and_offsets(
         identify_log(describe_poses(tmp_path, ntnu, pose, sign=1))
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("record", "residual", "gravity_only"),

@@ -120,6 +120,7 @@ def test_noise_is_no_contact(memory: float) -> None:
         assert not detect(contact - contact.mean(axis=0), 1 / rate).touched.any()
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(
     ("share", "count", "slow"),
     [(0.1, 5, False), (0.4, 20, False), (0.4, 5, True), (0.3, 1, True)],

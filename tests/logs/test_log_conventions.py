@@ -170,6 +170,7 @@ def test_an_error_in_a_real_record_is_named(
         assert summary["delay_s"] == pytest.approx(-0.494, abs=3e-3)
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_loads_and_streams_of_any_kind_raise_no_alarm(tmp_path: Path, seed: int) -> None:
@@ -226,6 +227,7 @@ def test_remedy_for_a_drifting_clock_is_correct(tmp_path: Path) -> None:
     assert inspect_command(path, tmp_path / "again", quiet=True)["findings"] == []
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "says"),
@@ -359,6 +361,7 @@ def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
         )
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.parametrize("start", [0.0, 1.0, 4.0])
 @pytest.mark.parametrize("drift", [2e-3, -3e-3])
 def test_offset_of_a_drifting_pose_is_that_at_its_first_row(

@@ -122,6 +122,7 @@ def test_poses_and_unknown_statistics_are_refused(ntnu: Path, tmp_path: Path) ->
         detect_log(describe_record(tmp_path, ntnu, "1-baseline"), statistic="sum")
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("statistic", ["level", "cusum", "glr"])
 def test_ntnu_hammer_is_not_detected_as_contact(ntnu: Path, tmp_path: Path, statistic: str) -> None:

@@ -23,6 +23,7 @@ def sample_tables(tmp_path_factory):
     return folder, pl.read_csv(folder / "free_wrench.csv"), pl.read_csv(folder / "free_pose.csv")
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("wrench_ms", "pose_ms"), [(200, 0), (0, 100), (100, 100)])
 def test_load_is_identified_with_coarse_stamps(sample_tables, wrench_ms, pose_ms):
@@ -39,6 +40,7 @@ def test_load_is_identified_with_coarse_stamps(sample_tables, wrench_ms, pose_ms
     assert found.mass == pytest.approx(0.95, abs=2e-3)
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [DrakeTeleopError, OverflowError, np.linalg.LinAlgError])
 def test_failing_check_does_not_stop_identify(sample_tables, error, monkeypatch):
@@ -80,6 +82,7 @@ def findings_of_edited_channel(tmp_path, name, edit):
     return planted.findings(tmp_path, columns, imu=name == "omega")
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("name", ["force", "torque", "omega"])
 def test_channel_that_keeps_its_value_is_named_with_its_rows(tmp_path, name):
     def freeze(x):
@@ -91,7 +94,8 @@ def test_channel_that_keeps_its_value_is_named_with_its_rows(tmp_path, name):
     assert f"{column} keeps the value" in message and "in rows 701 to 1100," in message
 
 
-@pytest.mark.parametrize("name", ["force", "torque"])
+@pytest.mark.quick_cases(1)
+@pytest.mark.parametrize("name", ["torque", "force"])
 def test_coarse_or_saturated_channels_are_not_frozen(tmp_path, name):
     def saturate(x):
         return x.clip(*np.quantile(x, [0.1, 0.9]))

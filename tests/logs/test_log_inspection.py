@@ -63,6 +63,7 @@ PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
 ]
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.parametrize("streams", [{}, {"imu": False}, {"pose": False}])
 def test_good_log_has_no_finding(tmp_path: Path, streams: dict[str, bool]) -> None:
     assert findings(tmp_path, good(), **streams) == {}
@@ -424,6 +425,7 @@ def test_unreadable_input_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "no such file" in capsys.readouterr().err
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
 def test_good_real_record_has_only_a_lag(ntnu: Path, tmp_path: Path, record: str) -> None:
     path = ntnu_log(ntnu, tmp_path, record, frame=NTNU_FRAME)

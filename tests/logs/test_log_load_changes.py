@@ -67,6 +67,7 @@ def test_identify_reports_no_change_of_a_constant_load(tmp_path: Path) -> None:
     assert summary["causes"] == [] and summary["loads"] == []
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize(("record", "cutoff_hz"), [("1-baseline", 30.0), ("2-vibrations", None)])
 def test_ntnu_records_have_one_load(
     ntnu: Path, tmp_path: Path, record: str, cutoff_hz: float | None

@@ -329,6 +329,7 @@ def test_identify_names_a_wrong_scale_despite_a_good_fit(tmp_path: Path) -> None
     assert found.name == "gravity"
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("scale", [16384 / 9.80665, 0.4])
 def test_accelerometer_in_no_known_unit_leaves_the_load_unknown(
     good: Columns, tmp_path: Path, scale: float

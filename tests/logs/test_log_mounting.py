@@ -183,6 +183,7 @@ def test_deviations_equal_the_scatter_of_repeated_records() -> None:
     assert 0.7 < np.sqrt((ratios**2).mean()) < 1.3
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_wrench_determines_the_lever_arm_without_a_pose(seed: int) -> None:
@@ -245,8 +246,9 @@ def test_load_may_leave_5_percent_of_the_wrench_unexplained(force: float, torque
     assert (lever_arm_from_wrench(log) is None) == (torque > 0.05)
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
-@pytest.mark.parametrize("source", ["pose", "wrench"])
+@pytest.mark.parametrize("source", ["wrench", "pose"])
 def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None:
     recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=rotation_about_y)
     streams = {"pose": True} if source == "pose" else {"pose": False}
@@ -289,6 +291,7 @@ def write_tables(folder: Path, recorder: Recorder, **imu: Any) -> Path:
     return folder / "log.yaml"
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("oblique", [False, True])
 def test_estimates_from_notes_reproduce_the_log(tmp_path: Path, oblique: bool) -> None:

@@ -51,7 +51,8 @@ def assert_nothing_is_certain_and_wrong(found: IdentifiedLog, torque_factor: flo
     assert (error < 4.0 * np.sqrt(np.diag(load.covariance)))[known].all()
 
 
-@pytest.mark.parametrize("torque_factor", [1.0, pytest.param(100.0, marks=pytest.mark.long), 0.01])
+@pytest.mark.quick_cases(1)
+@pytest.mark.parametrize("torque_factor", [1.0, 100.0, 0.01])
 def test_unknown_translation_corrects_neither_torque_unit_nor_pose_frame(
     tmp_path: Path, torque_factor: float
 ) -> None:
@@ -76,8 +77,9 @@ def test_acceleration_is_unknown_without_position_and_accelerometer(
     assert read_log(path).is_acceleration_unknown == (not has_position and not has_accelerometer)
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(
-    ("place", "noise_factor"), [([0.0, 0.1, -0.3], 1.0), ([0.5, 0.0, 0.2], 1.0), (COM, 0.1)]
+    ("place", "noise_factor"), [(COM, 0.1), ([0.0, 0.1, -0.3], 1.0), ([0.5, 0.0, 0.2], 1.0)]
 )
 def test_rotation_about_another_point_does_not_give_a_wrong_load(
     tmp_path: Path, place: np.ndarray, noise_factor: float

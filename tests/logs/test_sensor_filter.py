@@ -66,6 +66,7 @@ def test_low_pass_is_named_with_its_frequency(
     assert finding.values["cutoff_hz"] == pytest.approx(cutoff_hz, rel=0.1)
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("cutoff_hz", "order", "imu"), [(0.5, 1, True), (1.0, 2, False)])
 def test_no_load_is_identified_from_forces_without_fast_parts(
@@ -77,6 +78,7 @@ def test_no_load_is_identified_from_forces_without_fast_parts(
     assert not identified.identification.identifiable.any()
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("cutoff_hz", "imu"), [(0.05, False), (0.5, True)])
 def test_no_load_is_identified_from_forces_without_slow_parts(

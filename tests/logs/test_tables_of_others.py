@@ -438,6 +438,7 @@ def test_the_order_of_euler_angles_is_that_of_the_data(
     assert ("Corrected by the data: the Euler angles" in text) == (axes != guessed)
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(
     ("names", "order", "form"),
     [
@@ -465,13 +466,14 @@ def test_numbered_quaternions_are_drafted(
     assert draft["pose"]["position"]["columns"] == ["x", "y", "z"] and left == []
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize(
     ("sign", "push"),
     [
         (1, 0.0),
         (-1, 50.0),
-        pytest.param(-1, 0.0, marks=pytest.mark.long),
-        pytest.param(1, 50.0, marks=pytest.mark.long),
+        (-1, 0.0),
+        (1, 50.0),
     ],
 )
 def test_order_of_quaternions_and_sign_are_found_together(
@@ -594,6 +596,7 @@ def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
         eliminate_log(path, load, untouched_s=(0.2, 0.9), tare=False)
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("stride", [2, 4, 8])
 def test_arrays_of_different_length_in_a_file_have_rates(tmp_path: Path, stride: int) -> None:
     columns = table().drop("t").to_dict(as_series=False)
@@ -613,6 +616,7 @@ def test_arrays_of_different_length_in_a_file_have_rates(tmp_path: Path, stride:
     assert summary["findings"] == []
 
 
+@pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(("unit", "scale"), [("us", 100.0), ("us", 1e3), ("ms", 0.01), ("s", 2e-3)])
 def test_times_in_ticks_are_inspected_and_read(tmp_path: Path, unit: str, scale: float) -> None:
     """The pose begins later than the wrench, in a table of both."""
@@ -648,6 +652,7 @@ def test_a_scaled_rate_is_checked() -> None:
         read_clock(time, Table(Path("x.csv"), {"t": t, "x": t}), ["x"], "here")
 
 
+@pytest.mark.quick_cases(3)
 @pytest.mark.parametrize("column", ["f1", "m0", "m2"])
 @pytest.mark.parametrize("decimated", [1, 4])
 def test_dead_channel_beside_rows_of_another_stream_is_named(

@@ -46,6 +46,7 @@ def followed(
         follower.update_delay(at, wrench, before, after)
 
 
+@pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("late", [-0.006, 0.011])
 def test_delay_is_estimated_and_tracked(late: float) -> None:
     follower = DelayTracker(load(), 0.001, 30.0, 0.0)

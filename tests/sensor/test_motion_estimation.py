@@ -204,6 +204,7 @@ def test_arms_with_other_numbers_of_joints(source, joints):
 # Delays
 
 
+@pytest.mark.quick_cases(6)
 @pytest.mark.slow
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])

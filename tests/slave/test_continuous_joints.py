@@ -125,7 +125,8 @@ def commands_of_four_turns(system, arm, start, sign, turned=turned_tool):
     return np.array(commands), error
 
 
-@pytest.mark.parametrize(("chain", "sign"), [(SIX, 1), (SEVEN, -1)])
+@pytest.mark.quick_cases(1)
+@pytest.mark.parametrize(("chain", "sign"), [(SEVEN, -1), (SIX, 1)])
 def test_four_turns_of_the_tool_are_followed_without_a_jump(chain, sign):
     """Only the last joint rotates, also for a redundant arm."""
     arm, start = ARMS[chain], POSTURES[chain]
