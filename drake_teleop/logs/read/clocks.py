@@ -153,7 +153,6 @@ def join_episodes(t: Array) -> tuple[Array, int]:
 
 
 def zero_steps_between_episodes(steps: Array, median: float, num_episodes: int) -> Array:
-    """Return time steps (N,) [s] of joined episodes, with 0 for those between two episodes."""
     error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median)), steps.copy()
     inner[np.argsort(error, kind="stable")[: num_episodes - 1]] = 0.0
     return inner
