@@ -160,8 +160,8 @@ def _fit_shared_load(episodes: Sequence[_FittedEpisode], phi: Array) -> Identifi
         theta = np.concatenate([np.zeros(6), fitted])
         fitted = consistent_least_squares(whole, whole @ theta, theta)[6:]
     covariance = np.zeros((16, 16))
-    effects = parameter_errors_by_gains(np.array(products), np.array(weights, float), inverse)
-    effects *= episodes[0].signals.log.gain_std
+    arrays = np.array(products), np.array(weights), np.asarray(inverse, float)
+    effects = episodes[0].signals.log.gain_std * parameter_errors_by_gains(*arrays)
     covariance[:6, :6] = np.diag(noise**2 / samples)
     covariance[6:, 6:] = inverse + effects @ effects.T
     return Identification(
