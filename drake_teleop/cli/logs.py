@@ -95,9 +95,9 @@ def eliminate_command(
     scales |= {"sigma_weight": None, "sigma_inertia": None}
     summary = summaries.summarize_log(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
-        "gripper": _path_text_or_none(options.get("gripper")),
+        "gripper": options.get("gripper") and str(options["gripper"]),
         **{name: options.get(name, default) for name, default in scales.items()},
-        "free": _path_text_or_none(options.get("free")),
+        "free": options.get("free") and str(options["free"]),
         "offsets_from": offsets,
         "untouched_s": options.get("untouched_s"),
         "tare": found.offsets - load_file.offsets,
@@ -126,10 +126,6 @@ def eliminate_command(
     if not quiet:
         print_contact_wrench_summary(summary, out)
     return summary
-
-
-def _path_text_or_none(path: Path | None) -> str | None:
-    return None if path is None else str(path)
 
 
 def _make_contact_wrench_table(found: processing.EliminatedLog) -> pl.DataFrame:
@@ -163,8 +159,8 @@ def detect_command(
     )
     eliminated = found.eliminated
     summary = summaries.summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
-        "load": _path_text_or_none(load),
-        "free": _path_text_or_none(free),
+        "load": load and str(load),
+        "free": free and str(free),
         "free_s": found.free_duration_s,
         "statistic": statistic,
         "threshold": found.threshold,
@@ -342,13 +338,8 @@ def print_registered_names() -> None:
 
     from drake_teleop.common.registry import REGISTRIES
 
-    for module in (
-        "load.batch.methods",
-        "logs.read.table_files",
-        "robots.connections",
-        "robots.export",
-        "station.scenario",
-    ):
+    others = "robots.connections", "robots.export", "station.scenario"
+    for module in ("load.batch.methods", "logs.read.table_files", *others):
         import_module(f"drake_teleop.{module}")
     for kind, table in sorted(REGISTRIES.items()):
         names = [name if name in table.shipped else f"{name}*" for name in table]

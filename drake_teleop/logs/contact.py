@@ -111,6 +111,9 @@ def detect_contact(
             remedy = "use statistic `level`, or free motion with the rate of the log"
             raise DrakeTeleopError(what, where="free", remedy=remedy)
         train = free[0].select_rows(_rows_far_from_ends_and_edges(free[0], free[1], period))
+        if len(train.contact) < MIN_NOISE_FLOOR_SAMPLES:
+            what = f"{len(train.contact)} samples are too few for a noise floor"
+            raise DrakeTeleopError(what, where="free", remedy="give a longer record")
         floor = detection.fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
         threshold = max(detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(statistic))
         floor = replace(floor, fade=fade)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -20,11 +19,11 @@ from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.explained_log import ask_about_correction
 from drake_teleop.logs.processing import check_log
+from drake_teleop.logs.read import clocks
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.table_files import is_decimal_number, read_table
 from drake_teleop.logs.read.tables import Table
 
 BANDWIDTH_FOR_GAP_LENGTH_HZ = 30.0
@@ -104,16 +103,11 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     summary["kind"] = "unknown"
     table = read_table(path)
-    header = not all(map(_is_number, table.columns))
+    # polars adds a suffix to repeated names.
+    names = [name.partition("_duplicated_")[0] for name in table.columns]
+    header = not all(map(is_decimal_number, names))
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
-
-
-def _is_number(name: str) -> bool:
-    with suppress(ValueError):
-        float(name.partition("_duplicated_")[0])  # polars adds this suffix to repeated names
-        return True
-    return False
 
 
 def _find_writable_draft_path(out: Path) -> Path:
@@ -194,6 +188,10 @@ def _inspect_described_log(
         figures, more, rows = _inspect_stream_and_list_bad_rows(name, stream, table, source)
         summary["streams"][name] = figures
         findings += more
+        if getattr(stream, "time", None) and stream.time.column is None:
+            # Removal would shift the times of the following rows.
+            tables[stream.source] = _empty_cells(tables[stream.source], stream.columns, rows)
+            rows = rows[:0]
         bad.setdefault(stream.source, []).append(rows)
     clean = {path: _remove_rows(tables[path], np.concatenate(rows)) for path, rows in bad.items()}
     try:
@@ -227,6 +225,7 @@ def _inspect_stream_and_list_bad_rows(
     figures: dict[str, Any] = {"rows": len(values)}
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
+    delete = "empty" if time is not None and time.column is None else "delete"
     if time is not None:
         more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, columns, figures)
         findings += more
@@ -239,7 +238,7 @@ def _inspect_stream_and_list_bad_rows(
         first = table.line_in_file(int(np.argmin(good)))
         text = (
             f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}), the"
-            f" longest block has {figures['nan_longest']} rows; delete or repair them"
+            f" longest block has {figures['nan_longest']} rows; {delete} or repair them"
         )
         findings.append(Finding("nan", text))
     repeats = np.zeros(len(values), bool)
@@ -259,7 +258,7 @@ def _inspect_stream_and_list_bad_rows(
             first, last = (table.line_in_file(row) for row in frozen[i])
             text = (
                 f"{at}: {column} keeps the value {x[frozen[i][0]]:.4g} in rows {first} to {last},"
-                " but other channels vary: sensor or connection failed; delete these rows"
+                f" but other channels vary: sensor or connection failed; {delete} these rows"
             )
             findings.append(Finding("dead channel", text))
         elif time is not None and moving:
@@ -271,7 +270,7 @@ def _inspect_stream_and_list_bad_rows(
         if saturated:
             text = (
                 f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
-                f" {finite.max():.4g}) for {saturated} samples; delete them or move slower"
+                f" {finite.max():.4g}) for {saturated} samples; {delete} them or move slower"
             )
             findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
@@ -307,7 +306,7 @@ def _repeated_rows_findings(
 def _inspect_clock_and_flag_usable_rows(
     at: str, time: Any, table: Table, columns: Sequence[str], figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
-    stamps, episodes = time_stamps_and_num_episodes(time, table, columns, at)
+    stamps, episodes = clocks.time_stamps_and_num_episodes(time, table, columns, at)
     if time.column is None:
         duration = float(np.ptp(stamps)) if len(stamps) else 0.0
         figures |= {"rate_hz": time.rate / time.scale, "duration_s": duration}
@@ -322,15 +321,15 @@ def _inspect_clock_and_flag_usable_rows(
         what = "the time stamps never increase"
         raise DrakeTeleopError(what, where=at, remedy="name another column, or time.rate")
     median = float(np.median(forward))
-    between = figures["episodes"] - 1
-    gaps = int((steps > min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum()) - between
-    back, longest = int((steps <= 0).sum()), float(forward.max())
+    back, inner = (steps <= 0).sum(), clocks.zero_steps_between_episodes(steps, median, episodes)
+    gaps = int((inner > clocks.min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum())
+    longest = float(inner.max())
     rate = len(t) / len(np.unique(t)) / median  # of rows, which may share time stamps
     figures |= {"rate_hz": rate, "duration_s": float(t[-1] - t[0]), "longest_gap_s": longest}
-    figures |= {"gaps": gaps, "clock_jumps": back}
+    figures |= {"gaps": gaps, "clock_jumps": int(back)}
     findings = []
     if gaps:
-        where = float(t[int(np.argmax(steps))] - t[0])
+        where = float(t[int(np.argmax(inner))] - t[0])
         text = (
             f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s (missing rows, or a"
             " jump of the clock), are not used; record again if these parts are required"
@@ -393,6 +392,13 @@ def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:
     kept = np.setdiff1d(np.arange(table.rows), rows)
     whole = {n: x[kept] if len(x) == table.rows else x for n, x in table.columns.items()}
     return replace(table, columns=whole)
+
+
+def _empty_cells(table: Table, names: Sequence[Any], rows: NDArray[np.intp]) -> Table:
+    cells = {str(name): table.numbers_with_nan(name, "").copy() for name in names}
+    for column in cells.values():
+        column[rows] = np.nan
+    return replace(table, columns={**table.columns, **cells}) if len(rows) else table
 
 
 def _print_summary(summary: dict[str, Any]) -> None:

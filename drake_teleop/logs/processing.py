@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, expect_type
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread, to_float
 from drake_teleop.load import compensation
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
@@ -28,14 +28,9 @@ from drake_teleop.load.identification import (
 )
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs import explained_log
-from drake_teleop.logs.aligned_log import (
-    METHODS_WITH_SPLINES,
-    MIN_SPLINE_RECORD_DURATION_S,
-    LoadFitOfLog,
-    fit_load_to_posed_log,
-    read_aligned_log,
-)
+from drake_teleop.logs import aligned_log, explained_log
+from drake_teleop.logs import contact as contacts
+from drake_teleop.logs.aligned_log import METHODS_WITH_SPLINES, LoadFitOfLog, read_aligned_log
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import (
     CAUSES_AT_REST,
@@ -44,36 +39,17 @@ from drake_teleop.logs.causes.cause import (
     RecordPartWithLoad,
 )
 from drake_teleop.logs.causes.explain import MisfitExplanation
-from drake_teleop.logs.check import against_load, edits
+from drake_teleop.logs.check import against_load, conventions, edits
 from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, lag_findings
-from drake_teleop.logs.check.conventions import (
-    ConventionCheckResult,
-    check_conventions_of_file,
-    findings_if_load_is_suspicious,
-    motion_findings,
-)
+from drake_teleop.logs.check.conventions import ConventionCheckResult, check_conventions_of_file
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
 from drake_teleop.logs.check.nonlinear_sensor import error_of_load_by_nonlinear_sensor
 from drake_teleop.logs.check.sensor_filter import sensor_filter_finding
 from drake_teleop.logs.check.wrench_channels import wrench_channel_finding
-from drake_teleop.logs.contact import (
-    Detection,
-    detect_contact,
-    noise_floor,
-    note_on_drift_or_much_contact,
-    robust_offsets,
-    samples_for_detector,
-)
-from drake_teleop.logs.read.alignment import (
-    choose_delay,
-    is_far_from_gaps,
-    low_pass,
-    low_pass_log,
-    remove_delay,
-)
+from drake_teleop.logs.read import alignment
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.reading import MIN_CUTOFF_HZ, read_log
+from drake_teleop.logs.read.reading import check_path_and_cutoff, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
@@ -157,7 +133,7 @@ class EliminatedLog:
     noise_floor: Array
     causal: CausalContactAndScaledWrench | None
     edge: NDArray[np.bool_]
-    detection: Detection | None = None
+    detection: contacts.Detection | None = None
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -189,7 +165,7 @@ def identify_log(
         checks: result of `check_conventions_of_file` for this log, if known.
     """
     METHODS.check(method, "method")
-    _check_path_and_cutoff(path, cutoff_hz)
+    check_path_and_cutoff(path, cutoff_hz)
     check = partial(check_conventions_of_file, Path(path)) if checks is None else lambda: checks
     options = method, cutoff_hz
     raw, fitted, frame_findings = _read_and_fit_load(path, *options, delay)
@@ -225,8 +201,8 @@ def identify_log(
         result = explained_log.add_errors_of_load(result, load_errors)
     findings = errors or causes
     if not findings and not raw.estimated:
-        known_delay = None if fitted.delay_source == "undetermined" else fitted.delay_s
-        findings = findings_if_load_is_suspicious(log, result, predicted, known_delay, check)
+        known = None if fitted.delay_source == "undetermined" else fitted.delay_s
+        findings = conventions.findings_if_load_is_suspicious(log, result, predicted, known, check)
         findings = findings or frame_findings
         if accepted and accepted.is_acceleration_missing and not result.identifiable.all():
             findings = (*findings, explained_log.missing_acceleration_finding(accepted))
@@ -255,7 +231,7 @@ def _read_and_fit_load(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
-    fitted, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay)
+    fitted, frame_findings = aligned_log.fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     return log, fitted or _fit_load_to_filtered_log(log, method, cutoff_hz, delay), frame_findings
@@ -299,7 +275,7 @@ def _explain_residual(
 
 def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
     """Return the misfit if the motion of the IMU, without poses, does not explain the wrench."""
-    is_short = log.t[-1] - log.t[0] < MIN_SPLINE_RECORD_DURATION_S  # not compared with poses
+    is_short = log.t[-1] - log.t[0] < aligned_log.MIN_SPLINE_RECORD_DURATION_S  # no comparison
     if is_short or not _is_misfit_explainable(log, by_splines=False):
         return None
     log = replace(log, posed=None, R_WS=None, gravity=None, gravity_W=None)
@@ -336,7 +312,7 @@ def _correct_delay(
     elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S and motion is None:
         fitted = _fit_load_to_filtered_log(log, method, cutoff_hz, delay_s)
     elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S:
-        again, frame_findings = fit_load_to_posed_log(log, method, cutoff_hz, delay_s)
+        again, frame_findings = aligned_log.fit_load_to_posed_log(log, method, cutoff_hz, delay_s)
         fitted = again or fitted
     return replace(fitted, delay_source=source, motion=motion), frame_findings
 
@@ -360,7 +336,7 @@ def _findings_that_invalidate_load(
             found = wrench_channel_finding(fitted.log, splines, fitted.delay_s) or found
         errors = () if found is None else (found,)
         if not errors and why.is_misfit and why.causes:
-            errors = motion_findings(check)
+            errors = conventions.motion_findings(check)
     errors = _clock_rate_causes(why) or errors
     if raw.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
         errors += tuple(edits.correct_accelerometer_unit(raw.described, fitted.log)[0])
@@ -399,21 +375,14 @@ def _unexplained_misfit(
     return why
 
 
-def _check_path_and_cutoff(path: Any, cutoff_hz: Any) -> None:
-    expect_type((str, Path), path, "log", "give the file's name")
-    if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_CUTOFF_HZ:
-        remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no filter"
-        raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where="cutoff_hz", remedy=remedy)
-
-
 def _fit_load_to_filtered_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> LoadFitOfLog:
-    delay_s, source = choose_delay(log, cutoff_hz, delay)
-    log = remove_delay(log, delay_s)
-    known = is_far_from_gaps(log, cutoff_hz)
+    delay_s, source = alignment.choose_delay(log, cutoff_hz, delay)
+    log = alignment.remove_delay(log, delay_s)
+    known = alignment.is_far_from_gaps(log, cutoff_hz)
     _require_any_sample(log, known)
-    log = low_pass_log(log, cutoff_hz).select_rows(known)
+    log = alignment.low_pass_log(log, cutoff_hz).select_rows(known)
     fit = identify_batch(
         log.wrench,
         *log.motion,
@@ -527,7 +496,7 @@ def eliminate_log(
         DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
             static poses.
     """
-    _check_path_and_cutoff(path, cutoff_hz)
+    check_path_and_cutoff(path, cutoff_hz)
     if untouched_s is not None:
         start_s, stop_s = finite_array("untouched_s", untouched_s, 2).tolist()
         untouched_s = start_s, stop_s
@@ -551,23 +520,23 @@ def eliminate_log(
     found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
     reference = None
     if free is not None:
-        free_motion = _read_and_eliminate_log(free, *common)
-        _reject_static_log(free_motion)
+        free_log = _read_and_eliminate_log(free, *common)
+        _reject_static_log(free_log)
         _reject_static_log(found)
-        free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
-        reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
+        free_samples = contacts.samples_for_detector(free_log.log, free_log.contact, cutoff_hz)
+        reference = free_samples.select_rows(~free_log.edge), free_log.log.dt
     if found.log.static:
         return found
-    samples = samples_for_detector(found.log, found.contact, cutoff_hz)
+    samples = contacts.samples_for_detector(found.log, found.contact, cutoff_hz)
     covariance = limit_covariance_to_scales(found.phi, identification.covariance, tared=tare)
-    detection = detect_contact(
+    detection = contacts.detect_contact(
         *(samples, found.log.dt, cutoff_hz, covariance, identification.residual_rms),
         edge=found.edge,
         free=reference,
         statistic=statistic,
     )
     if free is not None and tare and detection is not None:
-        notes = note_on_drift_or_much_contact(found.offsets - free_motion.offsets, detection)
+        notes = contacts.note_on_drift_or_much_contact(found.offsets - free_log.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
@@ -601,14 +570,14 @@ def _read_and_eliminate_log(
     if log.static and causal is not None:
         what = "poses at rest have no times, which a causal filter requires"
         raise DrakeTeleopError(what, where="causal", remedy="remove it")
-    known = is_far_from_gaps(log, cutoff_hz)
+    known = alignment.is_far_from_gaps(log, cutoff_hz)
     shown, edge = log.select_rows(known), aligned.edge[known]
     _require_any_sample(log, ~edge)
     parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
 
     def low_pass_outside_gaps(wrench: Array) -> Array:
-        return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
+        return wrench if log.static else alignment.low_pass(wrench, log.dt, cutoff_hz)[known]
 
     def contact_and_scaled(
         offsets: Array, motion: tuple[Array, Array, Array]
@@ -620,7 +589,7 @@ def _read_and_eliminate_log(
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
             return residual[_rows_in_tare_span(shown, *untouched_s)].mean(axis=0), 1.0
-        return robust_offsets(residual) if tare else (identification.offsets, 1.0)
+        return contacts.robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
     offsets, fraction = choose_offsets(low_pass_outside_gaps(residual))
@@ -669,7 +638,7 @@ def _read_and_eliminate_log(
         contact=contact,
         scaled=scaled,
         gravity_only=gravity_only,
-        noise_floor=noise_floor(contact[~edge]),
+        noise_floor=contacts.noise_floor(contact[~edge]),
         causal=causal_wrench,
         edge=edge,
         findings=findings,
@@ -761,7 +730,7 @@ def _resolve_force_scales(
 
 
 @dataclass(frozen=True)
-class DetectedLog(Detection):
+class DetectedLog(contacts.Detection):
     """Contacts of a log, and `eliminated`, the log after removal of the load's wrench."""
 
     eliminated: EliminatedLog = field(kw_only=True)
@@ -795,6 +764,6 @@ def detect_log(
     _reject_static_log(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
-        remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"
+        remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples besides its ends"
         raise DrakeTeleopError(what, where=found.log.source, remedy=remedy)
     return DetectedLog(**vars(found.detection), eliminated=found)

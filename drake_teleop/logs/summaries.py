@@ -22,13 +22,14 @@ def summarize_log(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
     log = found.log
+    unfiltered = log.static or cutoff_hz is None or cutoff_hz >= 0.5 / log.dt
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
         "log": str(path),
         "samples": len(log),
         "duration_s": 0.0 if log.static else float(log.t[-1] - log.t[0]),
         "rate_hz": 0.0 if log.static else 1 / log.dt,
-        "cutoff_hz": None if log.static else cutoff_hz,
+        "cutoff_hz": None if unfiltered else cutoff_hz,
         "delay_s": delay_s,
         "delay_source": found.delay_source,
         "notes": [*log.notes, *(f"{f['name']}: {f['message']}" for f in findings)],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
@@ -453,3 +455,101 @@ def test_results_at_another_rate_are_not_continued(
     (work / "0.json").write_text("{}")
     command._open_work_folder(tmp_path / "out", dataset._replace(fps=fps), [])
     assert (work / "0.json").exists() == is_kept
+
+
+def key_of_interrupted_run(folder: Path, load: Path, description: Any = LEROBOT) -> str:
+    (folder / "d.yaml").write_text(json.dumps(description))
+    options: dict[str, Any] = {"load": load, "description": folder / "d.yaml", "quiet": True}
+    with pytest.raises(KeyboardInterrupt):
+        dataset_command(folder / "demo", folder / "out", **options)
+    return (folder / "out" / "unfinished-demo" / "key").read_text()
+
+
+def identification(**changes: Any) -> Identification:
+    covariance = np.eye(16) * 1e-8
+    known = {"phi": TRUE_PHI, "offsets": np.zeros(6), "covariance": covariance} | changes
+    numbers = np.ones(16, bool), 1.0, 0.0, np.ones(6), "test", 100
+    return Identification(*known.values(), *numbers)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.0 + 1e-9, 1.0 + 1e-6, 1.001])
+def test_results_with_another_load_are_not_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
+) -> None:
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_estimate_shared_load", interrupt)
+    write_sample_dataset(tmp_path / "demo", episodes=1)
+    load, keys = tmp_path / "load.json", []
+    for covariance in np.eye(16) * 1e-8, factor * np.eye(16) * 1e-8:
+        identification(covariance=covariance).save(load)
+        keys.append(key_of_interrupted_run(tmp_path, load))
+    assert (keys[0] == keys[1]) == (factor == 1.0)
+
+
+@pytest.mark.parametrize("suffix", [".zarr", ".hdf5"])
+def test_results_of_changed_arrays_are_not_continued(tmp_path: Path, suffix: str) -> None:
+    zarr, h5py = pytest.importorskip("zarr"), pytest.importorskip("h5py")
+    path = tmp_path / f"demo{suffix}"
+    root = zarr.open_group(path, mode="w") if suffix == ".zarr" else h5py.File(path, "w")
+    root["data/a/force"] = np.zeros((9, 3))
+    root["meta/episode_ends"] = np.array([9])
+    if suffix == ".hdf5":
+        root.close()
+    dataset = open_dataset(path)
+    work = command._open_work_folder(tmp_path / "out", dataset, [])
+    (work / "0.json").write_text("{}")
+    command._open_work_folder(tmp_path / "out", dataset, [])
+    assert (work / "0.json").exists()
+    root = zarr.open_group(path, mode="r+") if suffix == ".zarr" else h5py.File(path, "r+")
+    root["data/a/force"][:] = np.ones((9, 3))
+    if suffix == ".hdf5":
+        root.close()
+    command._open_work_folder(tmp_path / "out", dataset, [])
+    assert not (work / "0.json").exists()
+
+
+@pytest.mark.parametrize("name", ["demo", "unfinished", "unfinished-unfinished", "key"])
+def test_copy_is_not_in_the_folder_of_unfinished_results(tmp_path: Path, name: str) -> None:
+    write_sample_dataset(tmp_path / name, episodes=1)
+    work = command._open_work_folder(tmp_path / "out", open_dataset(tmp_path / name), [])
+    assert tmp_path / "out" / name not in (work, *work.parents)
+
+
+@pytest.mark.slow
+def test_shared_load_has_the_usual_delay_and_is_uncertain_by_gain_errors() -> None:
+    logs = [log_of(sample_episode(k, lag_frames=2.0)) for k in range(2)]
+    plain, widened = (
+        find_shared_load([replace(log, gain_std=gain_std) for log in logs], None).identification
+        for gain_std in (0.0, 0.05)
+    )
+    assert plain.delay_s == pytest.approx(2.0 / 30.0, abs=0.15 / 30.0)
+    np.testing.assert_array_equal(plain.phi, widened.phi)
+    increase = widened.standard_deviations[6] - plain.standard_deviations[6]
+    assert 0.6 < increase / (0.05 * TRUE_PHI[0]) < 1.1
+    assert (widened.standard_deviations[7:10] > 5.0 * plain.standard_deviations[7:10]).all()
+
+
+@pytest.mark.parametrize("removed_from", ["episodes", "load"])
+def test_removed_weight_is_refused(tmp_path: Path, removed_from: str) -> None:
+    write_sample_dataset(tmp_path / "demo", episodes=1)
+    described = json.loads(json.dumps(LEROBOT))
+    if removed_from == "episodes":
+        described["wrench"]["weight"] = "removed"
+    (tmp_path / "d.yaml").write_text(json.dumps(described))
+    load = replace(identification(), weight_removed=removed_from == "load")
+    load.save(tmp_path / "load.json")
+    options: dict[str, Any] = {"load": tmp_path / "load.json", "description": tmp_path / "d.yaml"}
+    with pytest.raises(DrakeTeleopError, match=r"weight the robot has removed.*wrench\.weight"):
+        dataset_command(tmp_path / "demo", tmp_path / "out", quiet=True, **options)
+
+
+@pytest.mark.parametrize(("number", "row"), [(0, 0), (1, 7), (2, 179)])
+def test_rows_in_messages_are_those_of_the_file(tmp_path: Path, number: int, row: int) -> None:
+    write_sample_dataset(tmp_path / "demo", episodes=3)
+    dataset = open_dataset(tmp_path / "demo")
+    table = dataset.read_episode(dataset.episodes[number])
+    assert table.line_in_file(row) == 180 * number + row + 1
+    index = pl.read_parquet(table.path)["index"]
+    assert index[table.line_in_file(row) - 1] == table.columns["index"][row]

@@ -148,3 +148,22 @@ def test_schema_contains_every_field_and_all_forms_of_gravity() -> None:
     kinds = [form["type"] for form in schema["properties"]["gravity"]["anyOf"]]
     assert kinds == ["number", "array", "string"]
     assert "inverse" in schema["$defs"]["Orientation"]["properties"]
+
+
+@pytest.mark.parametrize("given", [{"child_frame": "tool0"}, {"child_frame": "a", "topic": None}])
+def test_child_frame_without_topic_is_refused(tmp_path: Path, given: dict) -> None:
+    data = yaml.safe_load(EXAMPLES[0])
+    data["pose"] |= given
+    (tmp_path / "log.yaml").write_text(yaml.safe_dump(data))
+    with pytest.raises(DrakeTeleopError, match="pose: child_frame requires a topic"):
+        load_description(tmp_path / "log.yaml")
+
+
+@pytest.mark.parametrize("example", [THREE_INSTRUMENTS, AT_REST])
+def test_the_remedy_of_automatic_gravity_is_valid(tmp_path: Path, example: str) -> None:
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(example) | {"gravity": "auto"}))
+    with pytest.raises(DrakeTeleopError, match="requires a wrench and a pose alone: give the vec"):
+        load_description(path)
+    path.write_text(yaml.safe_dump(yaml.safe_load(example) | {"gravity": [0, 1, -9.7]}))
+    load_description(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import detect_log, eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.summaries import summarize_log
 
 TOOL = phi_from_mass_com_inertia(1.5, [0.01, -0.02, 0.1], np.diag([0.01, 0.009, 0.004]))
 OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
@@ -175,3 +177,35 @@ def test_force_residuals_have_torques(tmp_path: Path, capsys: pytest.CaptureFixt
         assert re.match(r"[^;]*? N[ ,][^;]*? N m", rest), words
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "rms of the force and of the torque that" in page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [60, 133])
+def test_too_short_records_are_one_error_with_a_valid_remedy(tmp_path: Path, count: int) -> None:
+    long = log_with_push(tmp_path / "long.parquet", np.zeros(3), 1)
+    load = identify_log(long, delay=0.0).identification
+    for samples in (count, count + 160):
+        pl.read_parquet(long)[:samples].write_parquet(tmp_path / "short.parquet")
+        short = tmp_path / "short.parquet"
+        calls: list[dict[str, Any]] = [{"path": short}, {"path": long, "free": short}]
+        for options in calls:
+            if samples > count:
+                detect_log(load=load, delay=0.0, **options)
+                continue
+            with pytest.raises(DrakeTeleopError, match="samples are too few") as error:
+                detect_log(load=load, delay=0.0, **options)
+            text = str(error.value)
+            assert ("free: " in text) == ("free" in options)
+            assert "besides its ends" in text or "give a longer record" in text
+
+
+@pytest.mark.parametrize(("rate", "cutoff", "used"), [(50, 30.0, None), (61, 30.0, 30.0)])
+@pytest.mark.parametrize("static", [False, True])
+def test_summary_states_the_cutoff_only_of_a_used_low_pass(
+    rate: float, cutoff: float, used: float | None, static: bool
+) -> None:
+    ones = np.ones((20, 3))
+    log = Log(np.arange(20) / rate, np.ones((20, 6)), ones, ones, ones, static=static)
+    found: Any = SimpleNamespace(log=log, findings=(), delay_source="given")
+    assert summarize_log(Path("log"), found, cutoff, 0.0)["cutoff_hz"] == (None if static else used)
+    assert summarize_log(Path("log"), found, None, 0.0)["cutoff_hz"] is None

@@ -528,3 +528,17 @@ def test_ur5_gyroscope_agrees_with_the_pose(ur5: Path, tmp_path: Path) -> None:
     assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(omega[moving] ** 2))
     tilt = low_pass(both.specific_force - posed.specific_force[at], both.dt, 1.0)
     assert np.median(np.linalg.norm(tilt, axis=1)) < 0.6
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("step_deg", [3.0, 8.0, 45.0])
+def test_written_poses_at_rest_read_unchanged(tmp_path: Path, suffix: str, step_deg: float) -> None:
+    R = Rotation.from_euler("y", step_deg * np.arange(12.0)[:, None], degrees=True).as_matrix()
+    gravity, rest = np.swapaxes(R, 1, 2) @ GRAVITY_W, np.zeros((12, 3))
+    wrench = np.hstack([-gravity, 0.1 * gravity])
+    log = Log(np.arange(12.0), wrench, -gravity, rest, rest, gravity, static=True)
+    write_log(log, tmp_path / f"log.{suffix}")
+    found = read_log(tmp_path / f"log.{suffix}")
+    assert found.static
+    np.testing.assert_array_equal(found.wrench, log.wrench)
+    np.testing.assert_array_equal(found.specific_force, log.specific_force)

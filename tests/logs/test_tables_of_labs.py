@@ -188,3 +188,12 @@ def test_commands_print_the_name_of_the_sheet(tmp_path: Path) -> None:
     found = identify_log(tmp_path / "out" / "draft.yaml")
     assert any("the sheet 'Log' was read" in note for note in found.log.notes)
     assert found.identification.mass == pytest.approx(PHI[0], rel=0.01)
+
+
+@pytest.mark.parametrize("row", [0, 7, 29])
+def test_row_numbers_of_excel_files_are_those_of_the_sheet(tmp_path: Path, row: int) -> None:
+    log = numbers_as_frame(30, NAMES).with_columns(pl.col(NAMES[1]).cast(pl.String))
+    log[row, NAMES[1]] = "oops"
+    table = read_table(write_sheets(tmp_path / "x.xlsx", {"Log": log}))
+    with pytest.raises(DrakeTeleopError, match=f"'oops' in row {row + 2} is not a number"):
+        table.finite_numbers([NAMES[1]], 1, "")

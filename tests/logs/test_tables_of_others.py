@@ -696,3 +696,36 @@ def test_pose_at_rest_without_gravity_is_no_crash(tmp_path: Path, row: int, sens
     (tmp_path / "x.yaml").write_text(yaml.safe_dump({"static": {"file": "x.csv", **static}}))
     summary = inspect_command(tmp_path / "x.yaml", tmp_path / "out", quiet=True)
     assert "unusable" not in [finding["name"] for finding in summary["findings"]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("first", "last"), [(1.0, 1.3), (0.5, 2.1)])
+def test_gaps_of_episodes_do_not_include_those_between_them(
+    tmp_path: Path, first: float, last: float
+) -> None:
+    whole = table(start=0.0)
+    cut = whole.filter(~pl.col("t").is_between(first, last))
+    path = described(tmp_path, pl.concat([whole, cut, whole]))
+    (note,) = (note for note in read_log(path).notes if note.startswith("wrench: "))
+    length = last - first + 0.004
+    assert f"1 gaps, the longest of {length:.3g} s at {3.998 + 1.0 + first - 0.002:.3g} s" in note
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    assert summary["streams"]["wrench"]["gaps"] == 1
+    assert summary["streams"]["wrench"]["longest_gap_s"] == pytest.approx(length, abs=1e-6)
+    assert f"the longest {length:.3g} s at {4.996 + first:.3g} s" in str(summary["findings"])
+
+
+@pytest.mark.parametrize("lost", [20, 400])
+def test_rows_with_nan_of_a_stream_without_stamps_keep_the_times_of_others(
+    tmp_path: Path, lost: int
+) -> None:
+    row = pl.int_range(pl.len())
+    frame = table().with_columns(
+        f1=pl.when(row.is_between(600, 599 + lost)).then(None).otherwise("f1")
+    )
+    frame.select(FORCE + TORQUE).write_parquet(tmp_path / "wrench.parquet")
+    path = described(tmp_path, frame, wrench__time={"rate": 500.0}, wrench__file="wrench.parquet")
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    assert [finding["name"] for finding in summary["findings"]] == ["nan"]
+    assert "empty or repair them" in summary["findings"][0]["message"]
+    assert abs(summary["delay_s"]) < 1e-3

@@ -48,7 +48,6 @@ _MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
 _MAX_LN_RESIDUAL_WIDTH_OVER_USUAL = 1.5  # of the residual of the best hypothesis
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
-_WORK_FOLDER_NAME = "unfinished"
 
 
 class DatasetAndLoad(NamedTuple):
@@ -90,7 +89,12 @@ def dataset_command(
     files.make_folder(out)
     with files.output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
         streams = _described_or_drafted_streams(dataset, description)
-        work = _open_work_folder(out, dataset, [str(load), known, streams])
+        if streams["wrench"].get("weight") == "removed" or (known and known.weight_removed):
+            what = "a load whose weight the robot has removed cannot be shared by episodes"
+            remedy = "describe wrench.weight as [m, m c_x, m c_y, m c_z], and use --identify"
+            raise DrakeTeleopError(what, where="dataset", remedy=remedy)
+        settings = [load and load.read_bytes(), streams]
+        work = _open_work_folder(out, dataset, settings)
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
         task = DatasetAndLoad(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
@@ -100,7 +104,8 @@ def dataset_command(
         files.write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = files.to_json_data(_dataset_summary(dataset, copied, shared, rows))
-        page = render_page("drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary)
+        texts = {"name": copied.name, "summary": summary}
+        page = render_page("drake_teleop.logs", "dataset.html.j2", **texts)
         files.write_text(out / "report.html", page)
         shutil.rmtree(work)
         files.write_json(out / "summary.json", summary)
@@ -232,10 +237,11 @@ def _num_frames(table: Table, streams: dict[str, Any]) -> int:
 
 
 def _open_work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
-    paths = sorted({episode.file for episode in dataset.episodes})
-    states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in paths]
+    files_or_folders = {episode.file for episode in dataset.episodes}
+    paths = {path for file in files_or_folders for path in (file, *file.rglob("*"))}
+    states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(paths)]
     key = hashlib.sha256(repr((settings, dataset.fps, states)).encode()).hexdigest()
-    work = out / _WORK_FOLDER_NAME
+    work = out / f"unfinished-{dataset.path.resolve().name}"
     if work.is_dir() and (work / "key").is_file() and (work / "key").read_text() != key:
         shutil.rmtree(work)
     files.make_folder(work)

@@ -24,6 +24,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
+from drake_teleop.logs.read.table_files import array_columns
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN = "observation.contact_wrench", "observation.in_contact"
@@ -62,15 +63,14 @@ class Dataset(NamedTuple):
             return table_files.read_table(episode.file)
         rows = slice(episode.first_row, episode.first_row + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
-            if self.kind != "lerobot":
-                if self.kind == "hdf5":
-                    arrays = read_hdf5(episode.file, group=episode.group)
-                else:
-                    arrays = read_zarr(episode.file / "data", rows=rows)
-                return Table(episode.file, table_files.array_columns(arrays, None))
-            frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
-            part = frame.slice(episode.first_row, episode.rows)
-            return Table(episode.file, table_files.columns_of_frame(part))
+            if self.kind == "lerobot":
+                frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
+                columns = table_files.columns_of_frame(frame[rows])
+            elif self.kind == "hdf5":
+                columns = array_columns(read_hdf5(episode.file, group=episode.group), None)
+            else:
+                columns = array_columns(read_zarr(episode.file / "data", rows=rows), None)
+            return Table(episode.file, columns, episode.first_row + 1)
 
 
 @lru_cache(maxsize=1)

@@ -11,6 +11,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, samples_to_nearest_flag
 from drake_teleop.load.batch.consistent import consistent_least_squares
+from drake_teleop.load.batch.uncertainty import parameter_errors_by_gains
 from drake_teleop.load.contact import detection
 from drake_teleop.load.contact.noise_floor import (
     DetectorSamples,
@@ -19,11 +20,7 @@ from drake_teleop.load.contact.noise_floor import (
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.dataset import episode_verdict
-from drake_teleop.logs.dataset.episode_verdict import (
-    TRIED_LAGS_PER_FRAME,
-    EpisodeSignals,
-    WrenchHypothesis,
-)
+from drake_teleop.logs.dataset.episode_verdict import EpisodeSignals, WrenchHypothesis
 from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.canonical import Log
 
@@ -77,8 +74,8 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     phi = load.phi if determined else phi_with_inertia_replaced(load)[0]
     chosen = _episodes_sharing_load(episodes, phi)
     usual = [x.faultless_hypothesis_and_residual(phi) for x in chosen]
-    steps = float(np.median([x.lag for x, _ in usual])) * TRIED_LAGS_PER_FRAME
-    lag = round(steps) / TRIED_LAGS_PER_FRAME
+    steps = float(np.median([x.lag for x, _ in usual])) * episode_verdict.TRIED_LAGS_PER_FRAME
+    lag = round(steps) / episode_verdict.TRIED_LAGS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
     limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.STANDARD_NORMAL_QUARTILE, []
     for episode, (x, residual) in zip(chosen, usual, strict=True):
@@ -113,8 +110,10 @@ class _FittedEpisode(NamedTuple):
         search = episode_verdict.HypothesisSearch(
             self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
         )
-        steps = np.arange(-TRIED_LAGS_PER_FRAME, TRIED_LAGS_PER_FRAME + 1)
-        lags = self.own.lag + steps / TRIED_LAGS_PER_FRAME
+        steps = np.arange(
+            -episode_verdict.TRIED_LAGS_PER_FRAME, episode_verdict.TRIED_LAGS_PER_FRAME + 1
+        )
+        lags = self.own.lag + steps / episode_verdict.TRIED_LAGS_PER_FRAME
         found = (
             search.with_spread_and_cost(episode_verdict.hypothesis_without_fault(float(lag)))
             for lag in lags
@@ -135,18 +134,21 @@ def _episodes_sharing_load(episodes: list[_FittedEpisode], phi: Array) -> list[_
 
 def _fit_shared_load(episodes: Sequence[_FittedEpisode], phi: Array) -> Identification:
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
-    offsets = []
+    offsets, delays, products, weights = [], [], [], []
     for episode in episodes:
         x, r = episode.faultless_hypothesis_and_residual(phi)
         sigma = np.exp(x.spread) / episode_verdict.STANDARD_NORMAL_QUARTILE
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episode.signals.regressor_at_lag(x.lag)[rows], episode.signals.log.wrench[rows]
-        A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)
-        b = ((w - w.mean(axis=0)) / sigma).ravel()
+        V, w = V - V.mean(axis=0), w - w.mean(axis=0)
+        A, b = (V / sigma[:, None]).reshape(-1, 10), (w / sigma).ravel()
         gram, right = gram + A.T @ A, right + A.T @ b
+        products.append(np.einsum("ncj,nk->cjk", V, w, optimize=True))
+        weights.append(np.diag(sigma**-2))
         squares += ((r[rows] - r[rows].mean(axis=0)) ** 2).sum(axis=0)
         samples += int(rows.sum())
         offsets.append(x.offsets)
+        delays.append(x.lag * episode.signals.log.dt)
     noise = np.sqrt(squares / max(samples, 1))
     size = np.sqrt(np.diag(gram)) + 1e-300
     inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-10, hermitian=True)
@@ -158,14 +160,17 @@ def _fit_shared_load(episodes: Sequence[_FittedEpisode], phi: Array) -> Identifi
         theta = np.concatenate([np.zeros(6), fitted])
         fitted = consistent_least_squares(whole, whole @ theta, theta)[6:]
     covariance = np.zeros((16, 16))
-    covariance[:6, :6], covariance[6:, 6:] = np.diag(noise**2 / samples), inverse
+    arrays = np.array(products), np.array(weights), np.asarray(inverse, float)
+    effects = episodes[0].signals.log.gain_std * parameter_errors_by_gains(*arrays)
+    covariance[:6, :6] = np.diag(noise**2 / samples)
+    covariance[6:, 6:] = inverse + effects @ effects.T
     return Identification(
         phi=fitted,
         offsets=np.median(offsets, axis=0),
         covariance=covariance,
         identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), fitted),
         condition_number=float(np.linalg.cond(gram / np.outer(size, size))),
-        delay_s=0.0,
+        delay_s=float(np.median(delays)),
         residual_rms=noise,
         method="least squares of the calm frames of a dataset",
         samples=samples,

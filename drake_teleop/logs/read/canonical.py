@@ -153,7 +153,8 @@ def write_log(log: Log, path: str | Path) -> None:
     names = [*WRENCH_COLUMNS, *SPECIFIC_FORCE_COLUMNS]
     names += [*ANGULAR_VELOCITY_COLUMNS, *ANGULAR_ACCELERATION_COLUMNS]
     values = np.hstack([log.wrench, *log.motion])
-    frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
+    time = {} if log.static else {"t": log.t}
+    frame = pl.DataFrame(time | dict(zip(names, values.T, strict=True)))
     if path.suffix not in (".csv", ".parquet"):
         what = f"logs cannot be written in the format {path.suffix!r}"
         raise DrakeTeleopError(what, where=str(path), remedy="name it .csv or .parquet")

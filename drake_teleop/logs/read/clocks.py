@@ -152,6 +152,12 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     return result, len(back) + 1
 
 
+def zero_steps_between_episodes(steps: Array, median: float, num_episodes: int) -> Array:
+    error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median)), steps.copy()
+    inner[np.argsort(error, kind="stable")[: num_episodes - 1]] = 0.0
+    return inner
+
+
 def smooth_duplicate_stamps(t: Array) -> Array:
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))

@@ -126,6 +126,8 @@ class _RecordedStreamDescription(_StreamDescription):
     @classmethod
     def _fill_topic_defaults(cls, data: Any) -> Any:
         if not isinstance(data, dict) or data.get("topic") is None:
+            if isinstance(data, dict) and data.get("child_frame") is not None:
+                raise ValueError("child_frame requires a topic: add topic, or remove child_frame")
             return data
         data = {"time": {}, **{name: {} for name in cls._quantities_of_topic}, **data}
         time = data["time"]
@@ -273,7 +275,7 @@ class Description(StrictModel):
             rule = f"more than 0, at most {_MAX_GRAVITY_M_S2:g} m/s^2"
             raise ValueError(f"the largest component of gravity is {largest:g} ({rule})")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
-            raise ValueError("gravity: auto requires a pose and no IMU: add pose, or remove imu")
+            raise ValueError("gravity: auto requires a wrench and a pose alone: give the vector")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
                 raise ValueError("static poses cannot be combined with wrench, imu or pose")

@@ -17,12 +17,12 @@ from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
-from drake_teleop.logs.read import alignment, auto_frames, streams, table_files
+from drake_teleop.logs.read import alignment, auto_frames, clocks, streams, table_files
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW_OVER_PERIOD, angular_motion, resample
 from drake_teleop.logs.read.auto_frames import restore_removed_weight
 from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_bag_topic_or_table
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, find_gaps_in_times, read_clock
+from drake_teleop.logs.read.clocks import Clock
 from drake_teleop.logs.read.description import (
     Description,
     Imu,
@@ -55,11 +55,7 @@ def read_log(
         differentiate: False leaves the motion zero where poses are its only source, for users of
             `Log.posed`.
     """
-    expect_type((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= MIN_CUTOFF_HZ:
-        what = f"{bandwidth_hz:g} Hz is too low"
-        remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for the largest possible one"
-        raise DrakeTeleopError(what, where="bandwidth_hz", remedy=remedy)
+    check_path_and_cutoff(path, bandwidth_hz, "bandwidth_hz")
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
         reader = _LogReader(load_description(path), str(path), bandwidth_hz)
@@ -74,6 +70,13 @@ def read_log(
     table_files.require_file(path)
     remedy = f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)"
     raise DrakeTeleopError(f"format {path.suffix!r} is not known", where=str(path), remedy=remedy)
+
+
+def check_path_and_cutoff(path: Any, cutoff_hz: Any, name: str = "cutoff_hz") -> None:
+    expect_type((str, Path), path, "log", "give the file's name")
+    if cutoff_hz is not None and not to_float(name, cutoff_hz) >= MIN_CUTOFF_HZ:
+        remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no limit"
+        raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where=name, remedy=remedy)
 
 
 def read_described_log(
@@ -305,7 +308,7 @@ class _LogReader:
         )
 
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        clock = read_clock(stream.time, table, stream.columns, f"{self.source}:{name}.time")
+        clock = clocks.read_clock(stream.time, table, stream.columns, f"{self.source}:{name}.time")
         t = clock.t
         if len(t) < MIN_STREAM_SAMPLES or len(alignment.uniform_times(t)) < MIN_STREAM_SAMPLES:
             what = f"{len(t)} samples in {table.path.name} are too few"
@@ -316,7 +319,9 @@ class _LogReader:
             self.notes.append(
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
-        found_gaps = find_gaps_in_times(t, self.bandwidth_hz)
+        step, found_gaps = np.median(np.diff(t)), clocks.find_gaps_in_times(t, self.bandwidth_hz)
+        lengths = found_gaps[:, 1] - found_gaps[:, 0]
+        lengths = clocks.zero_steps_between_episodes(lengths, step, clock.num_episodes)
         if clock.num_episodes > 1:
             starts = f"the clock starts {clock.num_episodes} times"
             if len({stream.source for stream in self.description.streams.values()}) > 1:
@@ -328,14 +333,14 @@ class _LogReader:
                     f"{starts}: the episodes follow each other, 1 s or more apart; samples near"
                     " their ends are not used"
                 )
-        elif len(found_gaps):
-            start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
+        if lengths.any():
+            start = found_gaps[int(np.argmax(lengths)), 0]
             self.notes.append(
-                f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
+                f"{name}: {np.count_nonzero(lengths)} gaps, the longest of {lengths.max():.3g} s at"
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
-            half = self._half_smoother_window_s(float(np.median(np.diff(t))))
+            half = self._half_smoother_window_s(float(step))
             self.gaps.append(found_gaps + np.array([-half, half]))
         return clock
 

@@ -202,8 +202,8 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _is_data_row(cells: list[str]) -> bool:
-    numbers = sum(map(_is_decimal_number, cells))
-    others = [cell for cell in cells if cell and not _is_decimal_number(cell)]
+    numbers = sum(map(is_decimal_number, cells))
+    others = [cell for cell in cells if cell and not is_decimal_number(cell)]
     # A single number beside empty cells can be text above the table.
     if not numbers or numbers + len(others) < (1 if len(cells) == 2 else 2):
         return False
@@ -230,7 +230,7 @@ def has_decimal_commas(lines: Sequence[str], separator: str) -> bool:
 
 def _header_in_comment(comments: list[str], rows: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
-    if not marked or not all(_is_decimal_number(cell) for cell in rows[0].split(separator)):
+    if not marked or not all(is_decimal_number(cell) for cell in rows[0].split(separator)):
         return None
     cells = None if separator == " " else separator
     names = [name.strip() for name in marked[-1].lstrip("# ").split(cells)]
@@ -238,7 +238,7 @@ def _header_in_comment(comments: list[str], rows: list[str], separator: str) -> 
     return names if matching else None
 
 
-def _is_decimal_number(cell: str) -> bool:
+def is_decimal_number(cell: str) -> bool:
     try:
         float(cell.replace(",", "."))
     except ValueError:
@@ -301,7 +301,7 @@ def _read_excel(path: Path) -> Table:
         raise DrakeTeleopError(what, where=str(path), remedy="save each sheet as a CSV file")
     others = ", ".join(repr(name) for name in sheets if name != best)
     note = f"{path.name}: the sheet {best!r} was read; other sheets: {others}" if others else ""
-    return Table(path, columns_of_frame(sheets[best].lazy()), note=note)
+    return Table(path, columns_of_frame(sheets[best].lazy()), first_row=2, note=note)
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
