@@ -20,7 +20,7 @@ from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
-from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, STALE_AGE_S, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -156,7 +156,7 @@ def run_compensate_command(
         report(f"warning: {note}")
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     report(f"outputs are {1e3 * late:.1f} ms late")
-    report(f"readings are stale after {1e3 * STALE_AGE_S:.0f} ms; invalid wrenches are zero")
+    report(f"readings are stale after {1e3 * compensator.stale_age_s:.0f} ms; invalid wrenches are zero")
     if sensor_range is None:
         report("no --range: saturation of the sensor is not detected")
     try:
