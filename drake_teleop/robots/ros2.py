@@ -49,7 +49,7 @@ def domain_of_address(address: Address) -> int:
 
 def checked_topic_name(address: Address, name: str) -> str:
     topic = name.strip("/")
-    if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
+    if not topic.isascii() or not all(part.isidentifier() for part in topic.split("/")):
         what = f"{name!r} is not the name of a ROS topic"
         remedy = "give one such as /ft_sensor/wrench"
         raise DrakeTeleopError(what, where=address.text, remedy=remedy)
@@ -70,6 +70,9 @@ def topics_frames_and_streams(
         if len(frames) != 2 or not all(frames):
             what = f"tf={text!r} does not name two frames"
             raise DrakeTeleopError(what, where=address.text, remedy="give tf=PARENT,CHILD")
+    if len(topics) > 2:  # poses of two frames would be one motion
+        what = f"gives more than one motion: {', '.join(list(topics)[1:])}"
+        raise DrakeTeleopError(what, where=address.text, remedy="give only one of them")
     if JOINTS in topics and not joints:
         what = "joint positions need the model of the arm"
         raise DrakeTeleopError(what, where=address.text, remedy="give --model and --sensor-frame")
@@ -205,7 +208,7 @@ def message_class(message_type: str, where: str) -> Any:
 
 
 class Ros2Source(streams.Source):
-    """Source at ros2://TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&domain=N&sign=1].
+    """Source at ros2://TOPIC[?pose=TOPIC|imu=TOPIC|joints=TOPIC|tf=PARENT,CHILD&domain=N&sign=1].
 
     TOPIC is a WrenchStamped. `/tf` and `/tf_static` contain all frames between PARENT and CHILD.
     """
