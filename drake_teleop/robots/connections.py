@@ -17,7 +17,7 @@ from drake_teleop.robots import assembly
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
+from drake_teleop.robots.streams import IMU, WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import UdpSink, UdpSource, UdpWrenchPoseSource
 
 _REPLAY_PREFIX = "replay:"
@@ -145,7 +145,10 @@ def _open_wrench_and_motion_source(
                 what = "delivers its motion only with a wrench"
                 remedy = "give a source such as rtde://HOST"
                 raise DrakeTeleopError(what, where=motion, remedy=remedy)
-        return assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)
+        streams = assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)
+        if streams.motion_stream == IMU:
+            _refuse_motion_options(streams.where, sensor_pose=sensor_pose)
+        return streams
     except BaseException:
         for each in opened:
             each.close()
