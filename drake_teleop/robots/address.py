@@ -18,7 +18,8 @@ class Address:
         try:
             parts = urlsplit(text)
             self._parameters = dict(parse_qsl(parts.query, keep_blank_values=True))
-            self.host, self.port = parts.hostname or host, parts.port or port
+            self.host = parts.hostname or host
+            self.port = port if parts.port is None else parts.port
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:

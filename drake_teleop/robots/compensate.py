@@ -146,17 +146,18 @@ def run_compensate_command(
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
+    control_port = None if control is None else TareRequestPort(control)
     file = [Path(sink)] if readings.live and is_file_address(sink) else []
     if earlier := move_earlier_recordings(*file):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
-    control_port = None if control is None else TareRequestPort(control)
     changes = ZeroAndLoadMonitor(readings.dt, live=readings.live, report=report) if watch else None
     for note in notes_on_undetermined_load(found):
         report(f"warning: {note}")
-    late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
-    report(f"outputs are {1e3 * late:.1f} ms late")
-    report(f"readings are stale after {1e3 * compensator.stale_age_s:.0f} ms; invalid wrenches are zero")
+    late_s = 0.0 if predicted else compensator.lag_s
+    report(f"outputs are {1e3 * (getattr(readings, 'lag_s', 0.0) + late_s):.1f} ms late")
+    stale_ms = 1e3 * compensator.stale_age_s
+    report(f"readings are stale after {stale_ms:.0f} ms; invalid wrenches are zero")
     if sensor_range is None:
         report("no --range: saturation of the sensor is not detected")
     try:
@@ -171,6 +172,8 @@ def run_compensate_command(
         )
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, ReadingAssembler):
+            late_ms = 1e3 * (readings.lag_s + late_s)
+            report(f"at the end outputs were {late_ms:.1f} ms late")
             report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as stack:

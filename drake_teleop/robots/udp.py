@@ -82,7 +82,8 @@ def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
         host, port = parts.hostname or LOCALHOST, port if parts.port is None else parts.port
     except ValueError:
         host, port = "", None
-    what, remedy = "has no port from 0 to 65535", "give one, such as udp://127.0.0.1:49152"
+    what, kind = "has no port from 0 to 65535", address.partition("://")[0]
+    remedy = f"give one, such as {kind}://127.0.0.1:49152"
     if query := address.partition("?")[2]:
         what, remedy = f"has the unknown parameters {query!r}", f"remove ?{query}"
     if port is None or query:
@@ -151,17 +152,21 @@ class UdpSink:
     """Sink that sends wrenches to udp://HOST:PORT, with or without a receiver."""
 
     def __init__(self, address: str) -> None:
-        self._to = host_and_port(address)
+        host, port = host_and_port(address)
+        if not port:
+            remedy = "give the port of the receiver"
+            raise DrakeTeleopError("port 0 cannot receive", where=address, remedy=remedy)
+        try:
+            self._to = socket.gethostbyname(host), port  # once: a name server delays wrenches
+        except (OSError, UnicodeError) as error:
+            what, remedy = f"{host} is not a known host", "check the name, or give an IPv4 address"
+            raise DrakeTeleopError(what, where=address, remedy=remedy) from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: CompensatedWrench) -> None:
         """Send a wrench; drop it if it cannot be sent now."""
-        try:
+        with suppress(OSError):
             self._socket.sendto(pack_wrench(out), self._to)
-        except OSError as error:
-            if isinstance(error, socket.gaierror):
-                what, remedy = "is not a known host", "check the name, or give an IP address"
-                raise DrakeTeleopError(what, where=self._to[0], remedy=remedy) from error
 
     def close(self) -> None:
         self._socket.close()

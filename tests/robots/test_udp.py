@@ -429,6 +429,42 @@ def test_invalid_address_raises(address: str) -> None:
             open_sink(address)
 
 
+@pytest.mark.parametrize("kind", ["udp", "posed", "foxglove"])
+def test_example_of_a_port_has_the_scheme_of_the_address(kind: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=f"such as {kind}://127.0.0.1:49152"):
+        udp.host_and_port(f"{kind}://127.0.0.1:70000")
+
+
+@pytest.mark.parametrize("address", ["udp://127.0.0.1:0", "udp://no-such-host.invalid:9"])
+def test_sink_without_a_receiver_is_refused_at_once(address: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=re.escape(address)):
+        open_sink(address)
+
+
+def test_host_of_a_sink_is_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(socket, "gethostbyname", lambda name: asked.append(name) or udp.LOCALHOST)
+    with udp.open_udp_receiver(udp.LOCALHOST, 0) as receiver:
+        sink = open_sink(f"udp://slow-name.invalid:{receiver.getsockname()[1]}")
+        for k in range(3):
+            sink.write(CompensatedWrench(k, 0.0, np.zeros(6), np.ones(6), 0))
+        assert [udp.unpack_wrench(receiver.recv(200)).number for _ in range(3)] == [0, 1, 2]
+    sink.close()
+    assert asked == ["slow-name.invalid"]
+
+
+def test_earlier_file_stays_if_the_control_port_is_in_use(tmp_path: Path) -> None:
+    load().save(tmp_path / "load.json")
+    (tmp_path / "x.csv").write_text("earlier")
+    with udp.open_udp_receiver(udp.LOCALHOST, 0) as taken:
+        options = {"rate_hz": 1 / DT, "control": taken.getsockname()[1]}
+        with pytest.raises(DrakeTeleopError, match="give a free port"):
+            run_compensate_command(
+                "udp://:0", tmp_path / "load.json", str(tmp_path / "x.csv"), **options
+            )
+    assert (tmp_path / "x.csv").read_text() == "earlier"
+
+
 @pytest.mark.parametrize("query", ["sign=1", "wrench=scaled&domain=3", "x"])
 def test_parameters_without_effect_are_refused(query: str) -> None:
     for open_address in (
