@@ -20,6 +20,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.interruption import delayed_signals, install_interrupt_handlers
 from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.haply import HaplyDevice
@@ -222,7 +223,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        client.close()
+        with delayed_signals():  # the device would keep its last force
+            client.close()
     behind = np.array(client.force_ages_s or [0.0])
     figures = {
         "behind_p50_ms": float(1e3 * np.median(behind)),
@@ -237,7 +239,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    install_interrupt_handlers()
     try:
         main()
     except DrakeTeleopError as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)

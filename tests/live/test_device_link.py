@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import socket
 import threading
+import time
 from importlib import resources
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -374,6 +377,41 @@ def test_inverse3_answers_every_message_of_its_service():
     values = [said["inverse3"][0]["commands"]["set_cursor_force"]["values"] for said in heard[1:]]
     assert values == [{"x": 0.0, "y": -1.0, "z": 0.0}, {"x": 0.0, "y": -2.0, "z": 0.0}]
     assert heard[0] == {}
+
+
+@pytest.mark.slow
+def test_end_of_a_drive_sets_the_force_of_an_inverse3_to_zero():
+    heard, ended = [], threading.Event()
+
+    def service(connection):
+        threading.Thread(target=send_poses, args=(connection,), daemon=True).start()
+        with contextlib.suppress(ConnectionClosed):
+            heard.extend(map(json.loads, connection))
+        ended.set()
+
+    def send_poses(connection):
+        cursor = {"device_id": "b7", "state": {"cursor_position": {"x": 0, "y": 0, "z": 0}}}
+        with contextlib.suppress(ConnectionClosed):
+            while not ended.wait(1e-3):
+                connection.send(json.dumps({"inverse3": [cursor]}))
+
+    with serve(service, "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        link = DeviceLink(f"haply://127.0.0.1:{server.socket.getsockname()[1]}")
+        end = time.monotonic() + 30.0
+        while time.monotonic() < end and not (heard and force_of(heard[-1])["z"] > 1.0):
+            link.receive_state(time.perf_counter())
+            link.send_wrench(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]))
+            time.sleep(1e-3)
+        link.close()
+        assert ended.wait(10.0)
+        server.shutdown()
+    assert not any(force_of(heard[-1]).values())
+
+
+def force_of(message) -> dict[str, float]:
+    forces = (each["commands"]["set_cursor_force"]["values"] for each in message["inverse3"])
+    return next(forces) if message else {"x": 0.0, "y": 0.0, "z": 0.0}
 
 
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
