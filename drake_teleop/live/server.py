@@ -197,6 +197,7 @@ class LiveDrive:
                 logger=_WEBSOCKET_LOGGER,
             )
         except OSError as error:
+            self._live.close()  # removes the empty record
             what, remedy = f"cannot be opened ({error.strerror})", "use another --port"
             raise DrakeTeleopError(what, where=f"port {self._port}", remedy=remedy) from error
         self._port = server.sockets[0].getsockname()[1]
