@@ -198,7 +198,8 @@ class Compensator:
         wrench = self._delay_line[0].copy()
         if kernel.clip_wrenches(wrench, self._range):
             flags |= _CLIPPED_FLAG
-        return CompensatedWrench(reading.number, reading.t, wrench[:6], wrench[6:], flags)
+        number = max(0, reading.number)
+        return CompensatedWrench(number, reading.t, wrench[:6], wrench[6:], flags)
 
     def stale_output(self, now: float) -> CompensatedWrench | None:
         """Return a zero wrench, flagged as stale, after `stale_age_s` of silence; else None."""

@@ -135,6 +135,16 @@ def test_number_outside_64_bits_is_damaged(number) -> None:
     assert udp.unpack_wrench(udp.pack_wrench(out)).number == 2**64 - 1
 
 
+@pytest.mark.parametrize("number", [-1, -5, -(2**40)])
+def test_negative_number_of_a_reading_is_sent_as_0(number: int, tmp_path: Path) -> None:
+    reading = readings(1)[0]._replace(number=number)
+    out = Compensator(load(), DT).step(reading, 0.0)
+    assert not out.flags and udp.unpack_wrench(udp.pack_wrench(out)).number == 0
+    sink = open_sink(str(tmp_path / "x.csv"))
+    sink.write(out)
+    assert table_of(tmp_path / "x.csv")["number"].to_list() == [0]
+
+
 def test_udp_round_trip_accepts_only_this_machine() -> None:
     source = udp.UdpSource("udp://:0", DT)
     with udp.open_udp_receiver(udp.LOCALHOST, 0) as there:
