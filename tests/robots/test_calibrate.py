@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -125,6 +126,37 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("seconds", [0.3, 0.6, 0.9])
+def test_record_is_not_longer_than_the_maximum(tmp_path: Path, seconds: float) -> None:
+    """A chunk of a replayed log can contain more than the rest of the record."""
+    recorder = Recorder()
+    calibrate(
+        *(Stream(recorded(5.0, [0])), recorder, tmp_path / "log.parquet", TOLERANCE),
+        seconds=seconds,
+    )
+    assert recorder.longest_part_s == pytest.approx(seconds, abs=1.1 * DT)
+
+
+class UselessStream(Stream):
+    """Live stream that repeats the same readings endlessly."""
+
+    live = True
+
+    def read(self, timeout_s: float) -> list[Reading]:
+        time.sleep(0.01)
+        return self._readings
+
+
+@pytest.mark.parametrize("readings", [[], [DAMAGED_READING], [DAMAGED_READING] * 7])
+def test_source_without_valid_readings_ends_after_the_maximum(tmp_path: Path, readings) -> None:
+    source, path = UselessStream(np.empty((0, 15))), tmp_path / "log.parquet"
+    source._readings = readings
+    path.write_text("earlier")
+    with pytest.raises(DrakeTeleopError, match=r"0 valid and .* check the source's address"):
+        calibrate(source, Recorder(), path, TOLERANCE, seconds=0.05)
+    assert path.read_text() == "earlier"
 
 
 def evaluate(values: np.ndarray, until: str, path: Path) -> RecordEvaluation:
