@@ -437,6 +437,28 @@ def test_device_drives_without_a_page_and_releases_after_silence(scenario, load,
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("opened", [None, 60])
+def test_device_still_drives_after_a_page_is_closed(scenario, load, link, opened):
+    """The page may also have opened the clutch."""
+    live = Live(with_task_space_device(scenario), load, None, lambda rows: {}, 0.0, link)
+    sender, seen = Sender(link.port), []
+    for k in range(140):
+        sender.send(k + 1, (0.0, 0.0, -1e-4 * k))
+        now = 2 * MS * k
+        if k == 50:
+            live.join(1, now)
+        if k == opened:
+            live.handle_message(1, json.dumps({"set": {"clutch": 0}}), now)
+        if k == 80:
+            live.leave(1, now)
+        live.tick(lambda now=now: now)
+        seen.append(live._session.inputs)
+    assert [each.clutch for each in seen[50:80:29]] == [1, int(opened is None)]
+    assert all((each.held, each.clutch) == (1, 1) for each in seen[80:])
+    assert seen[-1].z == -10 * 139
+
+
+@pytest.mark.slow
 def test_drive_by_a_device_repeats_to_the_same_bytes(scenario, load, tmp_path):
     setup = with_task_space_device(scenario)
     session = Session(setup, load, log=tmp_path / "log.parquet", record=tmp_path, device=True)
