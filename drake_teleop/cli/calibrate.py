@@ -13,7 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from drake_teleop.cli.logs import identify_command
-from drake_teleop.common.files import make_folder, write_json, write_picture
+from drake_teleop.common.files import (
+    make_folder,
+    refuse_to_replace_inputs,
+    write_json,
+    write_picture,
+)
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.load import tolerance as tolerances
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCES_TEXT, RecordEvaluation, calibrate
@@ -46,6 +51,7 @@ def calibrate_command(
     console = Console(stderr=True, quiet=quiet)
     processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
+        refuse_to_replace_inputs(path, source.removeprefix("replay:"))
         with Live(console=console, auto_refresh=False) as live:
 
             def show_progress(at: RecordEvaluation) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import move_earlier_recordings
+from drake_teleop.common.files import move_earlier_recordings, refuse_to_replace_inputs
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag
@@ -147,8 +147,10 @@ def run_compensate_command(
         print(text, file=sys.stderr, flush=True)
 
     control_port = None if control is None else TareRequestPort(control)
-    file = [Path(sink)] if readings.live and is_file_address(sink) else []
-    if earlier := move_earlier_recordings(*file):
+    file = [Path(sink)] if is_file_address(sink) else []
+    for path in file:
+        refuse_to_replace_inputs(path, source.removeprefix("replay:"))
+    if earlier := move_earlier_recordings(*file if readings.live else ()):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
     changes = ZeroAndLoadMonitor(readings.dt, live=readings.live, report=report) if watch else None

@@ -169,6 +169,8 @@ class _SampleSeries:
         if len(self.t) < 2:
             counts = f"{len(self.t)} valid and {num_rejected_in_error} invalid readings"
             what, remedy = f"{counts} received (minimum: 2 valid)", "check the source's address"
+            if num_rejected_in_error:
+                remedy = "check --range and the values that the source sends"
             raise DrakeTeleopError(what, where="calibrate", remedy=remedy)
         return np.array(self.t), np.array(self._values).reshape(-1, num_columns)
 

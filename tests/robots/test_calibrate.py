@@ -16,6 +16,7 @@ import sockets
 from click.testing import CliRunner
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+from test_compensator import load
 from test_peers import ADDRESS, peer
 from test_reading_assembly import X_FS, truth
 
@@ -38,6 +39,7 @@ from drake_teleop.robots.calibration import (
     calibrate,
     evaluate_record,
 )
+from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Reading, ReadingFlag
 
@@ -149,14 +151,40 @@ class UselessStream(Stream):
         return self._readings
 
 
-@pytest.mark.parametrize("readings", [[], [DAMAGED_READING], [DAMAGED_READING] * 7])
-def test_source_without_valid_readings_ends_after_the_maximum(tmp_path: Path, readings) -> None:
+@pytest.mark.parametrize(
+    ("readings", "remedy"),
+    [
+        ([], "0 invalid .* check the source's address"),
+        ([DAMAGED_READING] * 7, "[1-9] invalid .* check --range and the values"),
+    ],
+)
+def test_source_without_valid_readings_ends_after_the_maximum(
+    tmp_path: Path, readings: list[Reading], remedy: str
+) -> None:
     source, path = UselessStream(np.empty((0, 15))), tmp_path / "log.parquet"
     source._readings = readings
     path.write_text("earlier")
-    with pytest.raises(DrakeTeleopError, match=r"0 valid and .* check the source's address"):
+    with pytest.raises(DrakeTeleopError, match=f"0 valid and .*{remedy}"):
         calibrate(source, Recorder(), path, TOLERANCE, seconds=0.05)
     assert path.read_text() == "earlier"
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "../{}/log.parquet"])
+def test_replayed_log_is_never_replaced(tmp_path: Path, name: str) -> None:
+    log = Log(DT * np.arange(400), *np.split(recorded(2.0, [0]), [6, 9, 12], axis=1))
+    path = tmp_path / name.format(tmp_path.name)
+    write_log(log, path)
+    before = path.read_bytes()
+    load().save(tmp_path / "load.json")
+    for command in (
+        lambda: calibrate_command(f"replay:{path}", tmp_path, until="mass 50 %", quiet=True),
+        lambda: run_compensate_command(
+            f"replay:{path}", tmp_path / "load.json", str(tmp_path / path.name)
+        ),
+    ):
+        with pytest.raises(DrakeTeleopError, match=r"contains the input log.parquet, .* --out"):
+            command()
+    assert path.read_bytes() == before
 
 
 def evaluate(values: np.ndarray, until: str, path: Path) -> RecordEvaluation:
