@@ -118,6 +118,7 @@ def run_compensate_command(
     """
     found = Identification.load(load)
     scales = {name: options.pop(name) for name in SIGMA_GAMMA_NAMES if name in options}
+    limits = None if sensor_range is None else np.repeat(sensor_range, 3)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:
@@ -129,17 +130,10 @@ def run_compensate_command(
         ahead_s = delay_readings * dt + filter_lag(dt, cutoff_hz) if predicted else 0.0
         stream = dt, cutoff_hz, options.get("delay", "auto"), ahead_s
         detector = None if free is None else StreamContactDetector(load, free, *stream)
-        return Compensator(
-            load,
-            dt,
-            **scales,
-            cutoff_hz=cutoff_hz,
-            delay_readings=delay_readings,
-            predicted=predicted,
-            sensor_range=None if sensor_range is None else np.repeat(sensor_range, 3),
-            watch=ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None,
-            detector=detector,
-        )
+        lag: Any = {"delay_readings": delay_readings, "predicted": predicted}
+        monitors: Any = {"watch": ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None}
+        monitors |= {"detector": detector, "sensor_range": limits}
+        return Compensator(load, dt, cutoff_hz=cutoff_hz, **scales, **lag, **monitors)
 
     compensator = make_compensator(found) if attach is None else attach(make_compensator)
 
@@ -163,15 +157,8 @@ def run_compensate_command(
     if sensor_range is None:
         report("no --range: saturation of the sensor is not detected")
     try:
-        counts = compensate_stream(
-            readings,
-            compensator,
-            wrenches,
-            control=control_port,
-            tare=tare,
-            changes=changes,
-            report=report,
-        )
+        loop: Any = {"control": control_port, "tare": tare, "changes": changes, "report": report}
+        counts = compensate_stream(readings, compensator, wrenches, **loop)
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, ReadingAssembler):
             late_ms = 1e3 * (readings.lag_s + late_s)

@@ -60,14 +60,9 @@ def open_source(
     track = load if isinstance(delay, str) else None
     if isinstance(delay, str):
         delay = 0.0 if load is None else load.delay_s
-    return assembly.ReadingAssembler(
-        source,
-        cutoff_hz=cutoff_hz,
-        delay_s=delay,
-        track=track,
-        X_FS=_sensor_pose_from_option(motion_options.get("sensor_pose")),
-        weight_removed=weight_removed,
-    )
+    load_options: Any = {"delay_s": delay, "track": track, "weight_removed": weight_removed}
+    X_FS = _sensor_pose_from_option(motion_options.get("sensor_pose"))
+    return assembly.ReadingAssembler(source, cutoff_hz=cutoff_hz, X_FS=X_FS, **load_options)
 
 
 def open_source_and_recorder(

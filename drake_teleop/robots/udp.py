@@ -11,10 +11,9 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
-    DAMAGED_READING,
-    DAMAGED_WRENCH_READING,
     POSE,
     WRENCH,
     CompensatedWrench,
@@ -42,7 +41,7 @@ def pack_reading(reading: Reading) -> bytes:
 def unpack_reading(packet: bytes) -> Reading:
     """Return the reading in a packet, flagged as damaged if its length or tag is wrong."""
     if len(packet) != READING_FORMAT.size or packet[:4] != _READING_TAG:
-        return DAMAGED_READING
+        return streams.DAMAGED_READING
     _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 15, _HEADER_FORMAT.size).astype(np.float64)
     return Reading(number, t, values, flags & _SATURATED_FLAG)
@@ -55,7 +54,7 @@ def pack_wrench_and_pose(wrench: Reading, pose: Reading) -> bytes:
 
 def unpack_wrench_and_pose(packet: bytes) -> list[Reading]:
     if len(packet) != WRENCH_POSE_FORMAT.size or packet[:4] != _WRENCH_POSE_TAG:
-        return [DAMAGED_WRENCH_READING]
+        return [streams.DAMAGED_WRENCH_READING]
     _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEADER_FORMAT.size).astype(np.float64)
     wrench = Reading(number, t, values[:6], flags & _SATURATED_FLAG, stream=WRENCH)
