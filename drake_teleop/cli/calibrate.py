@@ -36,7 +36,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `until` is the required accuracy; `sensor_range` are the sensor's largest force and torque.
+    `until` is the required accuracy, `sensor_range` the largest force and torque.
     """
     tolerance = tolerances.parse_tolerance(until)
     files.make_folder(out)

@@ -208,9 +208,9 @@ def calibrate(
     seconds: float = 120.0,
     show: Callable[[RecordEvaluation], None] = lambda _: None,
 ) -> list[RecordEvaluation]:
-    """Record a stream until the tolerance is met, it ends or `seconds` pass; return evaluations.
+    """Record a stream until the tolerance is met or it ends; return evaluations.
 
-    The recording also ends after `seconds` without a valid reading.
+    Record and silence last at most `seconds`.
     """
     results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S

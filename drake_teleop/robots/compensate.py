@@ -114,7 +114,7 @@ def run_compensate_command(
         sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        options: scales of a `Compensator`, and options of `open_source`.
+        options: those of `Compensator.set_scales` and `open_source`.
     """
     found = Identification.load(load)
     scales = {name: options.pop(name) for name in SIGMA_GAMMA_NAMES if name in options}

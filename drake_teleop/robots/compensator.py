@@ -27,7 +27,7 @@ from drake_teleop.robots.streams import (
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
 STALE_AGE_S, _STALE_PERIODS = 0.05, 1.5
-"""Minimum age of a reading above which the output wrench is zero [s]; minimum in its periods."""
+"""Age of a stale reading, whose output wrench is zero: minimum [s], and in periods."""
 MIN_CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 MAX_CLOCK_DRIFT = 1e-3
