@@ -161,8 +161,7 @@ def run_compensate_command(
         counts = compensate_stream(readings, compensator, wrenches, **loop)
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, ReadingAssembler):
-            late_ms = 1e3 * (readings.lag_s + late_s)
-            report(f"at the end outputs were {late_ms:.1f} ms late")
+            report(f"at the end outputs were {1e3 * (readings.lag_s + late_s):.1f} ms late")
             report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as stack:

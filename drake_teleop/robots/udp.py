@@ -153,8 +153,7 @@ class UdpSink:
     def __init__(self, address: str) -> None:
         host, port = host_and_port(address)
         if not port:
-            remedy = "give the port of the receiver"
-            raise DrakeTeleopError("port 0 cannot receive", where=address, remedy=remedy)
+            raise DrakeTeleopError("has port 0", where=address, remedy="give the receiver's port")
         try:
             self._to = socket.gethostbyname(host), port  # once: a name server delays wrenches
         except (OSError, UnicodeError) as error:

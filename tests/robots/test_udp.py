@@ -439,6 +439,13 @@ def test_invalid_address_raises(address: str) -> None:
             open_sink(address)
 
 
+@pytest.mark.parametrize("query", ["sign=1&sign=-1", "sign=1&sign=1"])
+def test_parameter_that_is_given_twice_is_refused(query: str) -> None:
+    for kind in ("posed://:0", "rtde://h", "netft://h"):
+        with pytest.raises(DrakeTeleopError, match="gives a parameter twice"):
+            open_source(f"{kind}?{query}", load(), rate_hz=500.0)
+
+
 @pytest.mark.parametrize("kind", ["udp", "posed", "foxglove"])
 def test_example_of_a_port_has_the_scheme_of_the_address(kind: str) -> None:
     with pytest.raises(DrakeTeleopError, match=f"such as {kind}://127.0.0.1:49152"):
