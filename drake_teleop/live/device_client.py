@@ -20,6 +20,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import make_folder, write_json
 from drake_teleop.common.interruption import delayed_signals, install_interrupt_handlers
 from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
@@ -213,6 +214,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--no-observer", action="store_true", help="disable the passivity observer")
     add("--json", type=Path, help="JSON file for the force delays, largest force and energy")
     options = parser.parse_args(arguments)
+    if options.json is not None:
+        make_folder(options.json.parent)
     device = open_device(options.device, options.grip, options.depth)
     client = DeviceClient(device, options.station, observe=not options.no_observer)
     end, largest = time.perf_counter() + options.seconds, 0.0
@@ -234,7 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "slowed": client.guard.slowed,
     }
     if options.json is not None:
-        options.json.write_text(json.dumps(figures) + "\n")
+        write_json(options.json, figures)
     print(json.dumps(figures))
 
 

@@ -18,7 +18,7 @@ from websockets.sync.server import serve
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
-from drake_teleop.live.device_client import DeviceClient, VirtualDevice, tapping_motion
+from drake_teleop.live.device_client import DeviceClient, VirtualDevice, main, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import (
@@ -412,6 +412,18 @@ def test_end_of_a_drive_sets_the_force_of_an_inverse3_to_zero():
 def force_of(message) -> dict[str, float]:
     forces = (each["commands"]["set_cursor_force"]["values"] for each in message["inverse3"])
     return next(forces) if message else {"x": 0.0, "y": 0.0, "z": 0.0}
+
+
+@pytest.mark.parametrize("name", ["figures.json", "new/figures.json", "a file/figures.json"])
+def test_figures_of_a_client_are_written_or_refused_at_once(tmp_path, name):
+    (tmp_path / "a file").touch()
+    words = ["virtual", "udp://127.0.0.1:9", "--seconds", "0.01", "--json", str(tmp_path / name)]
+    if "file/" in name:
+        with pytest.raises(DrakeTeleopError, match="cannot be created as a folder"):
+            main(words)
+        return
+    main(words)
+    assert json.loads((tmp_path / name).read_text())["energy_j"] == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
