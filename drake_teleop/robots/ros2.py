@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -40,7 +41,7 @@ SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 
 
 def domain_of_address(address: Address) -> int:
-    text = address.optional_parameter("domain") or "0"
+    text = address.optional_parameter("domain") or os.environ.get("ROS_DOMAIN_ID") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         what, remedy = f"domain={text!r} is not a ROS domain", "give a whole number from 0 to 232"
         raise DrakeTeleopError(what, where=address.text, remedy=remedy)
@@ -284,7 +285,7 @@ class Ros2Sink:
     @delayed_signals()
     def __init__(self, address: str) -> None:
         parsed = parse_ros2_address(address, ("frame", "wrench", "domain"))
-        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.qos import qos_profile_sensor_data as quality
 
         topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
         self._which = parsed.wrench_name()
@@ -298,7 +299,6 @@ class Ros2Sink:
         self._topic, self._flags, self._next = f"/{topic}", -1, 0.0
         self._counts: Counter[str] = Counter()
         node, kinds = self._node.node, self._kinds
-        quality = qos_profile_sensor_data
         self._wrenches = node.create_publisher(kinds.WrenchStamped, self._topic, quality)
         self._diagnostics = node.create_publisher(kinds.DiagnosticArray, "/diagnostics", 100)
 

@@ -33,6 +33,7 @@ from drake_teleop.robots.ros2 import (
     SOURCE_PARAMETERS,
     MessageConverter,
     checked_topic_name,
+    domain_of_address,
     topics_frames_and_streams,
 )
 from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, POSE, CompensatedWrench, ReadingFlag
@@ -190,6 +191,19 @@ def test_only_one_motion_is_accepted(query: str) -> None:
     for part in query.split("&"):
         one = Address(f"zenoh://h/ft?{part}", None, SOURCE_PARAMETERS)
         assert len(topics_frames_and_streams(one, ("joint_1",))[2]) == 2
+
+
+@pytest.mark.parametrize(
+    ("query", "environment", "domain"),
+    [("", None, 0), ("", "", 0), ("", "7", 7), ("?domain=3", "7", 3), ("?domain=0", "7", 0)],
+)
+def test_domain_is_that_of_the_address_or_the_environment(
+    monkeypatch: pytest.MonkeyPatch, query: str, environment: str | None, domain: int
+) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    if environment is not None:
+        monkeypatch.setenv("ROS_DOMAIN_ID", environment)
+    assert domain_of_address(Address(f"zenoh://h/ft{query}", None, SOURCE_PARAMETERS)) == domain
 
 
 @pytest.mark.parametrize("name", ["a//b", "a/1b", "1a", "a-b", "", "/", "ä"])
