@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drake_teleop.cli.logs import identify_command
-from drake_teleop.common.files import make_folder, write_json, write_picture
+from drake_teleop.common import files
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.load import tolerance as tolerances
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCES_TEXT, RecordEvaluation, calibrate
@@ -36,16 +36,17 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `until` is the required accuracy; `sensor_range` are the sensor's largest force and torque.
+    `until` is the required accuracy, `sensor_range` the largest force and torque.
     """
     tolerance = tolerances.parse_tolerance(until)
-    make_folder(out)
+    files.make_folder(out)
     limits = None if sensor_range is None else np.repeat(sensor_range, 3)
     stream, recorder = open_source_and_recorder(source, limits, **stream_options)
     path = out / recorder.log_file_name
     console = Console(stderr=True, quiet=quiet)
     processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
+        files.refuse_to_replace_inputs(path, source.removeprefix("replay:"))
         with Live(console=console, auto_refresh=False) as live:
 
             def show_progress(at: RecordEvaluation) -> None:
@@ -58,7 +59,7 @@ def calibrate_command(
         stream.close()
     last = evaluations[-1]
     summary = identify_command(path, out, quiet=True, **processing)
-    write_picture(out / "settling.png", draw_accuracy(evaluations, tolerance))
+    files.write_picture(out / "settling.png", draw_accuracy(evaluations, tolerance))
     names = tolerance.required_entry_names
     summary |= {
         "tolerance": str(tolerance),
@@ -72,7 +73,7 @@ def calibrate_command(
         "left_out": recorder.left_out,
         "clock_changes": recorder.clock_changes,
     }
-    write_json(out / "summary.json", summary)
+    files.write_json(out / "summary.json", summary)
     verdict = "known" if summary["all_known"] else "[bold red]not known[/]"
     console.print(f"{verdict} after {last.record_length_s:.1f} s: {tolerance}", highlight=False)
     console.print(f"written to {out}", highlight=False, markup=False)

@@ -34,7 +34,8 @@ def experiment_command(
                 serve_experiment(Procedure(experiment, number, store), scenarios, **page)
         finally:
             table = write_results(experiment, store)
-            print(f"written {out / 'results.csv'} and .png, from {out / 'trials.csv'}", flush=True)
+            picture = " and .png" if (out / "results.png").exists() else ""
+            print(f"written {out / 'results.csv'}{picture}, from {out / 'trials.csv'}", flush=True)
     return table
 
 

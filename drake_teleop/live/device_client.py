@@ -20,6 +20,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import make_folder, write_json
+from drake_teleop.common.interruption import delayed_signals, install_interrupt_handlers
 from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.haply import HaplyDevice
@@ -212,6 +214,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--no-observer", action="store_true", help="disable the passivity observer")
     add("--json", type=Path, help="JSON file for the force delays, largest force and energy")
     options = parser.parse_args(arguments)
+    if options.json is not None:
+        make_folder(options.json.parent)
     device = open_device(options.device, options.grip, options.depth)
     client = DeviceClient(device, options.station, observe=not options.no_observer)
     end, largest = time.perf_counter() + options.seconds, 0.0
@@ -222,7 +226,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        client.close()
+        with delayed_signals():  # the device would keep its last force
+            client.close()
     behind = np.array(client.force_ages_s or [0.0])
     figures = {
         "behind_p50_ms": float(1e3 * np.median(behind)),
@@ -232,12 +237,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "slowed": client.guard.slowed,
     }
     if options.json is not None:
-        options.json.write_text(json.dumps(figures) + "\n")
+        write_json(options.json, figures)
     print(json.dumps(figures))
 
 
 if __name__ == "__main__":
+    install_interrupt_handlers()
     try:
         main()
     except DrakeTeleopError as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)

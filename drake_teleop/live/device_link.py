@@ -14,16 +14,9 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import conjugate_quaternion, quaternion_product
+from drake_teleop.live import device_packets
 from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
-from drake_teleop.live.device_packets import (
-    CLUTCH_OPEN_FLAG,
-    MAX_PACKET_BYTES,
-    DeviceState,
-    ForceCommand,
-    pack_force,
-    rejection_reason,
-    unpack_state,
-)
+from drake_teleop.live.device_packets import CLUTCH_OPEN_FLAG, DeviceState, ForceCommand
 from drake_teleop.live.inputs import inputs_at_displacement
 from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
@@ -78,17 +71,18 @@ class DeviceLink:
         self._polled_at = now
         for _ in range(_MAX_PACKETS_PER_POLL):
             try:
-                packet, peer = self._socket.recvfrom(MAX_PACKET_BYTES + 1)
+                packet, peer = self._socket.recvfrom(device_packets.MAX_PACKET_BYTES + 1)
             except (BlockingIOError, ConnectionError):
                 break
             self._accept_or_refuse_packet(packet, peer, now)
         return None if self.is_device_silent(now) else self._state
 
     def _accept_or_refuse_packet(self, packet: bytes, peer: Any, now: float) -> None:
-        state, silent = unpack_state(packet), self.is_device_silent(now)
+        state, silent = device_packets.unpack_state(packet), self.is_device_silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
-            self.refusal = rejection_reason(packet) if state is None else "is from a second device"
+            second = "is from a second device"
+            self.refusal = second if state else device_packets.rejection_reason(packet)
             return
         if silent:  # a new device, or the same one after a pause
             self._peer, self._connected_at, self._state = peer, now, None
@@ -112,7 +106,7 @@ class DeviceLink:
             return
         command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
         try:
-            self._socket.sendto(pack_force(command), self._peer)
+            self._socket.sendto(device_packets.pack_force(command), self._peer)
         except OSError:  # a later attempt would send an old force
             return
 

@@ -208,10 +208,11 @@ class Live:
             self._set_driving_page(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; if it drives, the hand releases the stylus."""
+        """Remove a page; if it drives, a simulated hand releases the stylus."""
         if client == self._driver:
             self._driver, self._idle_since = None, now
-            self._requested = self._requested.with_changes({"held": 0, "clutch": 0})
+            changes = {"held": 0, "clutch": 0} if self._link is None else {"clutch": 1}
+            self._requested = self._requested.with_changes(changes)
             self._rates = RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:

@@ -6,15 +6,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    Diagram,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-    System,
-)
+from pydrake.systems import framework
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues, System
 
 from drake_teleop.common.blocks import NO_EXTRA_SLOTS, weak_callback
 from drake_teleop.common.compiled import njit
@@ -105,7 +98,7 @@ def build_master_side(
     return builder.Build()
 
 
-class CrossFade(LeafSystem):
+class CrossFade(framework.LeafSystem):
     """Cross-fade from the rendered wrench of a previous station.
 
     .. pydrake_system::
@@ -122,7 +115,7 @@ class CrossFade(LeafSystem):
     def __init__(self, period: float) -> None:
         super().__init__()
         # Start [s], length [s], previous rendered wrench (6,).
-        self._change = self.DeclareNumericParameter(BasicVector(8))
+        self._change = self.DeclareNumericParameter(framework.BasicVector(8))
         # Weight of the new wrench, and force limit [N]. They are discrete, since the integrator
         # would evaluate a function of time several times in each step.
         self._state = int(self.DeclareDiscreteState([1.0, math.inf]))
@@ -155,7 +148,7 @@ class CrossFade(LeafSystem):
         elif max_force < math.inf and _force_norm(self._wrench.Eval(context)) <= max_force:
             state.get_mutable_value(self._state)[1] = math.inf
 
-    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+    def _calc_wrench(self, context: Context, output: framework.BasicVector) -> None:
         share, max_force = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
         if share == 1.0 and max_force == math.inf:  # the usual case, in half the time

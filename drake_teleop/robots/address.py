@@ -17,12 +17,17 @@ class Address:
         self.text = text
         try:
             parts = urlsplit(text)
-            self._parameters = dict(parse_qsl(parts.query, keep_blank_values=True))
-            self.host, self.port = parts.hostname or host, parts.port or port
+            pairs = parse_qsl(parts.query, keep_blank_values=True)
+            self._parameters = dict(pairs)
+            self.host = parts.hostname or host
+            self.port = port if parts.port is None else parts.port
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:
             raise DrakeTeleopError("has no host", where=text, remedy=f"use {parts.scheme}://HOST")
+        if len(pairs) > len(self._parameters):
+            what = "gives a parameter twice"
+            raise DrakeTeleopError(what, where=text, remedy="give each one only once")
         self.path = parts.path.strip("/")
         if unknown := self._parameters.keys() - set(allowed):
             what = f"unknown parameter {min(unknown)!r}"

@@ -227,6 +227,7 @@ class MotionWindow:
 
     def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY_W) -> None:
         self._cutoff_hz, self._dt, self._gravity_W = cutoff_hz, 0.0, gravity_W
+        self.half_window_s = 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / (cutoff_hz or math.inf)
         self._weights, self._size = np.zeros((3, 1)), 1
         self._R_FS, self._p_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0], X_FS[4:]
         self._steps: list[float] = []
@@ -243,6 +244,7 @@ class MotionWindow:
             self._dt = float(np.median(self._steps))
             self._weights = polynomial_fit_weights(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
+            self.half_window_s = self._size // 2 * self._dt
             self.reset()
 
     def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
@@ -337,8 +339,6 @@ class ReadingAssembler(Source):
         self._streams, self._delay, self.dt = streams, delay_s, streams.dt
         self._tracker = None if track is None else DelayTracker(track, self.dt, cutoff_hz, delay_s)
         self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY_W)
-        half_window_s = 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / (cutoff_hz or math.inf)
-        self.lag_s = max(0.0, half_window_s + delay_s)
         self._clocks = _ClockOffsetEstimator(), _ClockOffsetEstimator()
         self._motions: deque[tuple[float, Array]] = deque()
         self._pending = deque[Reading](maxlen=max(1, round(_STREAM_BUFFER_S / self.dt)))
@@ -346,6 +346,10 @@ class ReadingAssembler(Source):
     @property
     def delay_s(self) -> float:
         return self._delay if self._tracker is None else self._tracker.delay_s
+
+    @property
+    def lag_s(self) -> float:
+        return max(0.0, self._window.half_window_s + self.delay_s)
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         arrived = self._streams.read(timeout_s)

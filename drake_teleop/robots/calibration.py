@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -207,7 +208,10 @@ def calibrate(
     seconds: float = 120.0,
     show: Callable[[RecordEvaluation], None] = lambda _: None,
 ) -> list[RecordEvaluation]:
-    """Record a stream until the tolerance is met, it ends or `seconds` pass; return evaluations."""
+    """Record a stream until the tolerance is met or it ends; return evaluations.
+
+    Record and silence last at most `seconds`.
+    """
     results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S
     earlier = [path.with_name(name) for name in recorder.file_names] if source.live else []
@@ -228,7 +232,7 @@ def calibrate(
             earlier.clear()
         recorder.write(path)
 
-    done = False
+    done, grown_s, grown_at = False, 0.0, time.monotonic()
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
             while not (done or INTERRUPTED_EVENT.is_set()):
@@ -237,15 +241,17 @@ def calibrate(
                 for reading in readings:
                     recorder.add(reading)
                     if pending is None and recorder.longest_part_s >= next_length_s:
-                        grown_s = RECORD_GROWTH_FACTOR * recorder.longest_part_s
-                        next_length_s = max(FIRST_RECORD_S, grown_s)
+                        next_length_s = RECORD_GROWTH_FACTOR * recorder.longest_part_s
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):
                         done, pending = store_evaluation_and_get_is_done(pending.result()), None
-                        if done:
-                            break
-                done = done or recorder.longest_part_s >= seconds
+                    done = done or recorder.longest_part_s >= seconds
+                    if done:
+                        break
+                if recorder.longest_part_s > grown_s:
+                    grown_s, grown_at = recorder.longest_part_s, time.monotonic()
+                done = done or (source.live and time.monotonic() - grown_at > seconds)
     except Exception:  # raised again: the record is kept whatever ended the loop
         if recorder.longest_part_s:
             write_record()

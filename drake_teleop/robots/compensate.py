@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import move_earlier_recordings
+from drake_teleop.common.files import move_earlier_recordings, refuse_to_replace_inputs
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
-from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, STALE_AGE_S, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -114,10 +114,11 @@ def run_compensate_command(
         sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        options: scales of a `Compensator`, and options of `open_source`.
+        options: those of `Compensator.set_scales` and `open_source`.
     """
     found = Identification.load(load)
     scales = {name: options.pop(name) for name in SIGMA_GAMMA_NAMES if name in options}
+    limits = None if sensor_range is None else np.repeat(sensor_range, 3)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
 
     def make_compensator(load: Identification) -> Compensator:
@@ -129,48 +130,38 @@ def run_compensate_command(
         ahead_s = delay_readings * dt + filter_lag(dt, cutoff_hz) if predicted else 0.0
         stream = dt, cutoff_hz, options.get("delay", "auto"), ahead_s
         detector = None if free is None else StreamContactDetector(load, free, *stream)
-        return Compensator(
-            load,
-            dt,
-            **scales,
-            cutoff_hz=cutoff_hz,
-            delay_readings=delay_readings,
-            predicted=predicted,
-            sensor_range=None if sensor_range is None else np.repeat(sensor_range, 3),
-            watch=ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None,
-            detector=detector,
-        )
+        lag: Any = {"delay_readings": delay_readings, "predicted": predicted}
+        monitors: Any = {"watch": ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None}
+        monitors |= {"detector": detector, "sensor_range": limits}
+        return Compensator(load, dt, cutoff_hz=cutoff_hz, **scales, **lag, **monitors)
 
     compensator = make_compensator(found) if attach is None else attach(make_compensator)
 
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    file = [Path(sink)] if readings.live and is_file_address(sink) else []
-    if earlier := move_earlier_recordings(*file):
+    control_port = None if control is None else TareRequestPort(control)
+    file = [Path(sink)] if is_file_address(sink) else []
+    for path in file:
+        refuse_to_replace_inputs(path, source.removeprefix("replay:"))
+    if earlier := move_earlier_recordings(*file if readings.live else ()):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
-    control_port = None if control is None else TareRequestPort(control)
     changes = ZeroAndLoadMonitor(readings.dt, live=readings.live, report=report) if watch else None
     for note in notes_on_undetermined_load(found):
         report(f"warning: {note}")
-    late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
-    report(f"outputs are {1e3 * late:.1f} ms late")
-    report(f"readings are stale after {1e3 * STALE_AGE_S:.0f} ms; invalid wrenches are zero")
+    late_s = 0.0 if predicted else compensator.lag_s
+    report(f"outputs are {1e3 * (getattr(readings, 'lag_s', 0.0) + late_s):.1f} ms late")
+    stale_ms = 1e3 * compensator.stale_age_s
+    report(f"readings are stale after {stale_ms:.0f} ms; invalid wrenches are zero")
     if sensor_range is None:
         report("no --range: saturation of the sensor is not detected")
     try:
-        counts = compensate_stream(
-            readings,
-            compensator,
-            wrenches,
-            control=control_port,
-            tare=tare,
-            changes=changes,
-            report=report,
-        )
+        loop: Any = {"control": control_port, "tare": tare, "changes": changes, "report": report}
+        counts = compensate_stream(readings, compensator, wrenches, **loop)
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, ReadingAssembler):
+            report(f"at the end outputs were {1e3 * (readings.lag_s + late_s):.1f} ms late")
             report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as stack:

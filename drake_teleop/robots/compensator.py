@@ -26,8 +26,8 @@ from drake_teleop.robots.streams import (
 )
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
-STALE_AGE_S = 0.05
-"""Age of a reading above which the output wrench is zero [s]."""
+STALE_AGE_S, _STALE_PERIODS = 0.05, 1.5
+"""Age of a stale reading, whose output wrench is zero: minimum [s], and in periods."""
 MIN_CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 MAX_CLOCK_DRIFT = 1e-3
@@ -108,6 +108,7 @@ class Compensator:
     ) -> None:
         self._phi, self._zero_phi = processing.phi_with_inertia_replaced(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
+        self.stale_age_s = max(STALE_AGE_S, _STALE_PERIODS * dt)
         self._scales, self._is_gravity_known = np.empty(4), True
         self.set_scales(**scales)
         self.offsets = load.offsets.copy()
@@ -148,8 +149,8 @@ class Compensator:
             "range": np.minimum(self._range, np.finfo(float).max),
             "largest": self._largest,
             "noise_limits": self._noise_limit,
-            # Readings after which more than STALE_AGE_S has passed, by the tolerance of rounding.
-            "stale_steps": math.floor(STALE_AGE_S / self._dt + 1e-9) - 1,
+            # Readings after which more than `stale_age_s` has passed, by the tolerance of rounding.
+            "stale_steps": math.floor(self.stale_age_s / self._dt + 1e-9) - 1,
             "tare_steps": len(self._tare_rows),
         }
 
@@ -183,7 +184,7 @@ class Compensator:
         invalid = flags & ~_FLAGS_WITH_NONZERO_OUTPUT_WRENCH
         if invalid & ~_INTERPOLATED_GAP_FLAG:
             return self._make_zero_wrench(flags)
-        if now - self._now > STALE_AGE_S:
+        if now - self._now > self.stale_age_s:
             self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
         self._delay_line.append(self._contact_and_scaled_wrench(reading.values, reading.gravity))
@@ -197,14 +198,16 @@ class Compensator:
         wrench = self._delay_line[0].copy()
         if kernel.clip_wrenches(wrench, self._range):
             flags |= _CLIPPED_FLAG
-        return CompensatedWrench(reading.number, reading.t, wrench[:6], wrench[6:], flags)
+        number = max(0, reading.number)
+        return CompensatedWrench(number, reading.t, wrench[:6], wrench[6:], flags)
 
     def stale_output(self, now: float) -> CompensatedWrench | None:
-        """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
-        return self._make_zero_wrench(_STALE_FLAG) if now - self._now > STALE_AGE_S else None
+        """Return a zero wrench, flagged as stale, after `stale_age_s` of silence; else None."""
+        stale = now - self._now > self.stale_age_s
+        return self._make_zero_wrench(_STALE_FLAG) if stale else None
 
     def time_to_stale(self, now: float) -> float:
-        return max(0.0, self._now + STALE_AGE_S - now)
+        return max(0.0, self._now + self.stale_age_s - now)
 
     def tare(self) -> str:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
@@ -254,7 +257,7 @@ class Compensator:
         started = not math.isinf(self._min_offset)
         step = reading.t - self._t
         # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
-        lost = now - self._now > STALE_AGE_S
+        lost = now - self._now > self.stale_age_s
         if started and reading.number <= self._number and (abs(step) > MIN_CLOCK_JUMP_S or lost):
             return self._reset_clock_to_reading(reading, ahead, flags | int(ReadingFlag.RESTART))
         if started and (abs(ahead - self._min_offset) > MIN_CLOCK_JUMP_S or (step <= 0.0 and lost)):

@@ -17,7 +17,7 @@ from drake_teleop.robots import assembly
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import WRENCH_AND_MOTION, Sink, Source
+from drake_teleop.robots.streams import IMU, WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import UdpSink, UdpSource, UdpWrenchPoseSource
 
 _REPLAY_PREFIX = "replay:"
@@ -60,14 +60,9 @@ def open_source(
     track = load if isinstance(delay, str) else None
     if isinstance(delay, str):
         delay = 0.0 if load is None else load.delay_s
-    return assembly.ReadingAssembler(
-        source,
-        cutoff_hz=cutoff_hz,
-        delay_s=delay,
-        track=track,
-        X_FS=_sensor_pose_from_option(motion_options.get("sensor_pose")),
-        weight_removed=weight_removed,
-    )
+    load_options: Any = {"delay_s": delay, "track": track, "weight_removed": weight_removed}
+    X_FS = _sensor_pose_from_option(motion_options.get("sensor_pose"))
+    return assembly.ReadingAssembler(source, cutoff_hz=cutoff_hz, X_FS=X_FS, **load_options)
 
 
 def open_source_and_recorder(
@@ -145,7 +140,10 @@ def _open_wrench_and_motion_source(
                 what = "delivers its motion only with a wrench"
                 remedy = "give a source such as rtde://HOST"
                 raise DrakeTeleopError(what, where=motion, remedy=remedy)
-        return assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)
+        streams = assembly.WrenchAndMotionStreams(*opened, where=motion or address, arm=arm)
+        if streams.motion_stream == IMU:
+            _refuse_motion_options(streams.where, sensor_pose=sensor_pose)
+        return streams
     except BaseException:
         for each in opened:
             each.close()

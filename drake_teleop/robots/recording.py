@@ -16,17 +16,10 @@ from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.robots import streams
 from drake_teleop.robots.assembly import IDENTITY_POSE
 from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S
-from drake_teleop.robots.streams import (
-    IMU,
-    NUM_READING_VALUES,
-    POSE,
-    WRENCH,
-    WRENCH_AND_MOTION,
-    Reading,
-    ReadingFlag,
-)
+from drake_teleop.robots.streams import POSE, WRENCH, WRENCH_AND_MOTION, Reading, ReadingFlag
 
 _FLAGS_OF_REJECTED_READINGS = (
     ReadingFlag.DAMAGED
@@ -38,7 +31,7 @@ _FLAGS_OF_REJECTED_READINGS = (
 _LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
     WRENCH: {"force": canonical.WRENCH_COLUMNS[:3], "torque": canonical.WRENCH_COLUMNS[3:]},
     POSE: {"orientation": canonical.QUATERNION_COLUMNS, "position": canonical.POSITION_COLUMNS},
-    IMU: {
+    streams.IMU: {
         "specific_force": canonical.SPECIFIC_FORCE_COLUMNS,
         "angular_velocity": canonical.ANGULAR_VELOCITY_COLUMNS,
     },
@@ -122,7 +115,8 @@ class Recorder:
 
         part = self._longest_record()
         if WRENCH_AND_MOTION in part:
-            t, values = part[WRENCH_AND_MOTION].times_and_values(NUM_READING_VALUES, self.left_out)
+            size, samples = streams.NUM_READING_VALUES, part[WRENCH_AND_MOTION]
+            t, values = samples.times_and_values(size, self.left_out)
             wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
             write_log(Log(t - t[0], wrench, s, omega, alpha), path)
             return
@@ -169,6 +163,8 @@ class _SampleSeries:
         if len(self.t) < 2:
             counts = f"{len(self.t)} valid and {num_rejected_in_error} invalid readings"
             what, remedy = f"{counts} received (minimum: 2 valid)", "check the source's address"
+            if num_rejected_in_error:
+                remedy = "check --range and the values that the source sends"
             raise DrakeTeleopError(what, where="calibrate", remedy=remedy)
         return np.array(self.t), np.array(self._values).reshape(-1, num_columns)
 

@@ -20,8 +20,8 @@ from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 class ReplayLogSource(Source):
     """Source of a log's readings, with the motion aligned to the wrench.
 
-    `delay_readings` is the removed delay of the motion, in readings; `chunk` the largest number of
-    readings per call. Without a `load` the motion is not aligned.
+    `delay_readings`: removed delay of the motion [readings]; `chunk`: largest number of readings
+    per call. Without a `load` the motion is not aligned.
     """
 
     def __init__(

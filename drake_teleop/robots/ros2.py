@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -40,7 +41,7 @@ SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 
 
 def domain_of_address(address: Address) -> int:
-    text = address.optional_parameter("domain") or "0"
+    text = address.optional_parameter("domain") or os.environ.get("ROS_DOMAIN_ID") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         what, remedy = f"domain={text!r} is not a ROS domain", "give a whole number from 0 to 232"
         raise DrakeTeleopError(what, where=address.text, remedy=remedy)
@@ -49,7 +50,7 @@ def domain_of_address(address: Address) -> int:
 
 def checked_topic_name(address: Address, name: str) -> str:
     topic = name.strip("/")
-    if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
+    if not topic.isascii() or not all(part.isidentifier() for part in topic.split("/")):
         what = f"{name!r} is not the name of a ROS topic"
         remedy = "give one such as /ft_sensor/wrench"
         raise DrakeTeleopError(what, where=address.text, remedy=remedy)
@@ -70,6 +71,9 @@ def topics_frames_and_streams(
         if len(frames) != 2 or not all(frames):
             what = f"tf={text!r} does not name two frames"
             raise DrakeTeleopError(what, where=address.text, remedy="give tf=PARENT,CHILD")
+    if len(topics) > 2:  # poses of two frames would be one motion
+        what = f"gives more than one motion: {', '.join(list(topics)[1:])}"
+        raise DrakeTeleopError(what, where=address.text, remedy="give only one of them")
     if JOINTS in topics and not joints:
         what = "joint positions need the model of the arm"
         raise DrakeTeleopError(what, where=address.text, remedy="give --model and --sensor-frame")
@@ -205,7 +209,7 @@ def message_class(message_type: str, where: str) -> Any:
 
 
 class Ros2Source(streams.Source):
-    """Source at ros2://TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&domain=N&sign=1].
+    """Source at ros2://TOPIC[?pose=TOPIC|imu=TOPIC|joints=TOPIC|tf=PARENT,CHILD&domain=N&sign=1].
 
     TOPIC is a WrenchStamped. `/tf` and `/tf_static` contain all frames between PARENT and CHILD.
     """
@@ -281,7 +285,7 @@ class Ros2Sink:
     @delayed_signals()
     def __init__(self, address: str) -> None:
         parsed = parse_ros2_address(address, ("frame", "wrench", "domain"))
-        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.qos import qos_profile_sensor_data as quality
 
         topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
         self._which = parsed.wrench_name()
@@ -295,7 +299,6 @@ class Ros2Sink:
         self._topic, self._flags, self._next = f"/{topic}", -1, 0.0
         self._counts: Counter[str] = Counter()
         node, kinds = self._node.node, self._kinds
-        quality = qos_profile_sensor_data
         self._wrenches = node.create_publisher(kinds.WrenchStamped, self._topic, quality)
         self._diagnostics = node.create_publisher(kinds.DiagnosticArray, "/diagnostics", 100)
 

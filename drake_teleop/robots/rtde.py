@@ -73,12 +73,8 @@ class RtdeSource(Source):
     def _start_reader_process(self) -> None:
         code = "from drake_teleop.robots.rtde_reader import main; main()"
         self._pipe, into = os.pipe()
-        self._child = subprocess.Popen(
-            [sys.executable, "-c", code, self._host, str(into)],
-            pass_fds=[into],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        words, nowhere = [sys.executable, "-c", code, self._host, str(into)], subprocess.DEVNULL
+        self._child = subprocess.Popen(words, pass_fds=[into], stdout=nowhere, stderr=nowhere)
         os.close(into)
         self._partial, self._started = b"", time.monotonic()
 

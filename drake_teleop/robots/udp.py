@@ -11,10 +11,9 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
-    DAMAGED_READING,
-    DAMAGED_WRENCH_READING,
     POSE,
     WRENCH,
     CompensatedWrench,
@@ -42,7 +41,7 @@ def pack_reading(reading: Reading) -> bytes:
 def unpack_reading(packet: bytes) -> Reading:
     """Return the reading in a packet, flagged as damaged if its length or tag is wrong."""
     if len(packet) != READING_FORMAT.size or packet[:4] != _READING_TAG:
-        return DAMAGED_READING
+        return streams.DAMAGED_READING
     _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 15, _HEADER_FORMAT.size).astype(np.float64)
     return Reading(number, t, values, flags & _SATURATED_FLAG)
@@ -55,7 +54,7 @@ def pack_wrench_and_pose(wrench: Reading, pose: Reading) -> bytes:
 
 def unpack_wrench_and_pose(packet: bytes) -> list[Reading]:
     if len(packet) != WRENCH_POSE_FORMAT.size or packet[:4] != _WRENCH_POSE_TAG:
-        return [DAMAGED_WRENCH_READING]
+        return [streams.DAMAGED_WRENCH_READING]
     _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEADER_FORMAT.size).astype(np.float64)
     wrench = Reading(number, t, values[:6], flags & _SATURATED_FLAG, stream=WRENCH)
@@ -82,7 +81,8 @@ def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
         host, port = parts.hostname or LOCALHOST, port if parts.port is None else parts.port
     except ValueError:
         host, port = "", None
-    what, remedy = "has no port from 0 to 65535", "give one, such as udp://127.0.0.1:49152"
+    what, kind = "has no port from 0 to 65535", address.partition("://")[0]
+    remedy = f"give one, such as {kind}://127.0.0.1:49152"
     if query := address.partition("?")[2]:
         what, remedy = f"has the unknown parameters {query!r}", f"remove ?{query}"
     if port is None or query:
@@ -151,17 +151,20 @@ class UdpSink:
     """Sink that sends wrenches to udp://HOST:PORT, with or without a receiver."""
 
     def __init__(self, address: str) -> None:
-        self._to = host_and_port(address)
+        host, port = host_and_port(address)
+        if not port:
+            raise DrakeTeleopError("has port 0", where=address, remedy="give the receiver's port")
+        try:
+            self._to = socket.gethostbyname(host), port  # once: a name server delays wrenches
+        except (OSError, UnicodeError) as error:
+            what, remedy = f"{host} is not a known host", "check the name, or give an IPv4 address"
+            raise DrakeTeleopError(what, where=address, remedy=remedy) from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: CompensatedWrench) -> None:
         """Send a wrench; drop it if it cannot be sent now."""
-        try:
+        with suppress(OSError):
             self._socket.sendto(pack_wrench(out), self._to)
-        except OSError as error:
-            if isinstance(error, socket.gaierror):
-                what, remedy = "is not a known host", "check the name, or give an IP address"
-                raise DrakeTeleopError(what, where=self._to[0], remedy=remedy) from error
 
     def close(self) -> None:
         self._socket.close()

@@ -45,13 +45,9 @@ class ContactAndLoadMonitor:
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = white_wrench_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
-        self._parameters = change_detector_parameters(
-            noise,
-            np.zeros(9),
-            dt,
-            relative_wrench_error=LOAD_WRENCH_ERROR_FRACTION,
-            mass_std_ratio=_MASS_STD_RATIO_TO_NEVER_REPLACE_LOAD,
-        )
+        errors = {"relative_wrench_error": LOAD_WRENCH_ERROR_FRACTION}
+        errors["mass_std_ratio"] = _MASS_STD_RATIO_TO_NEVER_REPLACE_LOAD
+        self._parameters = change_detector_parameters(noise, np.zeros(9), dt, **errors)
         self._phi = phi_with_inertia_replaced(load)[0]
         self._covariance = limit_covariance_to_scales(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import IntervalLog, make_apparatus
@@ -106,6 +107,29 @@ def test_stimulus_and_measured_level_of_a_mass_agree(condition, shown):
     rows = IntervalLog(SCALED, None)
     assert made.interval_result(level, inputs, rows).level == pytest.approx(level)
     assert made.interval_result(0.0, inputs, rows).level == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "condition", "low", "accepted"),
+    [
+        ({}, Condition(name="a", sigma=3.0), 0.004, False),
+        ({}, Condition(name="a", sigma=2.99), 0.004, True),
+        ({}, Condition(name="a", sigma=2.99), 0.1, False),
+        ({}, Condition(name="a", eta=1.0), 0.1, True),
+        ({"force_scaling__force_scale": 0.0}, Condition(name="a"), 0.004, False),
+    ],
+)
+def test_condition_without_a_stimulus_of_mass_is_refused(changes, condition, low, accepted):
+    """The scales of the load end at 300 %, so that a larger share leaves nothing to add."""
+    scenario, task = replace(SCALED, **changes), ApparentMass(low=low, high=2.0 * low)
+    if not accepted:
+        with pytest.raises(DrakeTeleopError, match=r"^condition 'a': its largest added mass"):
+            make_apparatus(task, condition, scenario, None)
+        make_apparatus(ContactDetection(), condition, scenario, None)
+        return
+    made = make_apparatus(task, condition, scenario, None)
+    inputs = made.stimulus_scales(low, 8.0)
+    assert made.interval_result(low, inputs, IntervalLog(SCALED, None)).level > 0.5 * low
 
 
 @pytest.mark.parametrize("own", [(1.0, None), (None, 0.3), (0.5, 2.0)])

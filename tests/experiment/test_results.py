@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from test_procedure import SMALL, run_participant
 
-from drake_teleop.cli.experiment import next_participant
+from drake_teleop.cli.experiment import experiment_command, next_participant
 from drake_teleop.common.style import Picture
-from drake_teleop.live.experiment import simulated
+from drake_teleop.live.experiment import guided, simulated
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
-from drake_teleop.live.experiment.procedure import Procedure, plan_trials
+from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, plan_trials
 from drake_teleop.live.experiment.results import (
     ResultRow,
     _draw_results,
@@ -108,6 +108,23 @@ def test_axis_of_a_quantity_has_tick_labels(least, most):
     labels = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
     labels = [label for label in labels if low <= label.get_position()[0] <= high]
     assert 2 <= sum(bool(label.get_text()) for label in labels) <= 7
+
+
+def test_progress_is_that_of_each_trial_also_without_answers(tmp_path, monkeypatch):
+    result = IntervalResult(done=True, time_s=1.0)
+    monkeypatch.setattr(simulated, "_simulate_peg_insertion", lambda *_: result)
+    experiment = Experiment(tasks=[PegInSlot(trials=3)], conditions=[Condition(name="a")])
+    procedure, seen = Procedure(experiment, 1, TrialStore(tmp_path)), []
+    stations = {(0, 0): None}
+    simulated.simulate_participant(procedure, stations, lambda *counts: seen.append(counts))
+    assert sorted(set(seen)) == [(k, 4) for k in range(5)]
+
+
+def test_message_of_an_experiment_without_trials_lists_no_picture(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(guided, "serve_experiment", lambda *_, **__: None)
+    experiment_command("contact_and_mass", tmp_path)
+    assert capsys.readouterr().out.strip().startswith(f"written {tmp_path / 'results.csv'}, from")
+    assert not (tmp_path / "results.png").exists()
 
 
 def test_next_participant_has_trials_left_or_is_new(tmp_path):

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import socket
 import threading
+import time
 from importlib import resources
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
-from drake_teleop.live.device_client import DeviceClient, VirtualDevice, tapping_motion
+from drake_teleop.live.device_client import DeviceClient, VirtualDevice, main, tapping_motion
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import (
@@ -376,6 +379,53 @@ def test_inverse3_answers_every_message_of_its_service():
     assert heard[0] == {}
 
 
+@pytest.mark.slow
+def test_end_of_a_drive_sets_the_force_of_an_inverse3_to_zero():
+    heard, ended = [], threading.Event()
+
+    def service(connection):
+        threading.Thread(target=send_poses, args=(connection,), daemon=True).start()
+        with contextlib.suppress(ConnectionClosed):
+            heard.extend(map(json.loads, connection))
+        ended.set()
+
+    def send_poses(connection):
+        cursor = {"device_id": "b7", "state": {"cursor_position": {"x": 0, "y": 0, "z": 0}}}
+        with contextlib.suppress(ConnectionClosed):
+            while not ended.wait(1e-3):
+                connection.send(json.dumps({"inverse3": [cursor]}))
+
+    with serve(service, "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        link = DeviceLink(f"haply://127.0.0.1:{server.socket.getsockname()[1]}")
+        end = time.monotonic() + 30.0
+        while time.monotonic() < end and not (heard and force_of(heard[-1])["z"] > 1.0):
+            link.receive_state(time.perf_counter())
+            link.send_wrench(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]))
+            time.sleep(1e-3)
+        link.close()
+        assert ended.wait(10.0)
+        server.shutdown()
+    assert not any(force_of(heard[-1]).values())
+
+
+def force_of(message) -> dict[str, float]:
+    forces = (each["commands"]["set_cursor_force"]["values"] for each in message["inverse3"])
+    return next(forces) if message else {"x": 0.0, "y": 0.0, "z": 0.0}
+
+
+@pytest.mark.parametrize("name", ["figures.json", "new/figures.json", "a file/figures.json"])
+def test_figures_of_a_client_are_written_or_refused_at_once(tmp_path, name):
+    (tmp_path / "a file").touch()
+    words = ["virtual", "udp://127.0.0.1:9", "--seconds", "0.01", "--json", str(tmp_path / name)]
+    if "file/" in name:
+        with pytest.raises(DrakeTeleopError, match="cannot be created as a folder"):
+            main(words)
+        return
+    main(words)
+    assert json.loads((tmp_path / name).read_text())["energy_j"] == pytest.approx(0.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
 def test_device_address_of_another_machine_or_kind_is_an_error(address):
     with pytest.raises(DrakeTeleopError, match=re.escape(address)):
@@ -396,6 +446,28 @@ def test_device_drives_without_a_page_and_releases_after_silence(scenario, load,
     assert "silent" in live.frame()["device"]
     for _ in range(60):
         assert np.isfinite(sender.force().wrench).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("opened", [None, 60])
+def test_device_still_drives_after_a_page_is_closed(scenario, load, link, opened):
+    """The page may also have opened the clutch."""
+    live = Live(with_task_space_device(scenario), load, None, lambda rows: {}, 0.0, link)
+    sender, seen = Sender(link.port), []
+    for k in range(140):
+        sender.send(k + 1, (0.0, 0.0, -1e-4 * k))
+        now = 2 * MS * k
+        if k == 50:
+            live.join(1, now)
+        if k == opened:
+            live.handle_message(1, json.dumps({"set": {"clutch": 0}}), now)
+        if k == 80:
+            live.leave(1, now)
+        live.tick(lambda now=now: now)
+        seen.append(live._session.inputs)
+    assert [each.clutch for each in seen[50:80:29]] == [1, int(opened is None)]
+    assert all((each.held, each.clutch) == (1, 1) for each in seen[80:])
+    assert seen[-1].z == -10 * 139
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -97,6 +98,21 @@ def test_port_in_use_is_one_error_line(live, scenario, load, monkeypatch):
     with pytest.raises(DrakeTeleopError, match="there is no scenario"):
         server.drive("no-such-scenario")
     assert isinstance(scenario, Scenario)
+
+
+@pytest.mark.slow
+def test_record_is_removed_if_the_port_is_in_use(tmp_path, monkeypatch):
+    def make_no_scenes(drive, *_):
+        drive._load, view = None, SimpleNamespace(scene_values=lambda rows: {})
+        drive._views = dict.fromkeys(server.SCENE_NAMES, view)
+
+    monkeypatch.setattr(server.LiveDrive, "_build_scenes_and_compile", make_no_scenes)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for _ in range(2):
+            with pytest.raises(DrakeTeleopError, match=f"port {port}: cannot be opened"):
+                server.drive(LEARNING, record=tmp_path / "drive", port=port)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ import sockets
 from click.testing import CliRunner
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+from test_compensator import load
 from test_peers import ADDRESS, peer
 from test_reading_assembly import X_FS, truth
 
@@ -37,6 +39,7 @@ from drake_teleop.robots.calibration import (
     calibrate,
     evaluate_record,
 )
+from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Reading, ReadingFlag
 
@@ -125,6 +128,63 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("seconds", [0.3, 0.6, 0.9])
+def test_record_is_not_longer_than_the_maximum(tmp_path: Path, seconds: float) -> None:
+    """A chunk of a replayed log can contain more than the rest of the record."""
+    recorder = Recorder()
+    calibrate(
+        *(Stream(recorded(5.0, [0])), recorder, tmp_path / "log.parquet", TOLERANCE),
+        seconds=seconds,
+    )
+    assert recorder.longest_part_s == pytest.approx(seconds, abs=1.1 * DT)
+
+
+class UselessStream(Stream):
+    """Live stream that repeats the same readings endlessly."""
+
+    live = True
+
+    def read(self, timeout_s: float) -> list[Reading]:
+        time.sleep(0.01)
+        return self._readings
+
+
+@pytest.mark.parametrize(
+    ("readings", "remedy"),
+    [
+        ([], "0 invalid .* check the source's address"),
+        ([DAMAGED_READING] * 7, "[1-9] invalid .* check --range and the values"),
+    ],
+)
+def test_source_without_valid_readings_ends_after_the_maximum(
+    tmp_path: Path, readings: list[Reading], remedy: str
+) -> None:
+    source, path = UselessStream(np.empty((0, 15))), tmp_path / "log.parquet"
+    source._readings = readings
+    path.write_text("earlier")
+    with pytest.raises(DrakeTeleopError, match=f"0 valid and .*{remedy}"):
+        calibrate(source, Recorder(), path, TOLERANCE, seconds=0.05)
+    assert path.read_text() == "earlier"
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "../{}/log.parquet"])
+def test_replayed_log_is_never_replaced(tmp_path: Path, name: str) -> None:
+    log = Log(DT * np.arange(400), *np.split(recorded(2.0, [0]), [6, 9, 12], axis=1))
+    path = tmp_path / name.format(tmp_path.name)
+    write_log(log, path)
+    before = path.read_bytes()
+    load().save(tmp_path / "load.json")
+    for command in (
+        lambda: calibrate_command(f"replay:{path}", tmp_path, until="mass 50 %", quiet=True),
+        lambda: run_compensate_command(
+            f"replay:{path}", tmp_path / "load.json", str(tmp_path / path.name)
+        ),
+    ):
+        with pytest.raises(DrakeTeleopError, match=r"contains the input log.parquet, .* --out"):
+            command()
+    assert path.read_bytes() == before
 
 
 def evaluate(values: np.ndarray, until: str, path: Path) -> RecordEvaluation:

@@ -16,6 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causal import causal_low_pass
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensate import compensate_stream
@@ -107,6 +108,25 @@ def test_replayed_log_equals_eliminate(log: Path, mode: str, weight: float | Non
         assert all(not row.contact.any() for row in kept.rows if row.flags)
 
     at()
+
+
+@pytest.mark.parametrize("rate_hz", [8.0, 15.0, 20.0, 25.0])
+def test_slow_stream_is_filtered_and_loses_the_filter_with_a_reading(rate_hz: float) -> None:
+    """The low-pass is that of `eliminate`, in Python and by `stale_steps` of the exported code."""
+    count, dt = 40, 1.0 / rate_hz
+    wrench = np.random.default_rng(1).normal(size=(count, 6))
+    expected = causal_low_pass(wrench, dt, 0.1 * rate_hz)
+    compensator = Compensator(load(), dt, cutoff_hz=0.1 * rate_hz)
+    for k, reading in enumerate(resting(1, OFFSETS) * count):
+        reading = reading._replace(number=k, t=k * dt, values=reading.values.copy())
+        reading.values[:6] += wrench[k]
+        assert compensator.stale_output((k - 0.1) * dt) is None or k == 0
+        out = compensator.step(reading, k * dt)
+        np.testing.assert_allclose(out.contact, expected[k], atol=1e-12)
+    last = reading._replace(number=count, t=(count + 1) * dt)
+    out = compensator.step(last, last.t)
+    np.testing.assert_allclose(out.contact, wrench[-1], atol=1e-12)
+    assert compensator.c_settings["stale_steps"] == 0
 
 
 def test_weight_and_inertia_have_separate_scales() -> None:

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.controller.export import export_controller
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -107,6 +108,13 @@ def test_without_a_compiler_the_units_contain_sources(monkeypatch, tmp_path):
             names = set(archive.namelist())
         assert {"modelDescription.xml", "sources/wrench_compensator.c"} <= names
         assert not any(name.endswith(".so") for name in names)
+
+
+def test_failing_compiler_is_one_error_and_nothing_is_written(monkeypatch, tmp_path):
+    monkeypatch.setattr(shutil, "which", lambda _: "false")
+    with pytest.raises(DrakeTeleopError, match=r"^C compiler: .* remove it from PATH for FMUs"):
+        export_controller(kernel.LOAD, "fmu", tmp_path / "fmu", rate_hz=500.0)
+    assert not (tmp_path / "fmu").exists()
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from test_compensator import OFFSETS, PHI, load
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots import connections
 from drake_teleop.robots.assembly import (
     ReadingAssembler,
     WrenchAndMotionStreams,
@@ -118,6 +119,34 @@ def test_slow_wrenches_receive_their_motion(rate_hz: float) -> None:
     (reading,) = found
     assert reading.flags == 0 and reading.t == 1.8
     np.testing.assert_allclose(reading.values[6:9], truth(1.8)[1][:3], atol=0.01)
+
+
+@pytest.mark.parametrize("cutoff_hz", [30.0, 100.0])
+@pytest.mark.parametrize("rate_hz", [40, 100, 500])
+def test_stated_lag_is_that_of_the_window(rate_hz: int, cutoff_hz: float) -> None:
+    """The window has at least seven poses, so that slow poses are later than 0.9 / cut-off."""
+    streams = WrenchAndMotionStreams(StreamStub(WRENCH, POSE))
+    assembly, ages = ReadingAssembler(streams, cutoff_hz=cutoff_hz), []
+    for k in range(1000):
+        t, found = k * DT, assembly.readings_completed_by(wrench_at(k * DT, k))
+        if k % (1000 // rate_hz) == 0:
+            pose = Reading(k, t, truth(t)[0], stream=POSE, arrival=t)
+            found += assembly.readings_completed_by(pose)
+        ages += [t - each.t for each in found if not each.flags]
+    assert min(ages) > assembly.lag_s - 1e-9
+    assert max(ages) < assembly.lag_s + 2.0 / rate_hz
+
+
+def test_pose_of_the_sensor_is_refused_for_an_imu(monkeypatch: pytest.MonkeyPatch) -> None:
+    stubs = {"imu": StreamStub(WRENCH, IMU), "posed": StreamStub(WRENCH, POSE)}
+    monkeypatch.setattr(connections, "_open_registered_source", lambda at, *_: stubs[at])
+    pose = {"sensor_pose": (0.0, 0.0, 0.1, 0.0, 0.0, 90.0)}
+    with pytest.raises(DrakeTeleopError, match=r"^imu: .* remove --sensor-pose"):
+        open_source("imu", load(), rate_hz=500.0, **pose)
+    with pytest.raises(DrakeTeleopError, match=r"^imu: .* remove --sensor-pose"):
+        open_source("posed", load(), rate_hz=500.0, motion="imu", **pose)
+    open_source("posed", load(), rate_hz=500.0, **pose)
+    open_source("imu", load(), rate_hz=500.0)
 
 
 def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:

@@ -25,10 +25,17 @@ from test_peers import LoopOutputs
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.address import Address
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.ros2 import MessageConverter
+from drake_teleop.robots.ros2 import (
+    SOURCE_PARAMETERS,
+    MessageConverter,
+    checked_topic_name,
+    domain_of_address,
+    topics_frames_and_streams,
+)
 from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, POSE, CompensatedWrench, ReadingFlag
 
 PEER = Path(__file__).with_name("ros2_peer.py")
@@ -173,6 +180,38 @@ def test_wrong_addresses_are_one_error_line() -> None:
     if find_spec("tf2_msgs") is None:
         with pytest.raises(DrakeTeleopError, match="needs the ROS package tf2_msgs"):
             open_source("ros2://ft/wrench?tf=base,tool", load(), rate_hz=500.0)
+
+
+@pytest.mark.parametrize("query", ["pose=a&tf=b,c", "imu=a&joints=b", "pose=a&imu=b&tf=c,d"])
+def test_only_one_motion_is_accepted(query: str) -> None:
+    """Poses of two frames in one stream would be a motion that nothing has."""
+    address = Address(f"zenoh://h/ft?{query}", None, SOURCE_PARAMETERS)
+    with pytest.raises(DrakeTeleopError, match=r"more than one motion.*give only one of them"):
+        topics_frames_and_streams(address, ("joint_1",))
+    for part in query.split("&"):
+        one = Address(f"zenoh://h/ft?{part}", None, SOURCE_PARAMETERS)
+        assert len(topics_frames_and_streams(one, ("joint_1",))[2]) == 2
+
+
+@pytest.mark.parametrize(
+    ("query", "environment", "domain"),
+    [("", None, 0), ("", "", 0), ("", "7", 7), ("?domain=3", "7", 3), ("?domain=0", "7", 0)],
+)
+def test_domain_is_that_of_the_address_or_the_environment(
+    monkeypatch: pytest.MonkeyPatch, query: str, environment: str | None, domain: int
+) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    if environment is not None:
+        monkeypatch.setenv("ROS_DOMAIN_ID", environment)
+    assert domain_of_address(Address(f"zenoh://h/ft{query}", None, SOURCE_PARAMETERS)) == domain
+
+
+@pytest.mark.parametrize("name", ["a//b", "a/1b", "1a", "a-b", "", "/", "ä"])
+def test_name_that_no_topic_can_have_is_refused(name: str) -> None:
+    address = Address("zenoh://h/ft", None, SOURCE_PARAMETERS)
+    with pytest.raises(DrakeTeleopError, match="is not the name of a ROS topic"):
+        checked_topic_name(address, name)
+    assert checked_topic_name(address, "/a1/_b/c_2/") == "a1/_b/c_2"
 
 
 def test_missing_rclpy_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

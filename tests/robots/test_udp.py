@@ -135,6 +135,16 @@ def test_number_outside_64_bits_is_damaged(number) -> None:
     assert udp.unpack_wrench(udp.pack_wrench(out)).number == 2**64 - 1
 
 
+@pytest.mark.parametrize("number", [-1, -5, -(2**40)])
+def test_negative_number_of_a_reading_is_sent_as_0(number: int, tmp_path: Path) -> None:
+    reading = readings(1)[0]._replace(number=number)
+    out = Compensator(load(), DT).step(reading, 0.0)
+    assert not out.flags and udp.unpack_wrench(udp.pack_wrench(out)).number == 0
+    sink = open_sink(str(tmp_path / "x.csv"))
+    sink.write(out)
+    assert table_of(tmp_path / "x.csv")["number"].to_list() == [0]
+
+
 def test_udp_round_trip_accepts_only_this_machine() -> None:
     source = udp.UdpSource("udp://:0", DT)
     with udp.open_udp_receiver(udp.LOCALHOST, 0) as there:
@@ -427,6 +437,49 @@ def test_invalid_address_raises(address: str) -> None:
     if address != "log.csv":
         with pytest.raises(DrakeTeleopError):
             open_sink(address)
+
+
+@pytest.mark.parametrize("query", ["sign=1&sign=-1", "sign=1&sign=1"])
+def test_parameter_that_is_given_twice_is_refused(query: str) -> None:
+    for kind in ("posed://:0", "rtde://h", "netft://h"):
+        with pytest.raises(DrakeTeleopError, match="gives a parameter twice"):
+            open_source(f"{kind}?{query}", load(), rate_hz=500.0)
+
+
+@pytest.mark.parametrize("kind", ["udp", "posed", "foxglove"])
+def test_example_of_a_port_has_the_scheme_of_the_address(kind: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=f"such as {kind}://127.0.0.1:49152"):
+        udp.host_and_port(f"{kind}://127.0.0.1:70000")
+
+
+@pytest.mark.parametrize("address", ["udp://127.0.0.1:0", "udp://no-such-host.invalid:9"])
+def test_sink_without_a_receiver_is_refused_at_once(address: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=re.escape(address)):
+        open_sink(address)
+
+
+def test_host_of_a_sink_is_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(socket, "gethostbyname", lambda name: asked.append(name) or udp.LOCALHOST)
+    with udp.open_udp_receiver(udp.LOCALHOST, 0) as receiver:
+        sink = open_sink(f"udp://slow-name.invalid:{receiver.getsockname()[1]}")
+        for k in range(3):
+            sink.write(CompensatedWrench(k, 0.0, np.zeros(6), np.ones(6), 0))
+        assert [udp.unpack_wrench(receiver.recv(200)).number for _ in range(3)] == [0, 1, 2]
+    sink.close()
+    assert asked == ["slow-name.invalid"]
+
+
+def test_earlier_file_stays_if_the_control_port_is_in_use(tmp_path: Path) -> None:
+    load().save(tmp_path / "load.json")
+    (tmp_path / "x.csv").write_text("earlier")
+    with udp.open_udp_receiver(udp.LOCALHOST, 0) as taken:
+        options = {"rate_hz": 1 / DT, "control": taken.getsockname()[1]}
+        with pytest.raises(DrakeTeleopError, match="give a free port"):
+            run_compensate_command(
+                "udp://:0", tmp_path / "load.json", str(tmp_path / "x.csv"), **options
+            )
+    assert (tmp_path / "x.csv").read_text() == "earlier"
 
 
 @pytest.mark.parametrize("query", ["sign=1", "wrench=scaled&domain=3", "x"])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment import design
@@ -51,14 +52,12 @@ class Apparatus:
         `level`: rendered contact force [N] or added mass [kg]; `contact_force`: expected force [N].
         """
         condition = self.condition
-        sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
-        share = sigma if condition.eta is None else 100.0 * condition.eta
+        share, gamma = 100.0 * condition.load_share, 100.0 * condition.gamma
         if isinstance(self.task, design.ContactDetection):
             gamma = max(1.0, gamma * level / contact_force) if level else 0.0
         elif isinstance(self.task, design.ApparentMass) and level:
             share += max(1.0, 100.0 * level / self.load_mass_at_hand)
-        if condition.eta is None:
-            sigma = share
+        sigma = share if condition.eta is None else 0.0
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
         return {name: min(round(value), _MAX_FORCE_SCALE_PERCENT) for name, value in values.items()}
 
@@ -76,8 +75,8 @@ class Apparatus:
         if isinstance(self.task, design.ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
             return IntervalResult(level if target else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
-        before = self.condition.sigma if self.condition.eta is None else self.condition.eta
-        level = self.load_mass_at_hand * (inputs["sigma_object"] / 100.0 - before)
+        added = inputs["sigma_object"] / 100.0 - self.condition.load_share
+        level = self.load_mass_at_hand * added
         return IntervalResult(level if target else 0.0, force)
 
 
@@ -107,7 +106,13 @@ def make_apparatus(
     if condition.eta is not None:
         mass = setup.slave.payload.mass
     at_hand = setup.force_scaling.force_scale * setup.kinematic_scaling.translation_scale
-    return Apparatus(task, condition, setup, load, float(mass) * at_hand, scenario)
+    mass_at_hand = float(mass) * at_hand
+    largest = mass_at_hand * (0.01 * _MAX_FORCE_SCALE_PERCENT - condition.load_share)
+    if isinstance(task, design.ApparentMass) and largest < task.low:
+        what = f"its largest added mass is {largest:.3g} kg at the hand, less than low of the task"
+        remedy = "reduce sigma or low, or increase force_scale of the task's scenario"
+        raise DrakeTeleopError(what, where=f"condition {condition.name!r}", remedy=remedy)
+    return Apparatus(task, condition, setup, load, mass_at_hand, scenario)
 
 
 class IntervalLog:

@@ -41,6 +41,10 @@ class Condition:
     delay: float | None = quantity(None, "s", 0.0, 2.0, "delay of one way, in place of a network")
     method: str = choice(AS_IN_SCENARIO_NAME, (AS_IN_SCENARIO_NAME,), "passivity method", METHODS)
 
+    @property
+    def load_share(self) -> float:
+        return self.sigma if self.eta is None else self.eta
+
 
 @dataclass
 class _TaskFields:

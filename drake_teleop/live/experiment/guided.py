@@ -75,16 +75,10 @@ class GuidedExperiment:
             procedure.current_level, procedure.expected_contact_force
         )
         name = f"{procedure.num_completed_trials:04}-{procedure.interval}"
-        self._live = Live(
-            with_interval_seed(self._apparatus.scenario, procedure),
-            self._apparatus.load,
-            self._drives / name,
-            self._log_rows_and_return_scene_values,
-            now,
-            self._link,
-            log=False,
-            begin=self._stimulus,
-        )
+        setup = with_interval_seed(self._apparatus.scenario, procedure)
+        station = setup, self._apparatus.load, self._drives / name
+        show = self._log_rows_and_return_scene_values
+        self._live = Live(*station, show, now, self._link, log=False, begin=self._stimulus)
         self._intervals += 1
         if self._driver is not None:
             self._live.join(self._driver, now)

@@ -64,7 +64,7 @@ def simulate_participant(
 ) -> None:
     """Run the remaining trials; keys of `stations`: indices of task and condition.
 
-    After each answer, `progress` receives the numbers of finished and of all trials.
+    After each phase, `progress` receives the numbers of finished and of all trials.
     """
     experiment, responses = procedure.experiment, [0.0, 0.0]
     while procedure.phase != END_PHASE:
@@ -83,9 +83,9 @@ def simulate_participant(
             rng = np.random.default_rng(key)
             answer = answer_by_larger_response(experiment.simulated, responses, rng)
             procedure.store_answer(answer, 0.5)
-            progress(procedure.num_completed_trials, len(procedure.trials))
         else:
             procedure.advance_phase()
+        progress(procedure.num_completed_trials, len(procedure.trials))
 
 
 def answer_by_larger_response(

@@ -194,7 +194,11 @@ def _compile_shared_library(compiler: str, sources: ExportedFiles, c_files: list
         for file, text in sources.items():
             (folder / file).write_text(str(text), encoding="utf-8")
         options = [*CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
-        subprocess.run([compiler, *options, *c_files, "-o", "library.so"], cwd=folder, check=True)
+        try:
+            subprocess.run([compiler, *options, *c_files, "-o", "library.so"], cwd=name, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            remedy = "correct it, or remove it from PATH for FMUs with sources only"
+            raise DrakeTeleopError(str(error), where="C compiler", remedy=remedy) from error
         return (folder / "library.so").read_bytes()
 
 
