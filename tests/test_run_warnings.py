@@ -278,6 +278,7 @@ def test_torque_of_a_leader_is_limited_about_each_axis(torque, peak, count):
 @pytest.mark.parametrize("step", [100, 500, 1000, 1500])
 def test_log_with_few_rows_has_no_warnings(step):
     assert run_warnings(recorded()[::step], OVER_NETWORK, ARM) == []
+    assert run_warnings(recorded()[:0], OVER_NETWORK, ARM) == []
 
 
 def test_ledger_reserve_warning_gives_the_required_energy():

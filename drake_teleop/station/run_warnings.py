@@ -54,6 +54,9 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
 
     Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm.
     """
+    overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
+    if not len(result.t):
+        return [*overlaps]
     found = chain(
         _check_faults(result),
         _check_reached_limits(result, scenario, arm),
@@ -63,7 +66,6 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_contact_chatter(result),
         _check_rendered_force_oscillation(result),
     )
-    overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
     texts = [f"{text} {_spans_text(x)}{note and '; '}{note}" for text, x, note in found if x]
     return [*overlaps, *texts]
 

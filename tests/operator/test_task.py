@@ -368,9 +368,11 @@ def test_log_of_a_run_that_ends_with_its_task_contains_the_outcome(tmp_path, log
     assert result.t[-1] < time + 0.02 + 1.0 / log_hz
 
 
-def test_measures_need_a_task(reach):
+def test_measures_need_a_task_and_samples(reach):
     with pytest.raises(DrakeTeleopError, match=r"operator\.task"):
         task_measures(reach[0], Scenario())
+    with pytest.raises(DrakeTeleopError, match=r"no samples; increase simulation\.duration"):
+        task_measures(reach[0][:0], LoadScenario("reach"))
 
 
 def test_training_contains_scales_and_delays_of_the_station(monkeypatch):
