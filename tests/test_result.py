@@ -243,7 +243,7 @@ def test_a_slice_is_a_result_with_these_rows():
     ("specs", "name"),
     [
         ([Signal("a", ("x", "x"), "m")], "a.x"),
-        ([Signal("a", ("x", "y"), "m"), Signal("a", ("u", "v"), "m")], "a"),
+        ([Signal("a", ("x", "y"), "m"), Signal("a", ("u", "u"), "m")], "a.u"),
         ([Signal("t", ("x", "y"), "m")], "t"),
     ],
 )

@@ -462,7 +462,7 @@ def test_empty_load_estimate_is_rejected(sigma):
 def test_covariance_without_its_estimate_is_rejected(enabled):
     changes = {"load_estimator__watch": True, "load_estimator__method": "rtls"}
     scenario = replace(Scenario(), load_estimator__enabled=enabled, **changes)
-    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .*found None; pass the estimate"):
+    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .*found None; pass both"):
         MakeTeleopStation(scenario, load_covariance=np.eye(16))
 
 

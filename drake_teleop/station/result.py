@@ -91,12 +91,11 @@ class SimulationResult:
         if self._t.ndim != 1:
             what = f"has shape {self._t.shape} instead of (N,)"
             raise DrakeTeleopError(what, where="t", remedy="give one time per row")
-        names = ["t", *(name for spec in specs for name in (spec.name, *spec.columns))]
+        self._specs = {spec.name: spec for spec in specs}
+        names = ["t", *self._specs, *(column for spec in self.specs for column in spec.columns)]
         if len(set(names)) < len(names):
             what = f"the name '{max(names, key=names.count)}' occurs more than once"
-            remedy = "give each signal and component a name of its own, and none the name t"
-            raise DrakeTeleopError(what, where="specs", remedy=remedy)
-        self._specs = {spec.name: spec for spec in specs}
+            raise DrakeTeleopError(what, where="specs", remedy="give each its own name, not t")
         self._columns = {c: (s.name, i) for s in self.specs for i, c in enumerate(s.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())

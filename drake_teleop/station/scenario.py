@@ -139,9 +139,8 @@ class Scenario:
         """True if the channel has no network, passivity method or own wrench limits."""
         own, default = self.passivity, PassivityConfig()
         names = ("method", "force_limit", "torque_limit")
-        if any(getattr(own, name) != getattr(default, name) for name in names):
-            return False
-        return self.channel.networks_of_directions() == (NetworkConfig(),) * 2
+        is_plain = all(getattr(own, name) == getattr(default, name) for name in names)
+        return is_plain and self.channel.networks_of_directions() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""

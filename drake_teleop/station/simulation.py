@@ -64,9 +64,8 @@ def simulate(
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
     on_disk = None if log is None else LogOnDisk(Path(log), simulator, simulation.settle)
-    stops, rows, task = simulation.on_fault == "stop", 0, None
-    if simulation.end_with_task:
-        task = log_slices_of_signals(diagram).get("task_state")
+    stops, rows = simulation.on_fault == "stop", 0
+    task = log_slices_of_signals(diagram).get("task_state") if simulation.end_with_task else None
     logged = diagram.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     simulator.Initialize()
     try:

@@ -16,9 +16,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import quaternion_at, quaternion_product, scale_vector, vector_at
 from drake_teleop.station.slave.arm import ArmModel, pose_into
 
-#: Cosine of half the rotation since the reference, below which the master's pose becomes the new
-#: reference: 150 degrees. Beyond 180 degrees the scaled rotation would jump.
-_MIN_HALF_TURN_COSINE = 0.26
+_MIN_HALF_TURN_COSINE = 0.26  # rotation of 150 degrees: a scaled one jumps at 180 degrees
 
 
 @settings
