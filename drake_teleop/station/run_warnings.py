@@ -130,7 +130,8 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         limits = device.parameters
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * limits.peak_force
+        largest_force = limits.peak_force or np.inf  # 0: the device has no motors
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * largest_force
         if isinstance(device, LeaderDevice):
             reached = np.abs(shown[:, 3:]) >= _SHARE_AT_LIMIT * limits.peak_torque
             full |= reached.any(axis=1) & limits.peak_torque.all()
