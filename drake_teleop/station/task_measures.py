@@ -27,7 +27,7 @@ _TASK_PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of the operator's task, as in docs/operator.md, for one run.
+    """Return the measures of the operator's task in one run (docs/operator.md).
 
     A DrakeTeleopError is raised for a scenario without task or a log without samples.
     """

@@ -29,7 +29,7 @@ class ForceDisplay(SteppedBlock):
         - fault_at_hand: (1,) `Fault` code, 0 without fault
 
     Args:
-        device: device model, such as `Master().device(0.0, 0.0)`.
+        device: such as `Master().device(0.0, 0.0)`.
         period: sampling period [s].
         start: (6,) joint positions to use until valid ones arrive [rad].
     """

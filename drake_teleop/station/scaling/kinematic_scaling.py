@@ -82,9 +82,9 @@ def _pose_command_into(pose, clutch_references, R_WB, translation_scale, rotatio
 class KinematicScaling(DoubleOnlySystem, LeafSystem):
     """Block that scales the master's motion into the slave's commanded pose, with a clutch.
 
-    While the clutch is open, the command is constant. When it closes, and before a rotation reaches
-    180 degrees, the master's present pose is the new reference, so the command does not jump. While
-    the master's pose is not finite, the clutch keeps its state.
+    While the clutch is open, the command is constant. When it closes, or after a rotation by 150
+    degrees, the master's pose is the new reference, so the command does not jump. While the pose is
+    not finite, the clutch keeps its state.
 
     .. pydrake_system::
 
@@ -143,8 +143,8 @@ class KinematicScaling(DoubleOnlySystem, LeafSystem):
 class JointCoupling(LeafSystem):
     """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open, the command is constant. While it is closed, the command is start +
-    (leader's joints - home), so it jumps when the clutch closes.
+    While the clutch is open, the command is constant. Otherwise it is start + (leader's joints -
+    home), so it jumps when the clutch closes.
 
     .. pydrake_system::
 
