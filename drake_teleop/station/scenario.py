@@ -272,7 +272,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         config.check_field_name(Scenario, block, f"scenario:{block}")
         if inner:
             present, place = getattr(scenario, block), f"scenario:{block}.{inner}"
-            if not dataclasses.is_dataclass(present):
+            if present is None or isinstance(present, (str, list)):
                 what = f"{block} is {present!r} in this scenario, so it has no field {inner}"
                 remedy = f"set the whole block {block} first"
                 raise DrakeTeleopError(what, where=place, remedy=remedy)

@@ -313,7 +313,7 @@ def test_force_display_equals_the_display_of_the_station():
 
 
 def test_force_display_rejects_a_leader_arm():
-    """Its motor torques depend on the posture of more joints than the block's input contains."""
+    """Motor torques of an arm depend on more joints than the block's input contains."""
     arm = Leader(file=str(models_dir() / "leader_arm.urdf"), hand_frame="hand")
     with pytest.raises(DrakeTeleopError, match=r"ForceDisplay: device: expected HapticDevice"):
         blocks.ForceDisplay(arm.device([0.3, 0.0, 0.0], 0.0, 0.0), T)
