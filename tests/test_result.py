@@ -237,3 +237,17 @@ def test_a_slice_is_a_result_with_these_rows():
     np.testing.assert_array_equal(part.t, result.t[10:20:2])
     for name in result:
         np.testing.assert_array_equal(part[name], result[name][10:20:2])
+
+
+@pytest.mark.parametrize(
+    ("specs", "name"),
+    [
+        ([Signal("a", ("x", "x"), "m")], "a.x"),
+        ([Signal("a", ("x", "y"), "m"), Signal("a", ("u", "u"), "m")], "a.u"),
+        ([Signal("t", ("x", "y"), "m")], "t"),
+    ],
+)
+def test_equal_names_are_rejected(specs, name):
+    """A table would lose a column without a message."""
+    with pytest.raises(DrakeTeleopError, match=f"specs: the name '{name}' occurs more than once"):
+        SimulationResult([0.0, 1.0], {specs[0].name: np.zeros((2, 2))}, specs)

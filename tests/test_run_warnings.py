@@ -13,7 +13,7 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
 from drake_teleop.station.environment.solids import Wall
-from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.master.data_sheets import DeviceFigures, Master
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import (
     HOME_POSTURE_RAD,
@@ -276,9 +276,19 @@ def test_torque_of_a_leader_is_limited_about_each_axis(torque, peak, count):
     assert all("its largest force or torque from 1.000 to 2.000 s" in each for each in found)
 
 
+@pytest.mark.parametrize("peak_force", [0.0, 20.0])
+def test_device_without_motors_is_not_at_its_largest_force(peak_force):
+    figures = DeviceFigures(peak_force=peak_force)
+    scenario = replace(OVER_NETWORK, master=Master(model="custom", figures=figures))
+    shown = {"force_to_master": (slice(0, 3), np.outer(during(1, 2), [0.0, 0.0, peak_force]))}
+    found = run_warnings(recorded(**shown), scenario, ARM)
+    assert sum("largest force" in each for each in found) == (peak_force > 0.0)
+
+
 @pytest.mark.parametrize("step", [100, 500, 1000, 1500])
 def test_log_with_few_rows_has_no_warnings(step):
     assert run_warnings(recorded()[::step], OVER_NETWORK, ARM) == []
+    assert run_warnings(recorded()[:0], OVER_NETWORK, ARM) == []
 
 
 def test_ledger_reserve_warning_gives_the_required_energy():

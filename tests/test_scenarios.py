@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.master import phantom
-from drake_teleop.station.scenario import LoadScenario, Rates, ScenarioNames, replace
+from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, ScenarioNames, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -97,3 +98,9 @@ def test_contact_is_one_touch_with_small_deflection(movement):
     upwards = result["true_contact_wrench_W"][touching, 2]
     assert np.all(upwards > 0)
     assert 10 < upwards.max() < 25
+
+
+@pytest.mark.parametrize("block", ["description", "slot", "environment"])
+def test_field_of_a_block_without_fields_is_one_line(block):
+    with pytest.raises(DrakeTeleopError, match=f"so it has no field x; set .* {block} first"):
+        replace(Scenario(), **{f"{block}__x": 1.0})

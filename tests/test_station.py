@@ -458,6 +458,14 @@ def test_empty_load_estimate_is_rejected(sigma):
     MakeTeleopStation(learning, load_estimate=offsets_alone)
 
 
+@pytest.mark.parametrize("enabled", [False, True])
+def test_covariance_without_its_estimate_is_rejected(enabled):
+    changes = {"load_estimator__watch": True, "load_estimator__method": "rtls"}
+    scenario = replace(Scenario(), load_estimator__enabled=enabled, **changes)
+    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .*found None; pass both"):
+        MakeTeleopStation(scenario, load_covariance=np.eye(16))
+
+
 def test_station_without_load_has_no_contact_wrench():
     unknown, learning = Scenario(), replace(Scenario(), load_estimator__enabled=True)
     for scenario, told in ((unknown, False), (learning, True)):

@@ -158,12 +158,9 @@ def _find_logs_of_run(run: Path) -> list[Path]:
         return [run / "log.parquet"]
     logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
     if not logs:
-        raise DrakeTeleopError(
-            "contains no log of a run",
-            where=str(run),
-            remedy="give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
-            " stores measures only: run one of its points as a scenario",
-        )
+        remedy = "give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
+        remedy = f"{remedy} stores measures only: run one of its points as a scenario"
+        raise DrakeTeleopError("contains no log of a run", where=str(run), remedy=remedy)
     return logs
 
 

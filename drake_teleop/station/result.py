@@ -92,6 +92,10 @@ class SimulationResult:
             what = f"has shape {self._t.shape} instead of (N,)"
             raise DrakeTeleopError(what, where="t", remedy="give one time per row")
         self._specs = {spec.name: spec for spec in specs}
+        names = ["t", *self._specs, *(column for spec in self.specs for column in spec.columns)]
+        if len(set(names)) < len(names):
+            what = f"the name '{max(names, key=names.count)}' occurs more than once"
+            raise DrakeTeleopError(what, where="specs", remedy="give each its own name, not t")
         self._columns = {c: (s.name, i) for s in self.specs for i, c in enumerate(s.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())

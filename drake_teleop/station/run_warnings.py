@@ -54,6 +54,9 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
 
     Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm.
     """
+    overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
+    if not len(result.t):
+        return [*overlaps]
     found = chain(
         _check_faults(result),
         _check_reached_limits(result, scenario, arm),
@@ -63,7 +66,6 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_contact_chatter(result),
         _check_rendered_force_oscillation(result),
     )
-    overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
     texts = [f"{text} {_spans_text(x)}{note and '; '}{note}" for text, x, note in found if x]
     return [*overlaps, *texts]
 
@@ -128,7 +130,8 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         limits = device.parameters
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * limits.peak_force
+        largest_force = limits.peak_force or np.inf  # 0: the device has no motors
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * largest_force
         if isinstance(device, LeaderDevice):
             reached = np.abs(shown[:, 3:]) >= _SHARE_AT_LIMIT * limits.peak_torque
             full |= reached.any(axis=1) & limits.peak_torque.all()

@@ -82,7 +82,7 @@ class Simulation:
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; sampling shortens it")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "tolerance of error-controlled integrators")
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
-    end_with_task: bool = plain(False, "end within 20 ms after the operator finishes or gives up")
+    end_with_task: bool = plain(False, "end within 20 ms after the log contains the task's outcome")
     on_fault: str = choice(
         "continue", ("continue", "stop"), "after a fault: go on in a safe state, or end in an error"
     )
@@ -139,9 +139,8 @@ class Scenario:
         """True if the channel has no network, passivity method or own wrench limits."""
         own, default = self.passivity, PassivityConfig()
         names = ("method", "force_limit", "torque_limit")
-        if any(getattr(own, name) != getattr(default, name) for name in names):
-            return False
-        return self.channel.networks_of_directions() == (NetworkConfig(),) * 2
+        is_plain = all(getattr(own, name) == getattr(default, name) for name in names)
+        return is_plain and self.channel.networks_of_directions() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
@@ -279,7 +278,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         config.check_field_name(Scenario, block, f"scenario:{block}")
         if inner:
             present, place = getattr(scenario, block), f"scenario:{block}.{inner}"
-            if present is None or isinstance(present, str):
+            if present is None or isinstance(present, (str, list)):
                 what = f"{block} is {present!r} in this scenario, so it has no field {inner}"
                 remedy = f"set the whole block {block} first"
                 raise DrakeTeleopError(what, where=place, remedy=remedy)

@@ -50,8 +50,7 @@ def _signals_by_name(num_joints: int, sliding: Collection[int] = ()) -> dict[str
         ("saturated", ("saturated", "1"),
          "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after a"
          " lost reading"),
-        ("joint_position", angles,
-         "encoder readings of the slave, at sample_time"),
+        ("joint_position", angles, "encoder readings of the slave, at sample_time"),
         ("sample_time", ("t", "s"),
          "time of the wrist sensor's sample in this row; other signals are of t"),
         ("load_estimate", _LOAD_ESTIMATE_COMPONENTS, "offsets and phi, Eq. (7)"),

@@ -64,9 +64,9 @@ def simulate(
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
     on_disk = None if log is None else LogOnDisk(Path(log), simulator, simulation.settle)
-    stops, rows, task = simulation.on_fault == "stop", 0, None
-    if simulation.end_with_task and diagram.HasOutputPort("task_state"):
-        task = diagram.GetOutputPort("task_state")
+    stops, rows = simulation.on_fault == "stop", 0
+    task = log_slices_of_signals(diagram).get("task_state") if simulation.end_with_task else None
+    logged = diagram.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     simulator.Initialize()
     try:
         # Products, as Drake's event times are: a rounding difference would be a step of 1e-17 s.
@@ -75,10 +75,11 @@ def simulate(
             advance_without_garbage_collection(simulator, time)
             if stops:
                 rows = _raise_fault_in_new_log_rows(simulator, simulation.settle, rows)
+            # The newest row counts: without the outcome in the log, the task would seem unfinished.
+            over = task is not None and logged.data()[task][OUTCOME_INDEX, -1:].any()
             if on_disk is not None and on_disk.num_unwritten_rows() >= _LOG_ROWS_PER_PART:
                 on_disk.write_and_clear_rows()
                 rows = 0
-            over = task is not None and task.Eval(simulator.get_context())[OUTCOME_INDEX] != 0.0
             progress(1.0 if over else time / end)
             if over:
                 break

@@ -77,6 +77,7 @@ def MakeSlaveSide(
     _check_load_is_known(scenario, load_estimate, uses_contact)
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
+        expect_type((list, tuple, np.ndarray), load_estimate, "load_estimate", "pass both")
     builder = DiagramBuilder()
     slave, sample, held = _add_slave_blocks(
         builder, scenario, load_estimate, load_covariance, custom_torque=torques

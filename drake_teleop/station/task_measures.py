@@ -27,15 +27,18 @@ _TASK_PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of the operator's task, as in docs/operator.md, for one run.
+    """Return the measures of the operator's task in one run (docs/operator.md).
 
-    A DrakeTeleopError is raised if the scenario has no task.
+    A DrakeTeleopError is raised for a scenario without task or a log without samples.
     """
     task = scenario.operator.task
     if task is None:
         what = "the scenario has no operator's task to measure"
         remedy = "give the operator a task: !Reach, !Touch, !Press or !Insert"
         raise DrakeTeleopError(what, where="operator.task", remedy=remedy)
+    if not len(result.t):
+        remedy = "increase simulation.duration or rates.log_hz, or reduce simulation.settle"
+        raise DrakeTeleopError("the log contains no samples", where="task", remedy=remedy)
     state, t, ended = result["task_state"], result.t, _log_row_at_task_end(result)
     begun = int(np.argmax(state[:, decision.PHASE_INDEX] != decision.PHASE_WAITING))
     span = slice(begun, ended + 1)

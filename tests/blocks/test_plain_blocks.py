@@ -20,6 +20,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from rendered_wrench import wrench_to_master
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import models_dir
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.regressor import non_contact_wrench, wrench_of_load
@@ -27,7 +28,9 @@ from drake_teleop.station import blocks
 from drake_teleop.station.channel.channel import Channel, TeleopChannel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.estimation import contact_detection, load_estimator
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.force_display import initial_display_state, step_display
+from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
@@ -309,6 +312,19 @@ def test_force_display_equals_the_display_of_the_station():
     np.testing.assert_array_equal(found, expected)
 
 
+def test_force_display_rejects_a_leader_arm():
+    """Motor torques of an arm depend on more joints than the block's input contains."""
+    arm = Leader(file=str(models_dir() / "leader_arm.urdf"), hand_frame="hand")
+    with pytest.raises(DrakeTeleopError, match=r"ForceDisplay: device: expected HapticDevice"):
+        blocks.ForceDisplay(arm.device([0.3, 0.0, 0.0], 0.0, 0.0), T)
+
+
+def test_load_estimator_checks_its_settings():
+    config = LoadEstimatorConfig(enabled=True, watch=True)
+    with pytest.raises(DrakeTeleopError, match=r"load_estimator\.method: 'rls' ignores the noise"):
+        blocks.LoadEstimator(np.ones(6), T, config=config)
+
+
 DOCS = Path(__file__).parents[2] / "docs" / "blocks.md"
 
 
@@ -455,9 +471,11 @@ def test_an_end_without_a_required_input_raises(name):
     output(block, fixed(block, **given, **{name: ports[name]}), "packet")
 
 
-def test_scale_0_of_rotation_leaves_finite_numbers_at_both_ends():
+@pytest.mark.parametrize("scale", [{"scales": (1.0, 0.0)}, {"force_scale": 0.0}])
+@pytest.mark.parametrize("method", METHODS)
+def test_scale_0_leaves_finite_numbers_at_both_ends(method, scale):
     for end in (blocks.PassivityAtMaster, blocks.PassivityAtSlave):
-        block = end(PassivityConfig(method="wave"), T, START, scales=(1.0, 0.0))
+        block = end(PassivityConfig(method=method), T, START, **scale)
         ports = {"pose_command": START, "pose_slave": START, "wrench_B": np.ones(6)}
         ports = {"received": np.zeros(PACKET_SIZE + 1)} | ports
         context = fixed(block, **{k: v for k, v in ports.items() if block.HasInputPort(k)})

@@ -65,13 +65,16 @@ def test_ledger_has_the_encoder_steps_of_the_device():
     assert _passivity_config_for_arm_and_device(scenario).ledger.encoder_step == [2e-4, 1e-3]
 
 
-@pytest.mark.parametrize(("gamma", "rendered"), [(0.5, 0.05), (0.0, 0.1)])
-def test_slave_power_is_scaled_by_the_rendered_share_over_the_motion(gamma, rendered):
-    """A scale of motion of 0 counts as 1, as does a gamma of 0."""
+@pytest.mark.parametrize(
+    ("gamma", "force_scale", "rendered"),
+    [(0.5, 0.1, 0.05), (0.0, 0.1, 0.1), (0.5, 0.0, 0.5), (0.0, 0.0, 1.0)],
+)
+def test_slave_power_is_scaled_by_the_rendered_share_over_the_motion(gamma, force_scale, rendered):
+    """A scale of motion of 0 counts as 1, as does a gamma or force scale of 0."""
     for scales, expected in (((4.0, 0.5), (4.0, 0.5)), ((2.0, 0.0), (2.0, 1.0))):
         scenario = replace(
             Scenario(),
-            force_scaling=ForceScalingConfig(gamma=gamma, force_scale=0.1),
+            force_scaling=ForceScalingConfig(gamma=gamma, force_scale=force_scale),
             kinematic_scaling=KinematicScalingConfig(*scales),
         )
         found = slave_wrench_power_scale(scenario)

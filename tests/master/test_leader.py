@@ -176,6 +176,16 @@ def test_force_is_limited_to_the_peak(peak_force):
     assert np.linalg.norm(shown[:3]) == pytest.approx(peak_force, rel=1e-9)
 
 
+@pytest.mark.parametrize("peak_torque", [0.0, 0.002])
+@pytest.mark.parametrize("requested", [0.02, 3.0, 40.0])
+def test_torque_above_the_peak_does_not_reduce_the_force(peak_torque, requested):
+    """Motors need no torque for what is not displayed."""
+    wrench = np.array([3.0, -2.0, 1.0, requested, -requested, requested])
+    shown = ConnectedLeader(leader(peak_torque=peak_torque)).step(np.zeros(6), wrench)
+    np.testing.assert_allclose(shown[:3], wrench[:3], rtol=1e-12)
+    assert np.abs(shown[3:]).max() == pytest.approx(peak_torque)
+
+
 def test_joints_have_end_stops():
     held = ConnectedLeader(leader(hand=(0.2, 1e-3)))
     for _ in range(800):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_normal
@@ -20,6 +21,7 @@ from drake_teleop.station.operator.decision import (
     PHASE_OVER,
     PHASE_SEARCHING_SLOT,
     PHASE_STOPPING,
+    STATE_SIZE,
 )
 from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into, plan_move
 from drake_teleop.station.operator.perception import (
@@ -35,7 +37,7 @@ from drake_teleop.station.operator.task import (
     Touch,
     check_target_beyond_standoff,
 )
-from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
@@ -44,6 +46,7 @@ from drake_teleop.station.task_measures import (
     task_measures,
     true_contact_force_magnitudes,
 )
+from drake_teleop.station.wiring import build_with_log
 
 #: Rates of a study: the operator notices no difference.
 FAST = {
@@ -339,9 +342,37 @@ def test_target_beyond_its_radius_is_accepted():
         check_target_beyond_standoff(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 
-def test_measures_need_a_task(reach):
+class _Outcome(LeafSystem):
+    """Block with the signal task_state, whose outcome is 1 from `time` [s] on."""
+
+    def __init__(self, time):
+        super().__init__()
+
+        def calculate(context, output):
+            output[OUTCOME_INDEX] = float(context.get_time() >= time)
+
+        self.DeclareVectorOutputPort("task_state", STATE_SIZE, calculate)
+
+
+@pytest.mark.parametrize("log_hz", [1.0, 7.0, 30.0, 50.0, 1000.0])
+@pytest.mark.parametrize("time", [0.02, 0.333, 1.001])
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_log_of_a_run_that_ends_with_its_task_contains_the_outcome(tmp_path, log_hz, time, on_disk):
+    builder = DiagramBuilder()
+    side = builder.AddSystem(_Outcome(time))
+    station = build_with_log(builder, "station", [side], log_hz)
+    simulation = Simulation(duration=5.0, settle=0.0, end_with_task=True)
+    result = simulate(station, simulation, log=tmp_path / "log" if on_disk else None)
+    logged = result["task_state"][:, OUTCOME_INDEX]
+    assert logged[-1] == 1.0
+    assert result.t[-1] < time + 0.02 + 1.0 / log_hz
+
+
+def test_measures_need_a_task_and_samples(reach):
     with pytest.raises(DrakeTeleopError, match=r"operator\.task"):
         task_measures(reach[0], Scenario())
+    with pytest.raises(DrakeTeleopError, match=r"no samples; increase simulation\.duration"):
+        task_measures(reach[0][:0], LoadScenario("reach"))
 
 
 def test_training_contains_scales_and_delays_of_the_station(monkeypatch):

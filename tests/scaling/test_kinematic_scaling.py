@@ -192,3 +192,20 @@ def test_an_open_clutch_at_the_start_commands_the_start():
     np.testing.assert_array_equal(
         system.GetOutputPort("pose_command").Eval(context), np.arange(1.0, 8.0)
     )
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.5, 1.7])
+@pytest.mark.parametrize("axis", [[0.0, 0.0, 1.0], [0.6, -0.8, 0.0]])
+def test_command_is_continuous_over_more_than_a_turn(scale, axis):
+    """The slave would turn back by up to 180 degrees at once."""
+    block = KinematicScaling(KinematicScalingConfig(rotation_scale=scale), 0.01, IDENTITY)
+    simulator = Simulator(block)
+    context, angles = simulator.get_mutable_context(), np.linspace(0.0, 7.0, 300)
+    for time, angle in enumerate([*angles, *angles[::-1]]):
+        pose = np.array([np.cos(angle / 2), *np.sin(angle / 2) * np.array(axis), 0.0, 0.0, 0.0])
+        block.GetInputPort("pose_master").FixValue(context, pose)
+        simulator.AdvanceTo(0.01 * time)
+        half = 0.5 * scale * angle
+        expected = np.array([np.cos(half), *np.sin(half) * np.array(axis)])
+        found = block.GetOutputPort("pose_command").Eval(context)[:4]
+        assert abs(found @ expected) == pytest.approx(1.0, abs=1e-9)

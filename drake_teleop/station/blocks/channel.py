@@ -60,12 +60,10 @@ class NetworkChannel(SteppedBlock):
         super().__init__()
         config = NetworkConfig() if config is None else config
         if config.silence != "hold" and size not in (PACKET_LOAD_WRENCH.start, PACKET_SIZE):
-            raise DrakeTeleopError(
-                f"'{config.silence}' requires packets of a passivity method"
-                f" ({PACKET_LOAD_WRENCH.start} or {PACKET_SIZE} numbers), but size is {size}",
-                where="NetworkChannel.silence",
-                remedy="set silence: hold, or use a passivity method",
-            )
+            sizes = f"{PACKET_LOAD_WRENCH.start} or {PACKET_SIZE} numbers"
+            what = f"'{config.silence}' requires packets of a passivity method ({sizes}), but size"
+            what, remedy = f"{what} is {size}", "set silence: hold, or use a passivity method"
+            raise DrakeTeleopError(what, where="NetworkChannel.silence", remedy=remedy)
         self._parameters = network.network_parameters(config, seed, direction, period, min_steps=1)
         parts = network.initial_network_state(self._parameters, np.zeros(size))
         state = [*parts, np.zeros(1), np.zeros(size + 1)]

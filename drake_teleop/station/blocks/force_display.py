@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
+from drake_teleop.common.errors import expect_type
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.master import force_display as display
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.force_display import DISPLAYED_WRENCH_SLOTS
-from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.stepped_block import SteppedBlock
 
 
@@ -29,17 +29,16 @@ class ForceDisplay(SteppedBlock):
         - fault_at_hand: (1,) `Fault` code, 0 without fault
 
     Args:
-        device: device model, such as `Master().device(0.0, 0.0)`.
+        device: such as `Master().device(0.0, 0.0)`.
         period: sampling period [s].
         start: (6,) joint positions to use until valid ones arrive [rad].
     """
 
     __slots__ = ()
 
-    def __init__(
-        self, device: HapticDevice | LeaderDevice, period: float, start: ArrayLike = (0.0,) * 6
-    ) -> None:
+    def __init__(self, device: HapticDevice, period: float, start: ArrayLike = (0.0,) * 6) -> None:
         super().__init__()
+        expect_type(HapticDevice, device, "ForceDisplay: device", "choose another master.model")
         self._period, self._jacobian = period, np.zeros((6, 6))
         self._parameters = device.packed_parameters
         memory = display.initial_display_state(finite_array("start", start, 6), device.parameters)

@@ -94,8 +94,8 @@ def method_parameters_and_frame(
     passivity: PassivityConfig, R_WB: Array, scales: Array, force_scale: float
 ) -> tuple[Array, Array]:
     """Return the method's parameters (NUM_PARAMETERS,), and `frame` (11,) as in `step_channel`."""
-    # A motion scale of zero transfers no energy; any unit is valid.
-    scales = np.where(scales > 0.0, scales, 1.0)
+    # A scale of zero transfers no energy; any unit is valid.
+    scales, force_scale = np.where(scales > 0.0, scales, 1.0), force_scale or 1.0
     parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
     return parameters, np.concatenate([R_WB.ravel(), scales])
 

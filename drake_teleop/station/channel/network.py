@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError, field_location
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Presets
@@ -68,11 +68,9 @@ class NetworkConfig:
     def check(self, where: str = "network") -> None:
         check_all_field_values(self, where)
         if self.loss > self.burst_loss:
-            raise DrakeTeleopError(
-                f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g} of the bad state",
-                where=f"{where}.loss" if ":" in where else f"{where}:loss",
-                remedy="raise burst_loss to at least the mean loss",
-            )
+            what = f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g} of the bad"
+            place, remedy = field_location(where, "loss"), "raise burst_loss to at least the mean"
+            raise DrakeTeleopError(f"{what} state", where=place, remedy=f"{remedy} loss")
 
 
 _presets = {

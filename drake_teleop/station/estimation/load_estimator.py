@@ -77,6 +77,7 @@ class LoadEstimator(LeafSystem):
         fallback: ArrayLike | None = None,
     ) -> None:
         super().__init__()
+        config.check("load_estimator")
         if config.watch and not config.enabled and covariance is None:
             what = "there is no load to monitor: none is estimated or given with a covariance"
             remedy = "set load_estimator.enabled, or pass load_estimate with load_covariance"

@@ -38,22 +38,18 @@ def _advance_device(
 def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
     """Raise a DrakeTeleopError if q is outside limits, or the step `period` [s] is too long."""
     if not 0 < period <= _MAX_SIMULATION_PERIOD_S:
-        raise DrakeTeleopError(
-            f"gives a period of {period:g} s (a simulated haptic device needs a positive one of at"
-            f" most {_MAX_SIMULATION_PERIOD_S:g} s)",
-            where="rates.hand_hz",
-            remedy="choose 1000 Hz or more; the paper uses above 2 kHz",
-        )
+        what = f"gives a period of {period:g} s (a simulated haptic device needs a positive one of"
+        what = f"{what} at most {_MAX_SIMULATION_PERIOD_S:g} s)"
+        remedy = "choose 1000 Hz or more; the paper uses above 2 kHz"
+        raise DrakeTeleopError(what, where="rates.hand_hz", remedy=remedy)
     device.check_limits(q)
     slope = device.damping_matrix(q, include_coulomb_slope=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
     if rate * period > _MAX_DAMPING_RATE_TIMES_PERIOD:
-        raise DrakeTeleopError(
-            f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
-            f"simulation with a period of {1e3 * period:g} ms is unstable",
-            where=device.friction_setting_path,
-            remedy="choose less friction, or a higher rates.hand_hz",
-        )
+        what = f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its"
+        what = f"{what} simulation with a period of {1e3 * period:g} ms is unstable"
+        remedy = "choose less friction, or a higher rates.hand_hz"
+        raise DrakeTeleopError(what, where=device.friction_setting_path, remedy=remedy)
 
 
 class MasterDevice(LeafSystem):

@@ -155,6 +155,7 @@ class ForceDisplay(LeafSystem):
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLOTS.stop)
         self._leader = device.compiled_constants if isinstance(device, LeaderDevice) else None
+        dynamics.jacobian_into(np.zeros(6), device.parameters, self._jacobian)  # of a leader arm
         if self._leader is not None:
             self._state = self.DeclareVectorInputPort("state", 2 * device.num_joints)
         inputs = {self.all_input_ports_ticket()}
@@ -174,7 +175,9 @@ class ForceDisplay(LeafSystem):
         if self._leader is not None:
             q = self._state.Eval(context)[: self._num_joints]
             if np.isfinite(wrench).all() and np.isfinite(q).all():
-                limit_wrench_to_motor_torques(self._leader, q, wrench, self._shortened)
+                limits = self._parameters[0], self._jacobian, self._shortened
+                limit_wrench_into(wrench, *limits)  # first: undisplayed torque needs no motor
+                limit_wrench_to_motor_torques(self._leader, q, self._shortened, self._shortened)
                 wrench = self._shortened
         constants = self._parameters, self._period, self._jacobian
         step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())

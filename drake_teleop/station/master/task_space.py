@@ -139,10 +139,8 @@ def check_limits(q: Array, device: DeviceParameters) -> None:
         low, high = centre - half, centre + half
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
         turns = ", ".join(f"{a:.0f}" for a in np.degrees(device.max_rotation))
-        raise DrakeTeleopError(
-            f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll "
-            f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "
-            f"is {axes} m, +-({turns}) degrees",
-            where="master.position",
-            remedy="choose a start position inside the device's workspace, in its base frame B",
-        )
+        what = f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll"
+        what = f"{what} ({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's"
+        what = f"{what} workspace is {axes} m, +-({turns}) degrees"
+        remedy = "choose a start position inside the device's workspace, in its base frame B"
+        raise DrakeTeleopError(what, where="master.position", remedy=remedy)

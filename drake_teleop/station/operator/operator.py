@@ -100,12 +100,10 @@ class OperatorConfig:
     def check(self, where: str) -> None:
         for index, segment in enumerate(self.intent):
             if isinstance(segment, Sine) and segment.ramp > 0.5 * segment.duration:
-                raise DrakeTeleopError(
-                    f"two ramps of {segment.ramp:g} s are longer than the duration,"
-                    f" {segment.duration:g} s",
-                    where=f"{where}.intent[{index}].ramp",
-                    remedy=f"set it to {0.5 * segment.duration:g} or less, or increase duration",
-                )
+                what = f"two ramps of {segment.ramp:g} s are longer than the duration,"
+                what, place = f"{what} {segment.duration:g} s", f"{where}.intent[{index}].ramp"
+                remedy = f"set it to {0.5 * segment.duration:g} or less, or increase duration"
+                raise DrakeTeleopError(what, where=place, remedy=remedy)
 
     @property
     def hand(self) -> HandImpedance:

@@ -158,11 +158,9 @@ class PassivityConfig:
         schema = METHODS[self.method].config
         if schema is None:
             if self.registered:
-                raise DrakeTeleopError(
-                    f"built-in method '{self.method}' has no registered parameters",
-                    where=f"{where}.registered",
-                    remedy="remove this field; a built-in method has its own block of fields",
-                )
+                what = f"built-in method '{self.method}' has no registered parameters"
+                remedy = "remove this field; a built-in method has its own block of fields"
+                raise DrakeTeleopError(what, where=f"{where}.registered", remedy=remedy)
             # The number `force_limit` is a limit of all methods.
             name = "local_force_limit" if self.method == "force_limit" else self.method
             own = getattr(self, name, None)

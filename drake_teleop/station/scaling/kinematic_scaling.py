@@ -16,6 +16,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import quaternion_at, quaternion_product, scale_vector, vector_at
 from drake_teleop.station.slave.arm import ArmModel, pose_into
 
+_MIN_HALF_TURN_COSINE = 0.26  # rotation of 150 degrees: a scaled one jumps at 180 degrees
+
 
 @settings
 @dataclass
@@ -80,9 +82,9 @@ def _pose_command_into(pose, clutch_references, R_WB, translation_scale, rotatio
 class KinematicScaling(DoubleOnlySystem, LeafSystem):
     """Block that scales the master's motion into the slave's commanded pose, with a clutch.
 
-    While the clutch is open, the command is constant. When it closes, the master's present pose is
-    the new reference, so the command does not jump. While the master's pose is not finite, the
-    clutch keeps its state.
+    While the clutch is open, the command is constant. When it closes, or after a rotation by 150
+    degrees, the master's pose is the new reference, so the command does not jump. While the pose is
+    not finite, the clutch keeps its state.
 
     .. pydrake_system::
 
@@ -127,10 +129,11 @@ class KinematicScaling(DoubleOnlySystem, LeafSystem):
     def _update_clutch_references(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
         engage = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5
-        if engage == (references[14] > 0.5):
-            return
         pose = self._pose.Eval(context)
         if not np.isfinite(pose).all():  # the reference must be finite
+            return
+        far = engage and abs(pose[:4] @ references[7:11]) < _MIN_HALF_TURN_COSINE
+        if engage == (references[14] > 0.5) and not (far and self._scaling[2] % 1.0):
             return
         _pose_command_into(pose, references, *self._scaling, references[:7])
         references[7:14] = pose
@@ -140,8 +143,8 @@ class KinematicScaling(DoubleOnlySystem, LeafSystem):
 class JointCoupling(LeafSystem):
     """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open, the command is constant. While it is closed, the command is start +
-    (leader's joints - home), so it jumps when the clutch closes.
+    While the clutch is open, the command is constant. Otherwise it is start + (leader's joints -
+    home), so it jumps when the clutch closes.
 
     .. pydrake_system::
 
