@@ -620,6 +620,31 @@ def test_preset_as_factor_sets_its_values():
 
 
 @pytest.mark.parametrize(
+    ("scenario", "field", "value"),
+    [("press", "force", 5.0), ("insert", "depth", 0.03), ("reach", "width", 0.02)],
+)
+def test_fields_of_the_scenarios_own_task_can_be_factors(
+    tmp_path, monkeypatch, scenario, field, value
+):
+    scenarios = []
+
+    def keep(work, values, seed):
+        scenarios.append(work.scenario(values, seed))
+        return {}
+
+    monkeypatch.setattr(studies.StationRunFunction, "__call__", keep)
+    path = tmp_path / "study.yaml"
+    factor = f"{{field: operator.task.{field}, values: [{value}]}}"
+    path.write_text(f"{{scenario: {scenario}, factors: [{factor}]}}")
+    study_command(path, tmp_path / "out", jobs=1, quiet=True)
+    assert [getattr(each.operator.task, field) for each in scenarios] == [value]
+    # A field of another task is refused.
+    path.write_text(path.read_text().replace(field, "stiffness"))
+    with pytest.raises(DrakeTeleopError, match=r"factors\[0\]\.operator\.task\.stiffness: there"):
+        study_command(path, tmp_path / "other", jobs=1, quiet=True)
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         (
