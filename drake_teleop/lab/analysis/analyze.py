@@ -15,7 +15,12 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
-from drake_teleop.lab.analysis.linearization import close_network, linearize, two_port_along
+from drake_teleop.lab.analysis.linearization import (
+    close_network,
+    linearize,
+    network_delay_periods,
+    two_port_along,
+)
 from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
@@ -112,7 +117,7 @@ def _analyze_in_stages(
             summarise_diagram_stability(name, close_all_loops(system, linear), one_axis, sampling)
             for name, system, one_axis in points
         ],
-        "two_port": two_port_deviations(with_hand, axis, sampling),
+        "two_port": two_port_deviations(with_equal_delays(with_hand, linear), axis, sampling),
         "margins": margin_rows(axis, sampling, contact.wall_stiffness),
         "absolute": absolute_stability_values(H, axis),
         "bounded": stiffest_stable_walls(H, axis, sampling),
@@ -222,6 +227,14 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
         "decay_1_per_s": float(-np.log(abs(multiplier)) / system.dt),
         "frequency_Hz": float(abs(np.angle(multiplier)) / system.dt / (2 * np.pi)),
     }
+
+
+def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
+    """Return H at `OMEGA` as if both network delays were their mean; h12 h21 is unchanged."""
+    ahead, back = network_delay_periods(scenario)
+    shift = np.exp(S_AT_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
+    h11, h12, h21, h22 = two_port.matrix_entries(H)
+    return two_port.two_port_matrix(h11, h12 / shift, h21 * shift, h22)
 
 
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
