@@ -151,6 +151,25 @@ def test_slave_that_does_not_translate_is_refused(tmp_path, monkeypatch):
         study.compare_command(tmp_path / "out", scenario=mine)
 
 
+@pytest.mark.parametrize(
+    ("scenario", "methods", "message"),
+    [
+        ("{joint_control: {servo: ur_servoj}}", ["none", "ledger"], r"^joint_control\.servo: "),
+        ("{kinematic_scaling: {rotation_scale: 0}}", ["ledger"], r"passivity\.method: .* scales"),
+    ],
+)
+def test_scenario_that_a_method_does_not_support_is_refused(
+    tmp_path, monkeypatch, scenario, methods, message
+):
+    """Else the report would call the method unstable."""
+    monkeypatch.setattr(study, "_run_longest_round_trip_study", lambda *_: pytest.fail("too late"))
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(scenario)
+    with pytest.raises(DrakeTeleopError, match=message):
+        study.compare_command(tmp_path / "out", scenario=mine, methods=methods)
+    assert not (tmp_path / "out").exists()
+
+
 def test_slip_speed_at_the_leaf_is_the_default(monkeypatch):
     """A tenth of that slip takes seven times the steps in a hold."""
     asked = []

@@ -23,6 +23,7 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis.task_direction import check_can_press
 from drake_teleop.lab.comparison import one_dof, whole_station
 from drake_teleop.lab.comparison.one_dof import PERIOD_S, TAP_RATES_HZ, OneDof, RunMeasures, Task
+from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
@@ -80,6 +81,10 @@ def compare_command(
         what = "method 'none' over network 'ideal' has no channel that measures energy"
         raise DrakeTeleopError(what, where="networks", remedy="remove the network or the method")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
+    for method in methods:  # else each of its runs would count as unstable
+        settings = Channel(network=networks[0]), PassivityConfig(method=method)
+        setup, _ = whole_station.press_scenario(base, *settings, "contact")
+        MakeTeleopStation(setup, load_estimate=true_load(base))
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
         limits = _run_longest_round_trip_study(methods, seed, jobs, stage)
