@@ -223,6 +223,20 @@ def test_verdict_names_both_causes_of_a_difference_from_one_axis(deviation, stat
     assert ("Contact rotates the tool, or its motion is estimated with a delay" in text) == stated
 
 
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("kinematic_scaling__translation_scale", r"^kinematic_scaling\.translation_scale: is 0, "),
+        ("force_scaling__force_scale", r"^force_scaling\.force_scale: is 0, "),
+    ],
+)
+@pytest.mark.parametrize("name", ["contact_transition", "free_motion_force"])
+def test_scale_of_0_is_refused_before_the_work(monkeypatch, name, field, message):
+    monkeypatch.setattr(analyze, "linearize", lambda *_, **__: pytest.fail("too late"))
+    with pytest.raises(DrakeTeleopError, match=message):
+        analyze.analyze(replace(LoadScenario(name), **{field: 0.0}), progress=False)
+
+
 def test_eta_raises_because_of_two_sigmas():
     scenario = replace(
         LoadScenario("free_motion_force"),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
@@ -79,6 +80,7 @@ def analyze(
 def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
 ) -> tuple[dict[str, Any], report.ReportCurves]:
+    _check_scales_above_0(scenario)
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = true_load(scenario)
@@ -150,6 +152,13 @@ def _analyze_in_stages(
     return summary, report.ReportCurves(contact, OMEGA, H, nyquist, maps)
 
 
+def _check_scales_above_0(scenario: Scenario) -> None:
+    check_can_press(scenario)
+    if scenario.force_scaling.force_scale == 0.0:
+        what = "is 0, so that no force depends on the environment"
+        raise DrakeTeleopError(what, where="force_scaling.force_scale", remedy="set it above 0")
+
+
 def describe_wall_source(scenario: Scenario, is_wall_known: bool) -> str:
     if scenario.first_sheet_spring is not None:
         return "the leaf"
@@ -170,7 +179,6 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     """Return the master's displacement [m], in its base B, for a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
-    check_can_press(scenario)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).p_WTip_start
     return list(scaling.R_WB.T @ displacement / scaling.translation_scale)
