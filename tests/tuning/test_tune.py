@@ -48,6 +48,7 @@ GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, 
 
 def test_operating_range_has_all_grips_between_the_given_ones_and_walls_between_the_ends():
     stated = make_operating_range(["firm", "light"], [20.0, 0.5, 3.0], "press")
+    assert stated == make_operating_range(("light", "firm"), np.array([0.5, 20.0]), "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [

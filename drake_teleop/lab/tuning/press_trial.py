@@ -12,7 +12,7 @@ from scipy.fft import dct
 from scipy.optimize import bisect
 
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
@@ -101,6 +101,7 @@ class OperatingRange:
 
 def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str) -> OperatingRange:
     """Return the required operating range: these grips, walls [kN/m] and task."""
+    walls = [to_float("walls", wall) for wall in walls]
     _check_names_are_known("hands", hands, tuple(GRIP_IMPEDANCES))
     _check_names_are_known("task", [task], tuple(REQUIREMENTS_OF_TASK))
     for where, given, example in (("hands", hands, "light"), ("walls", walls, "0.5,20 (kN/m)")):
