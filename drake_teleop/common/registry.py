@@ -99,9 +99,9 @@ class Registry(dict[str, _Part]):
 
 def register_from_script(script: Path) -> None:
     """Import a Python file that registers parts, here and in the processes of studies."""
-    script = script.absolute()
-    if script.suffix != ".py" or not script.is_file():
-        remedy = "give an existing .py file"
+    script = Path(os.path.abspath(script))
+    if script.suffix != ".py" or "." in script.stem or not script.is_file():
+        remedy = "give an existing file NAME.py, without another dot in NAME"
         raise DrakeTeleopError("is not a Python file", where=str(script), remedy=remedy)
     sys.path.append(str(script.parent))
     try:
