@@ -578,6 +578,12 @@ def test_a_factorial_design_has_every_combination_once():
     assert {point["a.b"] for point in points} == {0.0, 0.25, 0.5, 0.75, 1.0}
 
 
+def test_whole_numbers_in_a_list_of_a_factor_are_numbers(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[1, 2.5, 3])], measures=["hand_work_J"])
+    found = run_study(study, tmp_path, lambda *_: {"hand_work_J": 1.0}, {}, jobs=1, progress=False)
+    assert found["a.b"].to_list() == [1.0, 2.5, 3.0]
+
+
 def test_measures_of_a_known_motion():
     """The hand pulls (3, 4, 0) N at 0.2 m/s along x; the display has 2 sin t along z."""
     t = np.linspace(0.0, 2 * math.pi, 20001)
