@@ -9,19 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, two_port
+from drake_teleop.lab.analysis import absolute_stability, cut_loop, linearization, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
-from drake_teleop.lab.analysis.linearization import (
-    close_network,
-    linearize,
-    network_delay_periods,
-    two_port_along,
-)
+from drake_teleop.lab.analysis.linearization import close_network, linearize, two_port_along
 from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
@@ -80,7 +74,7 @@ def analyze(
 def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
 ) -> tuple[dict[str, Any], report.ReportCurves]:
-    _check_scales_above_0(scenario)
+    check_can_press(scenario)
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = true_load(scenario)
@@ -150,13 +144,6 @@ def _analyze_in_stages(
         loop = cut_loop.cut_loop(axis_with_grip(contact, grip), sampling)
         nyquist[grip] = -cut_loop.loop_response(loop, OMEGA, axis.delay)
     return summary, report.ReportCurves(contact, OMEGA, H, nyquist, maps)
-
-
-def _check_scales_above_0(scenario: Scenario) -> None:
-    check_can_press(scenario)
-    if scenario.force_scaling.force_scale == 0.0:
-        what = "is 0, so that no force depends on the environment"
-        raise DrakeTeleopError(what, where="force_scaling.force_scale", remedy="set it above 0")
 
 
 def describe_wall_source(scenario: Scenario, is_wall_known: bool) -> str:
@@ -239,7 +226,7 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
 
 def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
     """Return H at `OMEGA` as if both network delays were their mean; h12 h21 is unchanged."""
-    ahead, back = network_delay_periods(scenario)
+    ahead, back = linearization.network_delay_periods(scenario)
     shift = np.exp(S_AT_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
     h11, h12, h21, h22 = two_port.matrix_entries(H)
     return two_port.two_port_matrix(h11, h12 / shift, h21 * shift, h22)

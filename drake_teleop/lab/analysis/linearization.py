@@ -34,6 +34,7 @@ from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.environment.point_contact import PAIR_FRICTION_COLUMNS
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
@@ -400,7 +401,8 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
         wrist_sensor=without_parts(scenario.wrist_sensor, *parts),
         master=scenario.master.without_coulomb_friction_and_encoder_steps(),
         slave__friction=[],
-        load_estimator__enabled=False,
+        load_estimator=LoadEstimatorConfig(),
+        contact_detection=None,
         # The closed form, if the arm has one, has no state.
         slave__inverse_kinematics=AUTOMATIC_IK_METHOD,
     )

@@ -28,6 +28,7 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.oscillation import high_pass_above_5_hz
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, step_addresses
 from drake_teleop.station.result import SimulationResult
@@ -64,8 +65,8 @@ def compare_command(
 ) -> dict[str, Any]:
     """Compare passivity methods (None: all); write summary, runs, report and pictures into `out`.
 
-    Rates, integrator and environment of the scenario are not used. Return the content of
-    summary.json (docs/delay-figures.md).
+    Rates, integrator, environment and load estimator of the scenario are not used. Return the
+    content of summary.json (docs/delay-figures.md).
     """
     if unknown := [name for name in networks if name not in PRESETS]:
         remedy = suggest_name(unknown[0], tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
@@ -145,7 +146,7 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment and contact detection, at the comparison's rates."""
+    """Return the scenario at the comparison's rates, without environment and detection."""
     given = LoadScenario(scenario).without_environment()
     check_can_press(given)
     return replace(
@@ -153,6 +154,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
         rates=_COMPARISON_RATES,
         contact_detection=None,
+        load_estimator=LoadEstimatorConfig(),  # contact would count as load
     )
 
 

@@ -23,6 +23,7 @@ from drake_teleop.lab.comparison.whole_station import measures_of_press, press_s
 from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
@@ -146,6 +147,7 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
         simulation=simulation,
         force_scaling=ForceScalingConfig(sigma=0.0, force_scale=force_scale),
         contact_detection=None,
+        load_estimator=LoadEstimatorConfig(),  # contact would count as load
         operator__intent=[],
         operator__task=None,
     )

@@ -87,7 +87,8 @@ def tune(
     shown = progress and not quiet
     with show_progress(shown) as stage:
         load = identified_load(base, stage)
-    of_trials = {name: getattr(base, name) for name in ("simulation", "operator", "channel")}
+    names = ("simulation", "operator", "channel", "load_estimator")
+    of_trials = {name: getattr(base, name) for name in names}
     own = replace(given, contact_detection=None, **of_trials)
     trial = StationPressTrial(own, base, stated, load.estimate)
     basis = {
