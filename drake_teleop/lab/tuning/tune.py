@@ -326,13 +326,11 @@ def _tuning_result_sentences(
         f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
         f"at the tool; {instead}.",
     ]
-    fails = figures["fails_at"]
-    if fails is None:
-        last = (
-            f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
-            f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
-        )
-    else:
+    last = (
+        f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
+        f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
+    )
+    if fails := figures["fails_at"]:
         wall, factor = fails["wall_N_per_m"] / 1e3, fails["gamma_factor"]
         last = (
             f"The station fails with a {fails['hand']} grip at a wall of {wall:g} kN/m and gamma "
