@@ -225,7 +225,7 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
 
 
 def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
-    """Return H at `OMEGA` as if both network delays were their mean; h12 h21 is unchanged."""
+    # One axis has one delay: the mean. The product h12 h21 is unchanged.
     ahead, back = linearization.network_delay_periods(scenario)
     shift = np.exp(S_AT_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
     h11, h12, h21, h22 = two_port.matrix_entries(H)

@@ -110,7 +110,7 @@ def task_direction(
 
 
 def check_can_press(scenario: Scenario) -> None:
-    """Raise DrakeTeleopError if the scale of translation or force is 0."""
+    """Raise DrakeTeleopError for a translation or force scale of 0."""
     for block, name, lack in (
         ("kinematic_scaling", "translation_scale", "the slave cannot press"),
         ("force_scaling", "force_scale", "the hand receives no force"),

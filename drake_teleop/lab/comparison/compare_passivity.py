@@ -65,8 +65,8 @@ def compare_command(
 ) -> dict[str, Any]:
     """Compare passivity methods (None: all); write summary, runs, report and pictures into `out`.
 
-    Rates, integrator, environment and load estimator of the scenario are not used. Return the
-    content of summary.json (docs/delay-figures.md).
+    The scenario's rates, integrator, environment and load estimator are unused. Return the content
+    of summary.json (docs/delay-figures.md).
     """
     if unknown := [name for name in networks if name not in PRESETS]:
         remedy = suggest_name(unknown[0], tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
@@ -146,7 +146,7 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario at the comparison's rates, without environment and detection."""
+    """Return the scenario at the comparison's rates, without environment, detection, estimator."""
     given = LoadScenario(scenario).without_environment()
     check_can_press(given)
     return replace(
