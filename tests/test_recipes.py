@@ -212,6 +212,7 @@ def test_a_registry_refuses_shipped_and_impossible_names():
     [
         ("parts.txt", "", "is not a Python file"),
         ("missing.py", None, "is not a Python file"),
+        ("my.parts.py", "", "is not a Python file; give .*, without another dot"),
         ("json.py", "", "has the name of the module"),
         ("broken.py", "1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
     ],
@@ -221,6 +222,14 @@ def test_a_file_that_registers_nothing_is_one_line(folder, name, text, says):
         (folder / name).write_text(text)
     with pytest.raises(DrakeTeleopError, match=says):
         register_from_script(folder / name)
+
+
+def test_a_file_is_registered_by_any_form_of_its_path(folder):
+    (folder / "sub").mkdir()
+    for path in (folder / "sub" / ".." / "parts.py", folder / "parts.py"):
+        register_from_script(path)
+    assert "share" in METHODS
+    assert os.environ["DRAKE_TELEOP_REGISTER"] == str(folder / "parts.py")
 
 
 def test_another_process_registers_the_same_parts_when_a_name_is_unknown(folder):

@@ -104,6 +104,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "a plant": (lambda: dt.AddWristSensor(None, 7, None), "AddWristSensor"),
     "a hand": (lambda: dt.tune("contact_transition", hands=("strong",)), "hands"),
     "a wall": (lambda: dt.tune("contact_transition", walls=(-1.0, 20.0)), "walls"),
+    "a numeral for a wall": (lambda: dt.tune("contact_transition", walls=("0.5",)), "walls"),  # type: ignore[arg-type]
     "a task": (lambda: dt.tune("contact_transition", task="dance"), "task"),
     # Logs.
     "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
@@ -115,6 +116,8 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "words in it": (lambda: eliminated(untouched_s=("a", "b")), "untouched_s"),
     "a start": (lambda: eliminated(causal="delayed", causal_tare_s="1"), "causal_tare_s"),
     "a numeral for a scale": (lambda: scaled(gamma="1"), "gamma"),
+    "numerals": (lambda: dt.regressor(N3.astype(str), N3, N3), "s"),  # type: ignore[arg-type]
+    "bytes": (lambda: dt.non_contact_wrench(N3, N3, N3, N10.astype(bytes)), "phi"),
     "dates": (lambda: dt.regressor(N3.astype("M8[s]"), N3, N3), "s"),  # type: ignore[arg-type]
     "a method": (lambda: dt.identify_log("log.csv", method=7), "method"),  # type: ignore[arg-type]
     "a load's file": (lambda: dt.eliminate_log("log.csv", 7), "load"),  # type: ignore[arg-type]

@@ -187,19 +187,14 @@ def to_json_data(data: Any) -> Any:
 
 
 def _file_times_and_inodes(folder: Path) -> dict[str, tuple[int, int]]:
-    found = {}
-    for path in sorted(folder.iterdir()):
-        if not path.is_dir() or any(path.iterdir()):
-            state = path.lstat()
-            found[path.name] = (state.st_mtime_ns, state.st_ino)
-    return found
+    paths = (x for x in sorted(folder.iterdir()) if not x.is_dir() or any(x.iterdir()))
+    states = {path.name: path.lstat() for path in paths}
+    return {name: (state.st_mtime_ns, state.st_ino) for name, state in states.items()}
 
 
 def _join_file_names(names: Sequence[str]) -> str:
-    if not names:
-        return "nothing"
     more = f" and {len(names) - _MAX_LISTED_FILES} more" if len(names) > _MAX_LISTED_FILES else ""
-    return ", ".join(names[:_MAX_LISTED_FILES]) + more
+    return ", ".join(names[:_MAX_LISTED_FILES]) + more or "nothing"
 
 
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[1]

@@ -49,8 +49,8 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
     try:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise ValueError("complex" if np.iscomplexobj(value) else "masked")
-        if np.asarray(value).dtype.kind in "mM":
-            raise ValueError("dates or time spans")
+        if np.asarray(value).dtype.kind in "mMSU":
+            raise ValueError("dates, time spans or texts")
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         what = f"contains no real numbers ({error})"

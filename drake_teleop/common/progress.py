@@ -26,17 +26,14 @@ def show_progress(progress: bool | StartStage, *, after: float = 0.0) -> Iterato
         yield progress
     elif not progress:
         yield show_no_progress
-    elif not _is_console_interactive():
-        yield _show_stages_as_lines(after)
     else:
-        yield from _show_stages_as_bars(after)
+        from rich import get_console
 
-
-def _is_console_interactive() -> bool:
-    from rich import get_console
-
-    console = get_console()
-    return console.is_terminal or console.is_jupyter
+        console = get_console()
+        if console.is_terminal or console.is_jupyter:
+            yield from _show_stages_as_bars(after)
+        else:
+            yield _show_stages_as_lines(after)
 
 
 def _show_stages_as_lines(delay_s: float) -> StartStage:

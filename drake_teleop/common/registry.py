@@ -65,13 +65,11 @@ class Registry(dict[str, _Part]):
     def _check_part_type(self, name: str, part: Any) -> None:
         if self._part_type is None:
             return
-        if self._parts_are_classes:
-            fits = isinstance(part, type) and issubclass(part, self._part_type)
-        else:
-            fits = isinstance(part, self._part_type)
-        if not fits:
-            kind = "a class derived from" if self._parts_are_classes else "an object of class"
-            remedy = f"register {kind} {self._part_type.__name__} (docs/extend.md)"
+        base, is_class = self._part_type, self._parts_are_classes
+        is_subclass = isinstance(part, type) and issubclass(part, base)
+        if not (is_subclass if is_class else isinstance(part, base)):
+            kind = "a class derived from" if is_class else "an object of class"
+            remedy = f"register {kind} {base.__name__} (docs/extend.md)"
             what = f"'{name}' is {reprlib.repr(part)}, not a valid part"
             raise DrakeTeleopError(what, where=self.kind, remedy=remedy)
 
@@ -99,9 +97,9 @@ class Registry(dict[str, _Part]):
 
 def register_from_script(script: Path) -> None:
     """Import a Python file that registers parts, here and in the processes of studies."""
-    script = script.absolute()
-    if script.suffix != ".py" or not script.is_file():
-        remedy = "give an existing .py file"
+    script = Path(os.path.abspath(script))
+    if script.suffix != ".py" or "." in script.stem or not script.is_file():
+        remedy = "give an existing file NAME.py, without another dot in NAME"
         raise DrakeTeleopError("is not a Python file", where=str(script), remedy=remedy)
     sys.path.append(str(script.parent))
     try:

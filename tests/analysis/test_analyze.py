@@ -16,6 +16,8 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.report import margin_cells, print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 pytestmark = pytest.mark.long
@@ -157,6 +159,27 @@ def test_models_without_displayed_force_have_no_deviation(gamma, sigma):
     assert np.isfinite(list(found["closed_form"].values())).all()
 
 
+@pytest.mark.parametrize(("ahead", "back"), [(0.03, 0.01), (0.005, 0.08), (0.02, 0.02)])
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_unequal_delays_are_no_deviation_from_one_axis(ahead, back, sigma):
+    """Only their sum affects the hand; h12 has the delay back, h21 that of the way ahead."""
+    channel = Channel(delay=ahead, backward=NetworkConfig(delay=back))
+    scenario = replace(LoadScenario("contact_transition"), channel=channel)
+    axis = OneAxis(sigma=sigma, wall_stiffness=0.0, delay=(ahead + back) / 2)
+    models = [
+        replace_fields(axis, device_mass=axis.device_mass + axis.hand_mass, delay=delay)
+        for delay in (axis.delay, 0.0)
+    ]
+    H, undelayed = (sampled_two_port(model, Sampling(), analyze.OMEGA) for model in models)
+    H[:, 0, 1] = undelayed[:, 0, 1] * np.exp(-analyze.S_AT_OMEGA * back)
+    H[:, 1, 0] = undelayed[:, 1, 0] * np.exp(-analyze.S_AT_OMEGA * ahead)
+    assert (max(analyze.two_port_deviations(H, axis, Sampling())["sampled"].values()) > 0.1) == (
+        ahead != back
+    )
+    found = analyze.two_port_deviations(analyze.with_equal_delays(H, scenario), axis, Sampling())
+    assert max(found["sampled"].values()) < 1e-9
+
+
 @pytest.mark.parametrize(("rate", "low_pass"), [(2000.0, 500.0), (1e4, 4500.0), (2e4, 9500.0)])
 def test_rates_of_the_map_increase_for_each_low_pass(monkeypatch, rate, low_pass):
     monkeypatch.setattr(analyze, "_NUM_POINTS_PER_MAP_AXIS", 2)
@@ -198,6 +221,20 @@ def test_verdict_names_both_causes_of_a_difference_from_one_axis(deviation, stat
     text = " ".join(verdict_sentences(figures))
     assert ("Along z the station is not one axis." in text) == stated
     assert ("Contact rotates the tool, or its motion is estimated with a delay" in text) == stated
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("kinematic_scaling__translation_scale", r"^kinematic_scaling\.translation_scale: is 0, "),
+        ("force_scaling__force_scale", r"^force_scaling\.force_scale: is 0, "),
+    ],
+)
+@pytest.mark.parametrize("name", ["contact_transition", "free_motion_force"])
+def test_scale_of_0_is_refused_before_the_work(monkeypatch, name, field, message):
+    monkeypatch.setattr(analyze, "linearize", lambda *_, **__: pytest.fail("too late"))
+    with pytest.raises(DrakeTeleopError, match=message):
+        analyze.analyze(replace(LoadScenario(name), **{field: 0.0}), progress=False)
 
 
 def test_eta_raises_because_of_two_sigmas():

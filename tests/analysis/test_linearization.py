@@ -7,6 +7,8 @@ import phantom_arrays as arrays
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis import frequency_response, linearization
+from drake_teleop.lab.analysis.analyze import measure_free_impedance
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
 from drake_teleop.lab.analysis.linearization import linearize, linearize_station, two_port_along
 from drake_teleop.lab.analysis.one_axis import device_impedance
@@ -391,6 +393,33 @@ def test_rates_method_and_direction_without_linear_model_raise():
         linearize_station(replace(scenario, passivity=PassivityConfig(method="tdpa")))
     with pytest.raises(DrakeTeleopError, match="direction"):
         task_direction(scenario, (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "blocks",
+    [
+        "{contact_detection: {}}",
+        "{load_estimator: {enabled: true, method: rtls, watch: true}}",
+        "{load_estimator: {watch: true}, contact_detection: {margin: 2}}",
+    ],
+)
+def test_estimation_and_detection_do_not_prevent_linearisation_and_probing(
+    tmp_path, monkeypatch, blocks
+):
+    class StationMadeError(Exception): ...
+
+    def stop(*_: object, **__: object):
+        raise StationMadeError
+
+    monkeypatch.setattr(linearization._PeriodSimulator, "find_rest_state_and_derivatives", stop)
+    monkeypatch.setattr(frequency_response, "simulate", stop)
+    (tmp_path / "mine.yaml").write_text(blocks)
+    scenario = LoadScenario(tmp_path / "mine.yaml")
+    with pytest.raises(StationMadeError):
+        linearize(scenario, load_estimate=true_load(scenario))
+    along = task_direction(scenario, UP)
+    with pytest.raises(StationMadeError):
+        measure_free_impedance(scenario, along, system=None)
 
 
 @pytest.mark.parametrize(

@@ -167,5 +167,8 @@ def test_scattering_relates_the_waves():
 def test_scales_and_ratio_of_powers_must_be_positive():
     with pytest.raises(DrakeTeleopError, match=r"OneAxis\.position_scale: is 0"):
         tp.reference_impedances(OneAxis(position_scale=0.0))
+    for name in ("position_scale", "force_scale"):
+        with pytest.raises(DrakeTeleopError, match=rf"OneAxis\.{name}: is 0"):
+            tp.power_scaled_matrices(tp.hybrid_matrix(OneAxis(), S), OneAxis(**{name: 0.0}))
     with pytest.raises(DrakeTeleopError, match="ratio: 0, "):
         tp.scale_slave_power(tp.hybrid_matrix(OneAxis(), S), 0.0)

@@ -20,6 +20,7 @@ from drake_teleop.lab.comparison.report import RUN_COLUMNS, run_cells
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.environment.solids import Wall
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.scenario import LoadScenario
 
 pytestmark = pytest.mark.long
@@ -123,6 +124,7 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(
         "{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {},"
+        " load_estimator: {enabled: true, method: rtls, watch: true},"
         " simulation: {integrator: runge_kutta2, max_step: 1.0e-4}}"
     )
     bases = []
@@ -138,17 +140,42 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
         study._COMPARISON_RATES,
     )
     assert base.surroundings is None and base.contact_detection is None
+    # An estimator would count the contact wrench as load.
+    assert base.load_estimator == LoadEstimatorConfig()
     # Steps longer than the events' period avoid extra steps by rounding.
     assert base.simulation.integrator == "runge_kutta3"
     assert base.simulation.max_step > 1.5 / base.rates.hand_hz
 
 
-def test_slave_that_does_not_translate_is_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("block", "name"),
+    [("kinematic_scaling", "translation_scale"), ("force_scaling", "force_scale")],
+)
+def test_scale_of_0_is_refused(tmp_path, monkeypatch, block, name):
     monkeypatch.setattr(study, "_run_longest_round_trip_study", lambda *_: pytest.fail("too late"))
     mine = tmp_path / "mine.yaml"
-    mine.write_text("{kinematic_scaling: {translation_scale: 0}}")
-    with pytest.raises(DrakeTeleopError, match=r"^kinematic_scaling\.translation_scale: is 0"):
+    mine.write_text(f"{{{block}: {{{name}: 0}}}}")
+    with pytest.raises(DrakeTeleopError, match=rf"^{block}\.{name}: is 0"):
         study.compare_command(tmp_path / "out", scenario=mine)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "methods", "message"),
+    [
+        ("{joint_control: {servo: ur_servoj}}", ["none", "ledger"], r"^joint_control\.servo: "),
+        ("{kinematic_scaling: {rotation_scale: 0}}", ["ledger"], r"passivity\.method: .* scales"),
+    ],
+)
+def test_scenario_that_a_method_does_not_support_is_refused(
+    tmp_path, monkeypatch, scenario, methods, message
+):
+    """Else the report would call the method unstable."""
+    monkeypatch.setattr(study, "_run_longest_round_trip_study", lambda *_: pytest.fail("too late"))
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(scenario)
+    with pytest.raises(DrakeTeleopError, match=message):
+        study.compare_command(tmp_path / "out", scenario=mine, methods=methods)
+    assert not (tmp_path / "out").exists()
 
 
 def test_slip_speed_at_the_leaf_is_the_default(monkeypatch):

@@ -29,11 +29,13 @@ from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.optimizer import FeasibleIterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.lab.excitation.shortest import design_shortest_motion
 from drake_teleop.lab.identification import identify_load
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.replay_file import ReplayFile
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -352,6 +354,17 @@ def test_limits_without_a_useful_motion_are_an_error_with_the_limit(slave, limit
     robot = dataclasses.replace(slave, limits=slave.limits._replace(**limits))
     with pytest.raises(DrakeTeleopError, match=said):
         excite(robot, harmonics=2, starts=1)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"harmonics": 1}, {"harmonics": 0}, {"period": 0.0}, {"period": -6.0}]
+)
+def test_series_without_motion_is_refused_before_the_search(slave, wrong):
+    with pytest.raises(DrakeTeleopError, match=r"^excite: .* describe no motion; give 2 harm"):
+        excite(slave, progress=False, **wrong)
+    if "harmonics" in wrong:
+        with pytest.raises(DrakeTeleopError, match=r"^excite: .* describe no motion; give 2 harm"):
+            design_shortest_motion(slave, parse_tolerance("mass 1 %"), **wrong)
 
 
 def test_arm_that_rotates_its_sensor_about_one_axis_is_an_error(tmp_path, capsys):

@@ -578,6 +578,12 @@ def test_a_factorial_design_has_every_combination_once():
     assert {point["a.b"] for point in points} == {0.0, 0.25, 0.5, 0.75, 1.0}
 
 
+def test_whole_numbers_in_a_list_of_a_factor_are_numbers(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[1, 2.5, 3])], measures=["hand_work_J"])
+    found = run_study(study, tmp_path, lambda *_: {"hand_work_J": 1.0}, {}, jobs=1, progress=False)
+    assert found["a.b"].to_list() == [1.0, 2.5, 3.0]
+
+
 def test_measures_of_a_known_motion():
     """The hand pulls (3, 4, 0) N at 0.2 m/s along x; the display has 2 sin t along z."""
     t = np.linspace(0.0, 2 * math.pi, 20001)
@@ -617,6 +623,31 @@ def test_preset_as_factor_sets_its_values():
     assert ideal.simulation.seed == 3
     assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor
     assert ideal.wrist_sensor.ideal
+
+
+@pytest.mark.parametrize(
+    ("scenario", "field", "value"),
+    [("press", "force", 5.0), ("insert", "depth", 0.03), ("reach", "width", 0.02)],
+)
+def test_fields_of_the_scenarios_own_task_can_be_factors(
+    tmp_path, monkeypatch, scenario, field, value
+):
+    scenarios = []
+
+    def keep(work, values, seed):
+        scenarios.append(work.scenario(values, seed))
+        return {}
+
+    monkeypatch.setattr(studies.StationRunFunction, "__call__", keep)
+    path = tmp_path / "study.yaml"
+    factor = f"{{field: operator.task.{field}, values: [{value}]}}"
+    path.write_text(f"{{scenario: {scenario}, factors: [{factor}]}}")
+    study_command(path, tmp_path / "out", jobs=1, quiet=True)
+    assert [getattr(each.operator.task, field) for each in scenarios] == [value]
+    # A field of another task is refused.
+    path.write_text(path.read_text().replace(field, "stiffness"))
+    with pytest.raises(DrakeTeleopError, match=r"factors\[0\]\.operator\.task\.stiffness: there"):
+        study_command(path, tmp_path / "other", jobs=1, quiet=True)
 
 
 @pytest.mark.parametrize(

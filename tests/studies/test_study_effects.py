@@ -79,6 +79,24 @@ def test_effects_equal_the_synthetic_ones():
     assert (gamma["effect"].abs() < 2 * gamma["effect_half"]).all()
 
 
+@pytest.mark.parametrize("failing", [2, 99, 100, 119])
+def test_reason_of_any_row_is_in_the_table(failing):
+    sigma = Factor("force_scaling.sigma", low=0.0, high=1.0, levels=120)
+    study = Study(factors=[sigma], measures=["effort_Ns"])
+    found = main_effects_table(study, table(study, failing))
+    assert found["why"].is_not_null().arg_true().to_list() == [failing]
+    assert found["why"][failing] == "no successful run"
+
+
+@pytest.mark.parametrize("factor", [STUDY.factors[0], STUDY.factors[2]])
+def test_table_without_effects_has_its_columns(factor):
+    """No run succeeds, or no field varies."""
+    study = Study(factors=[factor], measures=["effort_Ns"])
+    rows = table(study).with_columns(effort_Ns=pl.lit(None))
+    found = main_effects_table(study, rows)
+    assert found.is_empty() and found.columns == main_effects_table(STUDY, table()).columns
+
+
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4), st.booleans()), max_size=30))
 def test_front_contains_the_non_dominated_points(points):
     values = np.array([point[:2] for point in points], dtype=float).reshape(-1, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace as replace_fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ from drake_teleop.lab.tuning.tune import meets_requirements, search_settings, tu
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.operator.perception import Perception
 from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N as MAX_REST_FORCE_N
@@ -48,6 +50,7 @@ GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, 
 
 def test_operating_range_has_all_grips_between_the_given_ones_and_walls_between_the_ends():
     stated = make_operating_range(["firm", "light"], [20.0, 0.5, 3.0], "press")
+    assert stated == make_operating_range(("light", "firm"), np.array([0.5, 20.0]), "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [
@@ -99,10 +102,33 @@ def test_ideal_network_is_refused_for_each_passivity(passivity):
         without_task_and_method(scenario, "ideal")
 
 
-def test_slave_that_does_not_translate_is_refused():
-    rigid = replace(LoadScenario("contact_transition"), kinematic_scaling__translation_scale=0.0)
-    with pytest.raises(DrakeTeleopError, match=r"^kinematic_scaling\.translation_scale: is 0"):
-        without_task_and_method(rigid, "internet")
+@pytest.mark.parametrize(
+    ("block", "name"),
+    [("kinematic_scaling", "translation_scale"), ("force_scaling", "force_scale")],
+)
+def test_scale_of_0_is_refused(block, name):
+    scenario = replace(LoadScenario("contact_transition"), **{f"{block}__{name}": 0.0})
+    with pytest.raises(DrakeTeleopError, match=rf"^{block}\.{name}: is 0"):
+        without_task_and_method(scenario, "internet")
+
+
+def test_no_run_updates_the_load(tmp_path, monkeypatch):
+    """An estimator would count the contact wrench as load."""
+    trials = []
+
+    def stop(trial, _):
+        trials.append(trial)
+        raise DrakeTeleopError("enough")
+
+    monkeypatch.setattr(search, "search_settings", stop)
+    load = SimpleNamespace(estimate=np.ones(16))
+    monkeypatch.setattr(search, "identified_load", lambda scenario, progress: load)
+    given = LoadScenario("contact_transition")
+    given.load_estimator = LoadEstimatorConfig(enabled=True, method="rtls", watch=True)
+    with pytest.raises(DrakeTeleopError, match="enough"):
+        tune(given, tmp_path, network="internet")
+    for scenario in (trials[0].user_scenario, trials[0].base_scenario):
+        assert scenario.load_estimator == LoadEstimatorConfig()
 
 
 def test_unknown_networks_are_refused():

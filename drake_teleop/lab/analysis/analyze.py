@@ -12,7 +12,7 @@ import numpy as np
 from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.analysis import absolute_stability, cut_loop, report, two_port
+from drake_teleop.lab.analysis import absolute_stability, cut_loop, linearization, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, linearize, two_port_along
@@ -74,6 +74,7 @@ def analyze(
 def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
 ) -> tuple[dict[str, Any], report.ReportCurves]:
+    check_can_press(scenario)
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = true_load(scenario)
@@ -112,7 +113,7 @@ def _analyze_in_stages(
             summarise_diagram_stability(name, close_all_loops(system, linear), one_axis, sampling)
             for name, system, one_axis in points
         ],
-        "two_port": two_port_deviations(with_hand, axis, sampling),
+        "two_port": two_port_deviations(with_equal_delays(with_hand, linear), axis, sampling),
         "margins": margin_rows(axis, sampling, contact.wall_stiffness),
         "absolute": absolute_stability_values(H, axis),
         "bounded": stiffest_stable_walls(H, axis, sampling),
@@ -165,7 +166,6 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     """Return the master's displacement [m], in its base B, for a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
-    check_can_press(scenario)
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
     displacement = goal - NominalSlave(scenario.slave).p_WTip_start
     return list(scaling.R_WB.T @ displacement / scaling.translation_scale)
@@ -222,6 +222,14 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
         "decay_1_per_s": float(-np.log(abs(multiplier)) / system.dt),
         "frequency_Hz": float(abs(np.angle(multiplier)) / system.dt / (2 * np.pi)),
     }
+
+
+def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
+    # One axis has one delay: the mean. The product h12 h21 is unchanged.
+    ahead, back = linearization.network_delay_periods(scenario)
+    shift = np.exp(S_AT_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
+    h11, h12, h21, h22 = two_port.matrix_entries(H)
+    return two_port.two_port_matrix(h11, h12 / shift, h21 * shift, h22)
 
 
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.task_direction import TaskDirection
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.simulation import simulate
@@ -136,6 +137,8 @@ def measure_frequency_response(
         simulation__settle=start + excitation.settle,
         simulation__duration=period * excitation.periods,
         rates__log_hz=rate,
+        load_estimator=LoadEstimatorConfig(),
+        contact_detection=None,
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
     result = simulate(diagram, drawing.simulation, progress=False)

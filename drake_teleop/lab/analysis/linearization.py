@@ -34,6 +34,7 @@ from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.environment.point_contact import PAIR_FRICTION_COLUMNS
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
@@ -168,7 +169,11 @@ class _PeriodSimulator:
         smooth = _without_nonlinear_parts(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
-            _check_linear_environment(self._diagram)
+            sensor = GetBlock(self._diagram, "wrist_sensor")
+            if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
+                what = f"this environment cannot be linearised: {beyond}"
+                remedy = "use only a sheet spring, a slot, walls and boxes, or no environment"
+                raise DrakeTeleopError(what, where="environment", remedy=remedy)
             _remove_contact_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Error control would make the steps depend on the displacements.
@@ -268,7 +273,9 @@ class _PeriodSimulator:
 
     def _apply_input_changes(self, u: Array) -> None:
         self._fix_input_port("master_device", "hand_wrench_E", self._hand + u[:6])
-        command = _displace_pose(self._pose, u[6:12])
+        rotation = vectors.quaternion_exponential(tuple(u[9:12]))
+        rotated = vectors.quaternion_product(rotation, self._pose[:4])
+        command = np.concatenate([rotated, self._pose[4:] + u[6:9]])
         self._fix_input_port("inverse_kinematics", "pose_command", command)
         self._fix_input_port("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
@@ -375,12 +382,6 @@ def _central_difference_jacobian(function: Callable[[Array], Array], steps: Arra
     return np.stack(columns, axis=1) / (2 * steps)
 
 
-def _displace_pose(pose: Array, change: Array) -> Array:
-    rotation = vectors.quaternion_exponential(tuple(change[3:]))
-    rotated = vectors.quaternion_product(rotation, pose[:4])
-    return np.concatenate([rotated, pose[4:] + change[:3]])
-
-
 def _pose_difference(pose: Array, other: Array) -> Array:
     inverse = vectors.conjugate_quaternion(tuple(other[:4]))
     rotation = vectors.quaternion_product(tuple(pose[:4]), inverse)
@@ -400,18 +401,11 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
         wrist_sensor=without_parts(scenario.wrist_sensor, *parts),
         master=scenario.master.without_coulomb_friction_and_encoder_steps(),
         slave__friction=[],
-        load_estimator__enabled=False,
+        load_estimator=LoadEstimatorConfig(),
+        contact_detection=None,
         # The closed form, if the arm has one, has no state.
         slave__inverse_kinematics=AUTOMATIC_IK_METHOD,
     )
-
-
-def _check_linear_environment(diagram: Diagram) -> None:
-    sensor = GetBlock(diagram, "wrist_sensor")
-    if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
-        what = f"this environment cannot be linearised: {beyond}"
-        remedy = "use only a sheet spring, a slot, walls and boxes, or no environment"
-        raise DrakeTeleopError(what, where="environment", remedy=remedy)
 
 
 def _remove_contact_friction(diagram: Diagram) -> None:

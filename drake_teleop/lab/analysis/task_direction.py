@@ -110,10 +110,14 @@ def task_direction(
 
 
 def check_can_press(scenario: Scenario) -> None:
-    """Raise DrakeTeleopError if the scale of the translation is 0."""
-    if scenario.kinematic_scaling.translation_scale == 0.0:
-        what, remedy = "is 0, so that the slave cannot press", "choose a scale above 0"
-        raise DrakeTeleopError(what, where="kinematic_scaling.translation_scale", remedy=remedy)
+    """Raise DrakeTeleopError for a translation or force scale of 0."""
+    for block, name, lack in (
+        ("kinematic_scaling", "translation_scale", "the slave cannot press"),
+        ("force_scaling", "force_scale", "the hand receives no force"),
+    ):
+        if getattr(getattr(scenario, block), name) == 0.0:
+            what, remedy = f"is 0, so that {lack}", "choose a scale above 0"
+            raise DrakeTeleopError(what, where=f"{block}.{name}", remedy=remedy)
 
 
 def _environment_stiffness(scenario: Scenario) -> float:

@@ -92,9 +92,9 @@ def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
 
 def power_scaled_matrices(H: Complex, axis: OneAxis) -> tuple[Complex, Complex]:
     """Return H and its scattering matrix S, with the slave's power scaled by `power_ratio`."""
-    ratio = power_ratio(axis)
+    references, ratio = reference_impedances(axis), power_ratio(axis)
     scaled = scale_slave_power(H, ratio) if ratio > 0 else H
-    return scaled, scattering_matrix(scaled, reference_impedances(axis))
+    return scaled, scattering_matrix(scaled, references)
 
 
 def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:

@@ -23,10 +23,12 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis.task_direction import check_can_press
 from drake_teleop.lab.comparison import one_dof, whole_station
 from drake_teleop.lab.comparison.one_dof import PERIOD_S, TAP_RATES_HZ, OneDof, RunMeasures, Task
+from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station import simulation
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.oscillation import high_pass_above_5_hz
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, step_addresses
 from drake_teleop.station.result import SimulationResult
@@ -63,8 +65,8 @@ def compare_command(
 ) -> dict[str, Any]:
     """Compare passivity methods (None: all); write summary, runs, report and pictures into `out`.
 
-    Rates, integrator and environment of the scenario are not used. Return the content of
-    summary.json (docs/delay-figures.md).
+    The scenario's rates, integrator, environment and load estimator are unused. Return the content
+    of summary.json (docs/delay-figures.md).
     """
     if unknown := [name for name in networks if name not in PRESETS]:
         remedy = suggest_name(unknown[0], tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
@@ -80,6 +82,10 @@ def compare_command(
         what = "method 'none' over network 'ideal' has no channel that measures energy"
         raise DrakeTeleopError(what, where="networks", remedy="remove the network or the method")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
+    for method in methods:  # else each of its runs would count as unstable
+        settings = Channel(network=networks[0]), PassivityConfig(method=method)
+        setup, _ = whole_station.press_scenario(base, *settings, "contact")
+        MakeTeleopStation(setup, load_estimate=true_load(base))
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
         limits = _run_longest_round_trip_study(methods, seed, jobs, stage)
@@ -140,7 +146,7 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment and contact detection, at the comparison's rates."""
+    """Return the scenario at the comparison's rates, without environment, detection, estimator."""
     given = LoadScenario(scenario).without_environment()
     check_can_press(given)
     return replace(
@@ -148,6 +154,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
         rates=_COMPARISON_RATES,
         contact_detection=None,
+        load_estimator=LoadEstimatorConfig(),  # contact would count as load
     )
 
 

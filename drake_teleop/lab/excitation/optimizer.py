@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.lab.excitation import limits
 from drake_teleop.lab.excitation.criteria import Criterion
@@ -51,6 +52,10 @@ class DesignProblem:
     def __init__(
         self, robot: Robot, criterion: Criterion, period_s: float, num_harmonics: int
     ) -> None:
+        if not (num_harmonics >= 2 and period_s > 0.0):
+            what = f"{num_harmonics} harmonics and a period of {period_s:g} s describe no motion"
+            remedy = "give 2 harmonics or more, and a period above 0 s"
+            raise DrakeTeleopError(what, where="excite", remedy=remedy)
         self._criterion, self._period_s, self._num_harmonics = criterion, period_s, num_harmonics
         self._table, self._limits, self._home = robot.arm.table, robot.limits, robot.home_posture
         free, samples = 2 * (num_harmonics - 1), _SAMPLES_PER_PERIOD_OF_TOP_HARMONIC * num_harmonics

@@ -46,9 +46,8 @@ def new_command(
     """
     scenario = folder / "station.yaml"
     if scenario.exists():
-        raise DrakeTeleopError(
-            "already exists", where=str(scenario), remedy="edit it, or give another folder"
-        )
+        remedy = "edit it, or give another folder"
+        raise DrakeTeleopError("already exists", where=str(scenario), remedy=remedy)
     for kind, name, known in (
         ("device", device, (PHANTOM_NAME, *FIGURES)),
         ("sensor", sensor, (None, *PRESETS)),

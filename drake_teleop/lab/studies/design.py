@@ -41,7 +41,7 @@ class Factor:
         """Return the listed values, or `levels` evenly spaced numbers from `low` to `high`."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
-        return self.values or self.words or self.flags or self.vectors
+        return list(map(float, self.values)) or self.words or self.flags or self.vectors
 
     def value_at_share(self, share: float) -> FactorValue:
         """Return the value at a share (0 to 1) of `low` to `high`, or of the listed values."""

@@ -91,7 +91,8 @@ def factor_levels(factor: Factor, column: Sequence[FactorValue], num_sections: i
     # The last indicator column depends on the others.
     middles = middles[:, : max(middles.shape[1] - 1, 1)]
     middles = (middles - middles.mean(axis=0))[present]
-    names = [_format_value(listed[k]) for k in present]
+    values = [listed[k] for k in present]
+    names = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
     return Levels(index, names, None, middles[index], middles)
 
 
@@ -277,7 +278,3 @@ def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
 
 def _student_quantile(num_intervals: int, degrees_of_freedom: int) -> float:
     return float(stdtrit(degrees_of_freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / num_intervals))
-
-
-def _format_value(value: FactorValue) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

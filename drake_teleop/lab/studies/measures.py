@@ -20,11 +20,6 @@ def _force_norms(result: SimulationResult, signal: str) -> Array:
     return np.linalg.norm(result[signal][:, :3], axis=1) if signal in result else np.zeros(1)
 
 
-def _work_of_hand_J(result: SimulationResult) -> float:
-    power = np.sum(result["hand_wrench_E"] * result["twist_master"], axis=1)
-    return float(np.trapezoid(power, result.t))
-
-
 def _seconds_with_force_above_threshold(result: SimulationResult, threshold: float) -> float:
     above = _force_norms(result, "force_to_master") > threshold
     return float(np.trapezoid(above.astype(float), result.t))
@@ -40,7 +35,9 @@ _MEASURE_FUNCTION_BY_NAME: dict[str, Callable[[SimulationResult, float], float]]
     # Largest true force between tool and environment.
     "peak_contact_force_N": lambda result, _: _force_norms(result, "true_contact_wrench_W").max(),
     # Work of the hand on the stylus: integral of F.v + tau.omega.
-    "hand_work_J": lambda result, _: _work_of_hand_J(result),
+    "hand_work_J": lambda result, _: np.trapezoid(
+        np.sum(result["hand_wrench_E"] * result["twist_master"], axis=1), result.t
+    ),
     # Time of a displayed force above the threshold.
     "time_above_force_s": _seconds_with_force_above_threshold,
 }

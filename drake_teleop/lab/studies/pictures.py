@@ -50,12 +50,10 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
         if len(varied_factors(study)) > 1:
             pictures |= {f"interactions_{m}": draw_interactions(study, rows, m) for m in measures}
     pictures["pareto"] = draw_pareto_front(study, rows)
-    written = []
-    for name, picture in pictures.items():
-        if picture is not None:
-            written.append(out / f"{name}.png")
-            write_picture(written[-1], picture, bbox_inches="tight")
-    return written
+    drawn = {out / f"{name}.png": picture for name, picture in pictures.items() if picture}
+    for path, picture in drawn.items():
+        write_picture(path, picture, bbox_inches="tight")
+    return list(drawn)
 
 
 def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:

@@ -92,11 +92,10 @@ def study_command(
     )
     scenario = scenarios.ScenarioFromData(data, where)
     files = [*scenario.slave.model_files(), *scenarios.referenced_files(scenario)]
-    packages = {"slave": {"package_paths": scenario.slave.package_paths}}
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
-            changed = _copy_with_changed_fields(packages, {factor.field: value})
+            changed = _copy_with_changed_fields(data, {factor.field: value})
             place = f"{path}:factors[{index}]"
             config = scenarios.settings_without_range_check(scenarios.Scenario, changed, place)
             check_all_field_values(config, place)

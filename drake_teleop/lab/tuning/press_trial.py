@@ -12,7 +12,7 @@ from scipy.fft import dct
 from scipy.optimize import bisect
 
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.lab.analysis.analyze import axis_with_grip, sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis
@@ -23,6 +23,7 @@ from drake_teleop.lab.comparison.whole_station import measures_of_press, press_s
 from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
@@ -101,6 +102,7 @@ class OperatingRange:
 
 def make_operating_range(hands: Sequence[str], walls: Sequence[float], task: str) -> OperatingRange:
     """Return the required operating range: these grips, walls [kN/m] and task."""
+    walls = [to_float("walls", wall) for wall in walls]
     _check_names_are_known("hands", hands, tuple(GRIP_IMPEDANCES))
     _check_names_are_known("task", [task], tuple(REQUIREMENTS_OF_TASK))
     for where, given, example in (("hands", hands, "light"), ("walls", walls, "0.5,20 (kN/m)")):
@@ -145,6 +147,7 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
         simulation=simulation,
         force_scaling=ForceScalingConfig(sigma=0.0, force_scale=force_scale),
         contact_detection=None,
+        load_estimator=LoadEstimatorConfig(),  # contact would count as load
         operator__intent=[],
         operator__task=None,
     )

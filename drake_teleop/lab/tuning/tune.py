@@ -87,7 +87,8 @@ def tune(
     shown = progress and not quiet
     with show_progress(shown) as stage:
         load = identified_load(base, stage)
-    of_trials = {name: getattr(base, name) for name in ("simulation", "operator", "channel")}
+    names = ("simulation", "operator", "channel", "load_estimator")
+    of_trials = {name: getattr(base, name) for name in names}
     own = replace(given, contact_detection=None, **of_trials)
     trial = StationPressTrial(own, base, stated, load.estimate)
     basis = {
@@ -325,13 +326,11 @@ def _tuning_result_sentences(
         f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
         f"at the tool; {instead}.",
     ]
-    fails = figures["fails_at"]
-    if fails is None:
-        last = (
-            f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
-            f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
-        )
-    else:
+    last = (
+        f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
+        f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
+    )
+    if fails := figures["fails_at"]:
         wall, factor = fails["wall_N_per_m"] / 1e3, fails["gamma_factor"]
         last = (
             f"The station fails with a {fails['hand']} grip at a wall of {wall:g} kN/m and gamma "
