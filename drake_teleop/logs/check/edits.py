@@ -152,9 +152,10 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
         text = f"the position is not in {pose.position.unit}"
         unit = "mm" if pose.position.unit == "m" else "m"
         yield _make_edit(description, "units", text, {"pose.position.unit": unit})
-    if imu is not None and imu.angular_velocity and imu.angular_velocity.unit == "rad/s":
-        fields: dict[str, Any] = {"imu.angular_velocity.unit": "deg/s"}
-        yield _make_edit(description, "degrees", "the gyroscope is in degrees", fields)
+    if imu is not None and imu.angular_velocity:
+        text = f"the gyroscope is not in {imu.angular_velocity.unit}"
+        unit = "deg/s" if imu.angular_velocity.unit == "rad/s" else "rad/s"
+        yield _make_edit(description, "degrees", text, {"imu.angular_velocity.unit": unit})
     columns: dict[str, Any] = {
         f"{stream}.{x}.columns": getattr(sensor, x).columns for x in ("force", "torque")
     }

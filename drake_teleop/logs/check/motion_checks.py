@@ -42,6 +42,7 @@ MIN_REPORTED_RELATIVE_GRAVITY_ERROR = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION, _ALPHA_COMPARISON_CUTOFF_HZ = 5.0, 5.0
 _MIN_ALPHA_CORRELATION, _MAX_UNSWAPPED_OVER_BEST_CORRELATION = 0.8, 0.5
 _GRAVITY_WINDOW_RANGE_S, _MIN_GRAVITY_WINDOWS, _MAX_GRAVITY_WINDOWS = (2.0, 8.0), 6, 60
+_GYRO_UNITS = "rad/s", "deg/s", "mdeg/s"
 _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0.05, 3.0
 
 
@@ -94,9 +95,14 @@ def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
 def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float) -> Edit | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
-    given = _relative_gravity_misfit(few, np.eye(3), gravity)
+    given, unit = _relative_gravity_misfit(few, np.eye(3), gravity), imu.angular_velocity.unit
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
+    scales = {x: SI_VALUE_OF_UNIT[x] / SI_VALUE_OF_UNIT[unit] * np.eye(3) for x in _GYRO_UNITS}
+    least, best_unit = min((_relative_gravity_misfit(few, P, gravity), x) for x, P in scales.items())
+    if _MIN_AXES_MISFIT_REDUCTION * least < given:
+        text = f"the rotation of gravity in S shows that the gyroscope is not in {unit}"
+        return _gyro_unit_edit(description, text, best_unit)
     misfits = ((_relative_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
     best, P = min(misfits, key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
@@ -110,6 +116,11 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
     finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
     return finding, edit_field(description, "imu.angular_velocity.columns", ordered)
+
+
+def _gyro_unit_edit(description: Description, text: str, unit: str) -> Edit:
+    line = "imu.angular_velocity.unit"
+    return Finding("degrees", f"{text}; set {line}: {unit}"), edit_field(description, line, unit)
 
 
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
@@ -223,11 +234,13 @@ def check_imu_against_pose(
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
-    least, most = SPEED_RATIO_RANGE_OF_DEGREES
-    if given.speed_ratio is not None and least < given.speed_ratio < most:
-        text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
-        findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
-        description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
+    gyro = None if description.imu is None else description.imu.angular_velocity
+    for unit in _GYRO_UNITS if gyro and given.speed_ratio else ():
+        least, most = np.array(_UNIT_MATCH_RANGE) * SI_VALUE_OF_UNIT[gyro.unit]
+        if unit != gyro.unit and least < given.speed_ratio * SI_VALUE_OF_UNIT[unit] < most:
+            text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose"
+            finding, description = _gyro_unit_edit(description, text, unit)
+            findings.append(finding)
     if given.is_mirrored:
         text = (
             "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"
