@@ -99,7 +99,9 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
     scales = {x: SI_VALUE_OF_UNIT[x] / SI_VALUE_OF_UNIT[unit] * np.eye(3) for x in _GYRO_UNITS}
-    least, best_unit = min((_relative_gravity_misfit(few, P, gravity), x) for x, P in scales.items())
+    least, best_unit = min(
+        (_relative_gravity_misfit(few, P, gravity), x) for x, P in scales.items()
+    )
     if _MIN_AXES_MISFIT_REDUCTION * least < given:
         text = f"the rotation of gravity in S shows that the gyroscope is not in {unit}"
         return _gyro_unit_edit(description, text, best_unit)
