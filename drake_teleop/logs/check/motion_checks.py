@@ -20,6 +20,7 @@ from drake_teleop.logs.check.edits import (
     LogTables,
     call_or_none_if_unreadable,
     edit_field,
+    make_edit,
     orientation_and_gravity_sign_edits,
 )
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -58,7 +59,7 @@ def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding]
         edit = _gyro_axes_edit(description, imu, log, gravity)
         if edit is None:
             axes = _angular_acceleration_axes_finding(imu, log)
-            finding = axes or _gravity_magnitude_finding(imu, log, gravity)
+            finding = axes or _gravity_magnitude_finding(imu, log, description.gravity_W)
     finding, description = edit or (finding, description)
     return ([] if finding is None else [finding]), description
 
@@ -80,9 +81,8 @@ def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | Non
     ):
         if least < wrong < most and getattr(imu, quantity).unit == unit:
             text = f"the angular acceleration is {ratio:.3g} times the derivative of the angular"
-            line = f"imu.{quantity}.unit"
-            finding = Finding("degrees", f"{text} velocity; set {line}: {other}")
-            return finding, edit_field(description, line, other)
+            fields = {f"imu.{quantity}.unit": other}
+            return make_edit(description, "degrees", f"{text} velocity", fields)
     return None
 
 
@@ -104,7 +104,7 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     )
     if _MIN_AXES_MISFIT_REDUCTION * least < given:
         text = f"the rotation of gravity in S shows that the gyroscope is not in {unit}"
-        return _gyro_unit_edit(description, text, best_unit)
+        return make_edit(description, "degrees", text, {"imu.angular_velocity.unit": best_unit})
     misfits = ((_relative_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
     best, P = min(misfits, key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
@@ -118,11 +118,6 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
     finding = Finding("swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}")
     return finding, edit_field(description, "imu.angular_velocity.columns", ordered)
-
-
-def _gyro_unit_edit(description: Description, text: str, unit: str) -> Edit:
-    line = "imu.angular_velocity.unit"
-    return Finding("degrees", f"{text}; set {line}: {unit}"), edit_field(description, line, unit)
 
 
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
@@ -174,7 +169,8 @@ def _relative_gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> floa
     return float(np.sqrt(np.mean(off**2) + np.mean(np.sum((means[1] - means[0]) ** 2, axis=1))))
 
 
-def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
+def _gravity_magnitude_finding(imu: Imu, log: Log, gravity_W: Array) -> Finding | None:
+    gravity = float(np.linalg.norm(gravity_W))
     forces = _mean_specific_forces_in_start_axes(log, np.eye(3))[0]
     if len(forces) < _MIN_GRAVITY_WINDOWS:
         return None
@@ -190,7 +186,8 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
     measured_gravity = ratio * gravity
     remedy = f"divide the columns of imu.specific_force by {ratio:.4f}, or calibrate them"
     if imu.specific_force.unit not in ("g", "mg") and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
-        remedy = f"set gravity: {measured_gravity:.4g}"
+        vector = [float(f"{ratio * x:.4g}") for x in gravity_W]
+        remedy = f"set gravity: {vector if vector[:2] != [0, 0] or vector[2] > 0 else -vector[2]}"
     return Finding(
         "gravity",
         f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
@@ -241,7 +238,8 @@ def check_imu_against_pose(
         least, most = np.array(_UNIT_MATCH_RANGE) * SI_VALUE_OF_UNIT[gyro.unit]
         if unit != gyro.unit and least < given.speed_ratio * SI_VALUE_OF_UNIT[unit] < most:
             text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose"
-            finding, description = _gyro_unit_edit(description, text, unit)
+            fields = {"imu.angular_velocity.unit": unit}
+            finding, description = make_edit(description, "degrees", text, fields)
             findings.append(finding)
     if given.is_mirrored:
         text = (
