@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 
@@ -52,20 +54,16 @@ def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding]
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
-    edit = _angle_unit_edit(description, imu, log)
-    finding = None
+    edit, finding = _angle_unit_edit(description, imu, log), None
     if edit is None and imu.specific_force is not None and imu.frame != "base":
-        gravity = float(np.linalg.norm(description.gravity_W))
-        edit = _gyro_axes_edit(description, imu, log, gravity)
-        if edit is None:
-            axes = _angular_acceleration_axes_finding(imu, log)
-            finding = axes or _gravity_magnitude_finding(imu, log, description.gravity_W)
+        edit = _gyro_axes_edit(description, imu, log)
+        if edit is None and (finding := _angular_acceleration_axes_finding(imu, log)) is None:
+            finding = _gravity_magnitude_finding(imu, log, description.gravity_W)
     finding, description = edit or (finding, description)
-    return ([] if finding is None else [finding]), description
+    return ([finding] if finding else []), description
 
 
 def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | None:
-    assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
     given_alpha, derived_alpha = _given_and_derived_alpha(log)
@@ -92,21 +90,19 @@ def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
     return given, low_pass(rate, log.dt, _ALPHA_COMPARISON_CUTOFF_HZ)
 
 
-def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float) -> Edit | None:
+def _gyro_axes_edit(description: Description, imu: Imu, log: Log) -> Edit | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
-    given, unit = _relative_gravity_misfit(few, np.eye(3), gravity), imu.angular_velocity.unit
+    misfit = partial(_relative_gravity_misfit, few, float(np.linalg.norm(description.gravity_W)))
+    given, unit = misfit(np.eye(3)), imu.angular_velocity.unit
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
     scales = {x: SI_VALUE_OF_UNIT[x] / SI_VALUE_OF_UNIT[unit] * np.eye(3) for x in _GYRO_UNITS}
-    least, best_unit = min(
-        (_relative_gravity_misfit(few, P, gravity), x) for x, P in scales.items()
-    )
+    least, best_unit = min((misfit(P), x) for x, P in scales.items())
     if _MIN_AXES_MISFIT_REDUCTION * least < given:
         text = f"the rotation of gravity in S shows that the gyroscope is not in {unit}"
         return make_edit(description, "degrees", text, {"imu.angular_velocity.unit": best_unit})
-    misfits = ((_relative_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
-    best, P = min(misfits, key=lambda entry: entry[0])
+    best, P = min(((misfit(P), P) for P in signed_permutations()), key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
     text = "the axes of the gyroscope are not those of the accelerometer"
@@ -161,7 +157,7 @@ def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
     return means
 
 
-def _relative_gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> float:
+def _relative_gravity_misfit(log: Log, gravity: float, gyro_axes: Array) -> float:
     means = _mean_specific_forces_in_start_axes(log, gyro_axes) / gravity
     if means.shape[1] == 0:
         return np.nan
@@ -233,11 +229,12 @@ def check_imu_against_pose(
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
-    gyro = None if description.imu is None else description.imu.angular_velocity
-    for unit in _GYRO_UNITS if gyro and given.speed_ratio else ():
+    gyro: Any = getattr(description.imu, "angular_velocity", None)
+    ratio = given.speed_ratio or 0.0
+    for unit in _GYRO_UNITS if gyro else ():
         least, most = np.array(_UNIT_MATCH_RANGE) * SI_VALUE_OF_UNIT[gyro.unit]
-        if unit != gyro.unit and least < given.speed_ratio * SI_VALUE_OF_UNIT[unit] < most:
-            text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose"
+        if unit != gyro.unit and least < ratio * SI_VALUE_OF_UNIT[unit] < most:
+            text = f"the gyroscope reads {ratio:.3g} times the speed of the pose"
             fields = {"imu.angular_velocity.unit": unit}
             finding, description = make_edit(description, "degrees", text, fields)
             findings.append(finding)

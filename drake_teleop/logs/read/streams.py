@@ -51,16 +51,15 @@ class Stream:
 
 
 def check_that_no_rows_are_lost(values: Array, table: Table, where: str) -> None:
-    """Raise an error for rows of zeros between distant values, which drivers write for a loss."""
+    # Drivers write zeros for lost readings.
     sizes = np.linalg.norm(values, axis=1)
-    runs = find_runs_of_true(sizes == 0.0)
-    inside = (runs[:, 0] > 0) & (runs[:, 1] < len(sizes))
-    runs = runs[inside & (np.ptp(runs, axis=1) <= _MAX_SUCCESSIVE_LOST_ROWS)]
-    if not len(runs):
+    runs, padded = find_runs_of_true(sizes == 0.0), np.append(sizes, 0.0)
+    beside = np.minimum(padded[runs[:, 0] - 1], padded[runs[:, 1]])
+    if not beside.any():
         return
     steps = np.linalg.norm(np.diff(values[sizes > 0.0], axis=0), axis=1)
     least = max(_MIN_JUMP_OVER_STEP * np.quantile(steps, 0.99), _MIN_JUMP_OVER_SIZE * sizes.mean())
-    lost = runs[np.minimum(sizes[runs[:, 0] - 1], sizes[runs[:, 1]]) > least]
+    lost = runs[(beside > least) & (np.ptp(runs, axis=1) <= _MAX_SUCCESSIVE_LOST_ROWS)]
     if (count := int(np.ptp(lost, axis=1).sum())) > _MIN_LOST_ROW_SHARE * len(sizes):
         row = table.line_in_file(int(lost[0, 0]))
         what = f"{count} rows of zeros between other values, the first is row {row}: lost readings"
