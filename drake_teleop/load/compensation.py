@@ -19,17 +19,12 @@ def scaled_wrench_into(
     """Write `scaled_wrench` (6,), with equal scales of weight and inertia, to `out`."""
     a, b = sigma_gr - gamma, sigma_obj - gamma
     phi = (
-        a * phi_gripper[0] + b * phi_object[0],
-        a * phi_gripper[1] + b * phi_object[1],
-        a * phi_gripper[2] + b * phi_object[2],
-        a * phi_gripper[3] + b * phi_object[3],
-        a * phi_gripper[4] + b * phi_object[4],
-        a * phi_gripper[5] + b * phi_object[5],
-        a * phi_gripper[6] + b * phi_object[6],
-        a * phi_gripper[7] + b * phi_object[7],
-        a * phi_gripper[8] + b * phi_object[8],
-        a * phi_gripper[9] + b * phi_object[9],
-    )
+        a * phi_gripper[0] + b * phi_object[0], a * phi_gripper[1] + b * phi_object[1],
+        a * phi_gripper[2] + b * phi_object[2], a * phi_gripper[3] + b * phi_object[3],
+        a * phi_gripper[4] + b * phi_object[4], a * phi_gripper[5] + b * phi_object[5],
+        a * phi_gripper[6] + b * phi_object[6], a * phi_gripper[7] + b * phi_object[7],
+        a * phi_gripper[8] + b * phi_object[8], a * phi_gripper[9] + b * phi_object[9],
+    )  # fmt: skip
     force, torque = wrench_of_load(s, omega, alpha, phi)
     contact_force = minus(vector_at(wrench, 0), vector_at(offsets, 0))
     contact_torque = minus(vector_at(wrench, 3), vector_at(offsets, 3))

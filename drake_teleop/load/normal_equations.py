@@ -150,9 +150,7 @@ class SecondMoments:
         covariance = mark_undetermined(covariance, undetermined)
         degrees[undetermined] = np.inf
         return Identification(
-            phi=theta[6:],
-            offsets=theta[:6],
-            covariance=covariance,
+            *(theta[6:], theta[:6], covariance),
             identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
             delay_s=float(finite_array("delay_s", delay_s)),
@@ -429,12 +427,8 @@ def _add_sample_products(wrench, s, omega, alpha, weights, sums, blocks, state):
                 blocks[b] = blocks[2 * b] + blocks[2 * b + 1]
             blocks[last:] = 0.0
         filled += 1
-        z[0] = 1.0
-        for k in range(6):
-            z[1 + k] = wrench[i, k]
+        z[0], z[1:7], z[7:10], z[10:13] = 1.0, wrench[i], s[i], alpha[i]
         for k in range(3):
-            z[7 + k] = s[i, k]
-            z[10 + k] = alpha[i, k]
             z[13 + k] = omega[i, k] * omega[i, k]
         z[16] = omega[i, 0] * omega[i, 1]
         z[17] = omega[i, 0] * omega[i, 2]

@@ -89,12 +89,16 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     for k in range(3):
         rows[4:, 1 + k] = -(2.0 * c[k] * E - (np.outer(E[k], c) + np.outer(c, E[k])))[upper]
     rows[4:, 4:] = np.eye(6)
-    # Lower bound, because a poorly determined inertia can have any estimate.
-    scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
+    scale = _inertia_scale(m, c, inertia)
     parts = {"mass": (rows[:1], 1.0), "com": (rows[1:4], 1.0), "inertia": (rows[4:], scale)}
     required = [(*parts[x], getattr(tolerance, x)) for x in tolerance.required_quantity_names]
     out = np.concatenate([part / (size * limit) for part, size, limit in required])
     return np.hstack([np.zeros((len(out), 6)), out])
+
+
+def _inertia_scale(m: float, c: Array, inertia_com: Array) -> float:
+    # Lower bound, because a poorly determined inertia can have any estimate.
+    return max(float(np.trace(inertia_com)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
 
 
 def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
@@ -115,8 +119,8 @@ def display_values_of_required_entries(tolerance: Tolerance, phi: Array) -> Arra
 
 def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
     """Return the tolerances (k,), made absolute for load phi [kg, mm, kg m^2]."""
-    m, _, inertia = mass_com_inertia(phi)
-    scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
+    m, c, inertia = mass_com_inertia(phi)
+    scales = {"mass": abs(m), "com": 1e3, "inertia": _inertia_scale(m, c, inertia)}
     names = tolerance.required_quantity_names
     sizes = [scales[name] * getattr(tolerance, name) for name in names]
     return np.repeat(sizes, [len(ENTRY_NAMES_OF_QUANTITY[name]) for name in names])

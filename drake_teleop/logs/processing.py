@@ -282,8 +282,8 @@ def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
     why = explained_log.explain_log(log, delay_s, None)
     if why is None or not (why.is_misfit and why.is_residual_large):
         return None
-    correctable = [x for x in why.causes if x.name not in CAUSES_WITHOUT_CORRECTION]
-    return why if correctable and not _clock_rate_causes(why) else None
+    useful = not why.causes or any(x.name not in CAUSES_WITHOUT_CORRECTION for x in why.causes)
+    return why if useful and not _clock_rate_causes(why) else None
 
 
 def _may_sensor_be_nonlinear(raw: Log, why: MisfitExplanation) -> bool:

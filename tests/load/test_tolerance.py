@@ -67,3 +67,17 @@ def test_values_of_undetermined_parameters_have_infinite_deviations() -> None:
         )
     )
     np.testing.assert_array_equal(known, [True] * 4 + [False] + [True] * 5)
+
+
+@pytest.mark.parametrize("inertia", [INERTIA, 1e-9 * INERTIA, np.zeros((3, 3)), -INERTIA])
+@pytest.mark.parametrize("mass", [3.1, -0.2])
+def test_shown_tolerances_are_those_that_the_deviations_are_compared_with(
+    inertia: np.ndarray, mass: float
+) -> None:
+    tolerance, phi = parse_tolerance(ALL), phi_from_mass_com_inertia(mass, [0.02, 0, 0.1], inertia)
+    covariance = np.diag(np.linspace(1e-6, 2e-6, 16))
+    relative = deviations_over_tolerances(derivatives_over_tolerances(tolerance, phi), covariance)
+    step, shown = 1e-6, partial(display_values_of_required_entries, tolerance)
+    slopes = [(shown(phi + x) - shown(phi - x)) / (2.0 * step) for x in step * np.eye(10)]
+    expected = np.sqrt(np.square(slopes).T @ np.diag(covariance)[6:])
+    assert relative * tolerances_in_display_units(tolerance, phi) == pytest.approx(expected, 1e-4)

@@ -13,7 +13,12 @@ from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import fit_candidates
 from drake_teleop.logs.causes.cause import loads_between_changes, name_misfit_causes
-from drake_teleop.logs.causes.changes import find_contact_spans, fit_steps_at_middle_of_ramps
+from drake_teleop.logs.causes.changes import (
+    add_step_change,
+    find_contact_spans,
+    fit_steps_at_middle_of_ramps,
+    replace_steps_by_contact,
+)
 from drake_teleop.logs.causes.explain import _refit_with_delay_removed
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
@@ -211,3 +216,20 @@ def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) ->
         )
         == ()
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [0.06, -0.06])
+def test_steps_at_the_ends_of_a_record_are_no_changes(at: float) -> None:
+    """A few samples determine no offsets, and the rest of the record is no contact."""
+    s, omega, alpha, *_ = moving(T)
+    wrench = non_contact_wrench(s, np.roll(omega, 25, axis=0), alpha, PHI) + OFFSETS
+    step = T[0] + at if at > 0.0 else T[-1] + at
+    wrench += (step < T)[:, None] * np.array([30.0, -5.0, -7.0, 1.0, 3.0, 0.7])
+    wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
+    plain = FittedModel.fit_record(record(wrench), LoadModel())
+    found = add_step_change(plain, "offsets")
+    assert all(T[0] + 0.2 < time < T[-1] - 0.2 for time in (found or plain).model.step_times)
+    state = FittedModel.fit_record(plain.data, LoadModel(steps=(StepChange("offsets", step),)))
+    for span in replace_steps_by_contact(state).contact_spans:
+        assert span[1] - span[0] < 0.5 * (T[-1] - T[0])

@@ -56,8 +56,9 @@ def test_units_are_drafted_and_read(
 
 @pytest.mark.parametrize(("unit", "is_set"), [("m/s^2", True), ("mm/s^2", True), ("mg", False)])
 @pytest.mark.parametrize("gravity", [9.4, 10.3])
+@pytest.mark.parametrize("direction", [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.6, 0.8, 0.0]])
 def test_gravity_is_proposed_only_for_units_without_it(
-    tmp_path: Path, unit: str, is_set: bool, gravity: float
+    tmp_path: Path, unit: str, is_set: bool, gravity: float, direction: list[float]
 ) -> None:
     """The units g and mg change with the described gravity, so that it cannot correct them."""
     size = 1e3 * 9.80665 / gravity if unit == "mg" else SI_VALUE_OF_UNIT[unit] ** -1 * 9.80665
@@ -69,10 +70,11 @@ def test_gravity_is_proposed_only_for_units_without_it(
     imu = {"specific_force": fields["a"] | {"unit": unit}, "angular_velocity": fields["w"]}
     wrench = {"force": fields["f"], "torque": fields["m"]}
     description = Description.model_validate(
-        {"gravity": gravity, "wrench": file | wrench, "imu": file | imu}
+        {"gravity": [gravity * x for x in direction], "wrench": file | wrench, "imu": file | imu}
     )
     tables = {tmp_path / "x.csv": Table(tmp_path / "x.csv", values)}
     log = read_described_log(description, "x", tables=tables)
     (finding,), _ = check_imu_signals(description, log)
-    assert ("set gravity: 9.807" in finding.message) == is_set
+    vector = {-1.0: 9.807, 1.0: [0.0, 0.0, 9.807], 0.0: [5.884, 7.845, 0.0]}[direction[2]]
+    assert finding.message.endswith(f"set gravity: {vector}") == is_set
     assert ("divide the columns" in finding.message) != is_set

@@ -28,6 +28,7 @@ from drake_teleop.logs.check.motion_checks import (
 from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS, Log
 from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
 Columns = dict[str, np.ndarray]
@@ -165,6 +166,22 @@ def test_unit_of_the_wrong_rate_is_named(omega: float, alpha: float, unit: str, 
     (finding,), corrected = check_imu_signals(description, log)
     assert finding.name == "degrees" and finding.message.endswith(line)
     assert corrected != description
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
+@pytest.mark.parametrize("true", ["rad/s", "deg/s", "mdeg/s"])
+def test_unit_of_the_gyroscope_follows_from_gravity_or_pose(unit: str, true: str) -> None:
+    at = motion_at(np.arange(0.0, 12.0, 0.01))
+    omega = at.omega / SI_VALUE_OF_UNIT[true]
+    description, data = imu_and_pose(np.eye(3), angular_velocity=omega)
+    description = edit_field(description, "imu.angular_velocity.unit", unit)
+    of_imu = check_imu_signals(description, data.read_thinned_log(description))
+    of_pose = check_imu_against_pose(description, data)
+    for found, corrected in (of_imu, (of_pose[0], of_pose[2])):
+        lines = [x.message.partition("; set ")[2] for x in found]
+        assert lines == ([] if unit == true else [f"imu.angular_velocity.unit: {true}"])
+        assert corrected.imu is not None and corrected.imu.angular_velocity is not None
+        assert corrected.imu.angular_velocity.unit == true
 
 
 def imu_and_pose(frame: np.ndarray, **changed: np.ndarray) -> tuple[Description, LogTables]:

@@ -24,6 +24,8 @@ from drake_teleop.logs.read.canonical import (
     write_log,
 )
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.streams import check_that_no_rows_are_lost
+from drake_teleop.logs.read.tables import Table
 
 T = np.arange(0, 3, 0.002)
 TURNED = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])
@@ -481,6 +483,37 @@ def test_log_with_impossible_values_raises_error(changes: dict[str, Any], words:
     }
     with pytest.raises(DrakeTeleopError, match=words):
         Log(**good | changes)
+
+
+@pytest.mark.parametrize("columns", [WRENCH_COLUMNS, WRENCH_COLUMNS[:3], SPECIFIC_FORCE_COLUMNS])
+@pytest.mark.parametrize(("spacing", "length"), [(20, 1), (301, 1), (400, 19)])
+def test_rows_of_zeros_between_other_values_are_lost_readings(
+    tmp_path: Path, columns: tuple[str, ...], spacing: int, length: int
+) -> None:
+    table, row = canonical("s", "omega"), np.arange(len(T))
+    lost = (row % spacing < length) & (row >= spacing)
+    zero = [pl.when(pl.Series(lost)).then(0.0).otherwise(pl.col(x)).alias(x) for x in columns]
+    path = tmp_path / "log.csv"
+    table.with_columns(zero).write_csv(path)
+    said = f"{lost.sum()} rows of zeros between other values, the first is row {spacing + 2}: "
+    with pytest.raises(DrakeTeleopError, match=said):
+        read_log(path)
+    table.filter(pl.Series(~lost)).write_csv(path)
+    read_log(path)
+
+
+@pytest.mark.parametrize("kind", ["starts at zero", "crosses zero", "dead band", "contact", "few"])
+def test_measured_zeros_are_no_lost_readings(kind: str) -> None:
+    t = np.arange(0.0, 4.0, 0.002)
+    x = np.stack([np.sin(3.0 * t), np.sin(3.0 * t), 2.0 * np.sin(3.0 * t)], axis=1)
+    values = {
+        "starts at zero": np.where(t[:, None] < 0.02, 0.0, x + 3.0),
+        "crosses zero": np.round(x, 2),
+        "dead band": np.where(np.abs(x) < 0.05, 0.0, x),
+        "contact": np.where(np.sin(40.0 * t)[:, None] > 0.0, 0.0, np.abs(x)),
+        "few": np.where(np.isin(np.arange(len(t)), [300, 900])[:, None], 0.0, x + 3.0),
+    }[kind]
+    check_that_no_rows_are_lost(values, Table(Path("x.csv"), {}), "force")
 
 
 def test_ur5_gyroscope_agrees_with_the_pose(ur5: Path, tmp_path: Path) -> None:

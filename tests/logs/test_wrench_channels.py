@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from planted import Columns, written
 from scipy.spatial.transform import Rotation
 from test_sensor_filter import record
@@ -110,3 +111,22 @@ def test_nothing_is_identified_with_a_saturated_gyroscope_beside_poses(
     identified = identify_log(written(tmp_path, columns))
     assert identified.findings
     assert not identified.identification.identifiable[6:].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("unit", "rotated"), [("deg/s", False), ("rad/s", True)])
+def test_nothing_is_identified_with_a_wrong_gyroscope_beside_poses(
+    tmp_path: Path, unit: str, rotated: bool
+) -> None:
+    columns = record(None)
+    if rotated:
+        columns = turn_into_base_axes(columns, "omega")
+    path = written(tmp_path, columns)
+    document = yaml.safe_load(path.read_text())
+    document["imu"]["angular_velocity"]["unit"] = unit
+    path.write_text(yaml.safe_dump(document))
+    identified = identify_log(path)
+    assert identified.findings
+    found = ["imu.angular_velocity.unit: rad/s" in x.message for x in identified.findings]
+    assert any(found) != rotated
+    assert not identified.identification.identifiable.any()

@@ -95,11 +95,9 @@ def _solve_noise_compensated_equations(
     gram_basis = gram @ basis[:, kept]
     variance = np.sum(basis**2, axis=1)
     return SolvedNormalEquations(
-        gram=(gram_basis * remaining[kept]) @ gram_basis.T,
-        right=gram_basis @ (basis[:, kept].T @ right),
-        theta=theta,
-        weights=W,
-        noise_scale=scale,
+        (gram_basis * remaining[kept]) @ gram_basis.T,
+        gram_basis @ (basis[:, kept].T @ right),
+        *(theta, W, scale),
         map_from_ordinary=inverse @ gram,
         is_undetermined=np.sum(basis[:, ~kept] ** 2, axis=1) > 0.5 * variance,
     )

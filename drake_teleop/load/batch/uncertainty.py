@@ -92,21 +92,16 @@ class BaseParameters:
         if self.parameters_without_influence:
             names = ", ".join(self.parameters_without_influence)
             lines.append(f"parameters without influence on this record: {names}")
-        several = (c for c in self.combinations if np.count_nonzero(c.coefficients) > 1)
-        lines += [f"determined only in combination: {c}" for c in several]
+        sums = (c for c in self.combinations if np.count_nonzero(c.coefficients) > 1)
+        lines += [f"determined only in combination: {c}" for c in sums]
         for c in self.weak_directions:
-            if (
-                np.count_nonzero(c.coefficients) == 1
-                or c.relative_std > identification.MAX_IDENTIFIED_SCALED_STD
-            ):
-                percent = 100.0 * c.relative_std
-                share = f"{percent:.0f} % of" if percent < 100.0 else "more than"
-                lines.append(
-                    f"weak: {c} (+- is {share} the typical size for this load); rotate the load"
-                    " further and faster, about more axes"
-                )
-            else:
-                lines.append(f"identified only as a combination: {c}")
+            percent = 100.0 * c.relative_std
+            share = f"{percent:.0f} % of" if percent < 100.0 else "more than"
+            text = f"weak: {c} (+- is {share} the typical size for this load); rotate the load"
+            text += " further and faster, about more axes"
+            precise = c.relative_std <= identification.MAX_IDENTIFIED_SCALED_STD
+            several = np.count_nonzero(c.coefficients) > 1
+            lines.append(f"identified only as a combination: {c}" if several and precise else text)
         if self.channels_with_slow_noise:
             names = ", ".join(self.channels_with_slow_noise)
             lines.append(

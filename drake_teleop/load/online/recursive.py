@@ -196,9 +196,7 @@ class RecursiveEstimator(ABC):
         covariance = self.covariance
         deviations = np.sqrt(np.diag(covariance))
         return Identification(
-            phi=self.phi,
-            offsets=self.offsets,
-            covariance=covariance,
+            *(self.phi, self.offsets, covariance),
             identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_SCALED_STD),
             condition_number=self._condition_number(),
             delay_s=0.0,

@@ -13,6 +13,7 @@ from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
 from drake_teleop.logs.causes.model import LoadModel, StepChange
 from drake_teleop.logs.causes.state import (
+    MIN_ROWS_FOR_AUTOREGRESSION,
     FittedModel,
     TimeSpans,
     is_in_time_spans,
@@ -49,7 +50,8 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
     scan = _StepTimeScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
     gains = np.array([scan.score_statistic_of_step_at_row(int(n)) for n in starts])
-    for time in state.model.step_times:
+    others = (*state.model.step_times, float(data.t[0]), float(data.t[-1]))
+    for time in others:
         gains[np.abs(data.t[starts] - time) < _MIN_TIME_BETWEEN_STEPS_S] = 0.0
     out: list[float] = []
     for _ in range(_NUM_TRIED_STEP_TIMES):
@@ -58,7 +60,7 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
         time = float(data.t[max(near, key=scan.score_statistic_of_step_at_row)]) - 0.5 * data.dt
-        if all(abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in state.model.step_times):
+        if all(abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in others):
             out.append(time)
         distance = max(2.0 * _MIN_TIME_BETWEEN_STEPS_S, 3.0 * rows * data.dt)
         gains[np.abs(data.t[starts] - time) < distance] = 0.0
@@ -187,7 +189,9 @@ def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> F
 
 def _is_step_significant(state: FittedModel, i: int) -> bool:
     values, covariance = state.parameters_of_extension(f"step {i}")
-    deviations = np.sqrt(np.diag(covariance))
+    deviations, t, time = np.sqrt(np.diag(covariance)), state.data.t, state.model.steps[i].time
+    if min(time - t[0], t[-1] - time) < 0.5 * _MIN_TIME_BETWEEN_STEPS_S:
+        return False  # the few samples before or after it do not determine the change
     if state.model.steps[i].kind == "offsets":
         clear = np.abs(values) > _MIN_STEP_OVER_DEVIATION * deviations
         large = np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise
@@ -365,6 +369,9 @@ def replace_steps_by_contact(state: FittedModel) -> FittedModel:
             continue
         span = start - state.data.dt, stop + state.data.dt
         spans = (*state.contact_spans, span)
+        left = state.data.used & ~is_in_time_spans(state.data, spans)
+        if left.sum() < MIN_ROWS_FOR_AUTOREGRESSION:
+            continue
         if len(ends) == 2 and _do_offset_steps_cancel(state, i, j):
             return _refit_without_steps(state, ends, spans)
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:

@@ -129,17 +129,14 @@ def _search_causes_from(
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]
         winner = _most_plausible_of_best_candidates(effective)
         calmest = _candidate_with_much_smaller_residual(state, rejected)
-        if winner is None or (
-            calmest is not None
-            and calmest.name != "contact"
-            and _has_much_smaller_residual_than(calmest.state, winner.state)
-        ):
+        calm = calmest if calmest is not None and calmest.name != "contact" else None
+        if winner is None or (calm and _has_much_smaller_residual_than(calm.state, winner.state)):
             winner = calmest
         if winner is None:
             limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
             contacts = (x.state for x in rejected if x.name == "contact")
-            calm = next((x for x in contacts if x.residual_ratio < limit), None)
-            explained = None if calm is None else changes.replace_contacts_by_steps(calm)
+            touched = next((x for x in contacts if x.residual_ratio < limit), None)
+            explained = None if touched is None else changes.replace_contacts_by_steps(touched)
             if explained is None:
                 break
             state, delay_s = _refit_with_delay_removed(explained, delay_s, means_at)
@@ -282,10 +279,7 @@ def explain_misfit(
         if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _findings_if_load_is_absent(state, covariance)
         return MisfitExplanation(
-            causes=tuple(causes),
-            explained=only_noise,
-            theta=state.x[OFFSETS_AND_LOAD],
-            covariance=covariance,
+            *(tuple(causes), only_noise, state.x[OFFSETS_AND_LOAD], covariance),
             misfit_deviations=deviations_of_load_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(cause.loads_between_changes(state, covariance)),

@@ -14,7 +14,7 @@ from drake_teleop.logs.causes import instants
 from drake_teleop.logs.causes.instants import BlockMeans
 from drake_teleop.logs.causes.model import SYMMETRIC_MATRIX_INDICES, LoadModel
 
-_MIN_ROWS_FOR_AUTOREGRESSION = 50
+MIN_ROWS_FOR_AUTOREGRESSION = 50
 TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
 
 
@@ -71,7 +71,7 @@ class UsedRows:
         history = np.stack([e[now - d] for d in range(instants.MAX_NOISE_LAG + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(now), 1)
-        if is_white or len(now) < _MIN_ROWS_FOR_AUTOREGRESSION:
+        if is_white or len(now) < MIN_ROWS_FOR_AUTOREGRESSION:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(instants.MAX_NOISE_LAG)
         inner += 1e-300 * np.eye(instants.MAX_NOISE_LAG)

@@ -95,8 +95,7 @@ def _low_passed_samples(log: Log) -> _LowPassedSamples:
         (s, omega, alpha),
         gravity if "weight" in log.estimated else None,
         cutoff,
-        log.dt,
-        float(log.t[-1] - log.t[0]),
+        *(log.dt, float(log.t[-1] - log.t[0])),
         white_noise_deviations(log.wrench),
     )
 
@@ -328,15 +327,11 @@ def lag_findings(description: Description, delay: float | None) -> list[Finding]
     side = "behind" if delay > 0 else "ahead of"
     if abs(delay) > edits.MIN_LAG_OF_WRONG_CLOCK_S:
         offset = description.wrench.time.offset + delay
-        text = (
-            f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong; set"
-            f" wrench.time.offset: {offset:.3f} (or shift the other streams by the opposite)"
-        )
+        text = f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong; set"
+        text += f" wrench.time.offset: {offset:.3f} (or shift the other streams by the opposite)"
         return [Finding("clock", text)]
-    text = (
-        f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify corrects"
-        f" this. To state it in the description, add {delay:.4f} to wrench.time.offset"
-    )
+    text = f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify corrects"
+    text += f" this. To state it in the description, add {delay:.4f} to wrench.time.offset"
     return [Finding("lag", text)]
 
 

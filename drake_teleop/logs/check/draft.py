@@ -235,9 +235,7 @@ def _remove_trailing_number(name: str) -> str:
 
 
 def _is_not_measured(name: str) -> bool:
-    return (
-        re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name) is not None
-    )
+    return bool(re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name))
 
 
 def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
@@ -380,10 +378,8 @@ def _draft_quantity(
         return group | ({"unit": fitting[0]} if fitting else {"scale": _FILL_IN_TEXT})
     if kind == "angular_velocity" and np.nanmax(size) > _MAX_GYRO_RATE_DEG_S:
         return group | {"unit": "mdeg/s"}
-    usual, other, limit = {
-        "angular_velocity": ("rad/s", "deg/s", 15),
-        "position": ("m", "mm", 20),
-    }.get(kind, ("rad", "deg", 15))
+    units = {"angular_velocity": ("rad/s", "deg/s", 15), "position": ("m", "mm", 20)}
+    usual, other, limit = units.get(kind, ("rad", "deg", 15))
     return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 

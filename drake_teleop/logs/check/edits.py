@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import permutations, product
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ def edit_field(description: Description, path: str, value: Any) -> Description:
     return description.model_copy(update={first: value})
 
 
-def _make_edit(
+def make_edit(
     description: Description, name: str, text: str, fields: dict[str, Any], note: str = ""
 ) -> Edit:
     shown = {path: str(x).lower() if isinstance(x, bool) else x for path, x in fields.items()}
@@ -77,7 +78,7 @@ def correct_accelerometer_unit(
         text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in {sensor.unit}"
         for unit in ("m/s^2", "g", "mg", "mm/s^2"):
             if unit != sensor.unit and 0.7 < read * description.unit_in_si(unit) < 1.43:
-                finding, edited = _make_edit(description, "units", text, {f"{path}.unit": unit})
+                finding, edited = make_edit(description, "units", text, {f"{path}.unit": unit})
                 return [finding], edited
         if not _MIN_MEDIAN_OVER_GRAVITY < ratio < _MAX_MEDIAN_OVER_GRAVITY:
             remedy = f"correct {path}.scale or unit; a reading without gravity cannot be used"
@@ -88,12 +89,12 @@ def correct_accelerometer_unit(
 
 def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edit]:
     """Yield edits of a description: other forms of the orientation, opposite sign of gravity."""
-    pose, imu = description.pose, description.imu
+    pose, imu, edit = description.pose, description.imu, partial(make_edit, description)
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
         text = "the accelerometer reads g - a: gravity is reversed"
         note = " (or reverse the vector `gravity` if z points down)"
-        yield _make_edit(description, "reversed gravity", text, {"imu.sign": -imu.sign}, note)
+        yield edit("reversed gravity", text, {"imu.sign": -imu.sign}, note)
     where = "static.orientation" if description.static else "pose.orientation"
     orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
     if orientation is None:
@@ -101,23 +102,21 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
     if not sensed:
         turned = [0.0 - x for x in description.gravity_W.tolist()]
         text, note = "gravity is reversed", ", a vector in the world"
-        yield _make_edit(description, "reversed gravity", text, {"gravity": turned}, note)
+        yield edit("reversed gravity", text, {"gravity": turned}, note)
     text = "the orientation is that of the world in S, R_SW, not R_WS"
-    fields: dict[str, Any] = {f"{where}.inverse": not orientation.inverse}
-    yield _make_edit(description, "inverted orientation", text, fields)
+    yield edit("inverted orientation", text, {f"{where}.inverse": not orientation.inverse})
     forms = {"quaternion_wxyz": "quaternion_xyzw", "quaternion_xyzw": "quaternion_wxyz"}
     if orientation.form in forms:
         text = f"the quaternions are not {orientation.form}"
-        fields = {f"{where}.form": forms[orientation.form]}
-        yield _make_edit(description, "quaternion order", text, fields)
+        yield edit("quaternion order", text, {f"{where}.form": forms[orientation.form]})
     for axes in EULER_AXIS_SEQUENCES if orientation.form == "euler" else ():
         if axes != orientation.axes:
             text = f"the Euler angles are not about the axes {orientation.axes}"
-            yield _make_edit(description, "Euler axes", text, {f"{where}.axes": axes})
+            yield edit("Euler axes", text, {f"{where}.axes": axes})
     if orientation.form in ("rotation_vector", "euler"):
         text = f"the angles are not in {orientation.unit}"
         unit = "deg" if orientation.unit == "rad" else "rad"
-        yield _make_edit(description, "degrees", text, {f"{where}.unit": unit})
+        yield edit("degrees", text, {f"{where}.unit": unit})
 
 
 def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -> Edit:
@@ -139,37 +138,36 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     """Yield edits of a description: other signs, axes and units of wrench and motion."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
-    text = "the sign of the wrench is inverted"
-    yield _make_edit(description, "sign", text, {f"{stream}.sign": -sensor.sign})
+    edit = partial(make_edit, description)
+    yield edit("sign", "the sign of the wrench is inverted", {f"{stream}.sign": -sensor.sign})
     yield from orientation_and_gravity_sign_edits(description)
     if isinstance(sensor.frame, str):
         text, other = "the wrench is in the axes of the base", "base"
         if sensor.frame == "base":
             text, other = "the wrench is not in base axes", "sensor"
-        yield _make_edit(description, "base axes", text, {f"{stream}.frame": other})
+        yield edit("base axes", text, {f"{stream}.frame": other})
     imu, pose = description.imu, description.pose
     if pose is not None and pose.position and (imu is None or imu.specific_force is None):
         text = f"the position is not in {pose.position.unit}"
         unit = "mm" if pose.position.unit == "m" else "m"
-        yield _make_edit(description, "units", text, {"pose.position.unit": unit})
-    if imu is not None and imu.angular_velocity and imu.angular_velocity.unit == "rad/s":
-        fields: dict[str, Any] = {"imu.angular_velocity.unit": "deg/s"}
-        yield _make_edit(description, "degrees", "the gyroscope is in degrees", fields)
+        yield edit("units", text, {"pose.position.unit": unit})
+    if imu is not None and imu.angular_velocity:
+        text = f"the gyroscope is not in {imu.angular_velocity.unit}"
+        unit = "deg/s" if imu.angular_velocity.unit == "rad/s" else "rad/s"
+        yield edit("degrees", text, {"imu.angular_velocity.unit": unit})
     columns: dict[str, Any] = {
         f"{stream}.{x}.columns": getattr(sensor, x).columns for x in ("force", "torque")
     }
     exchanged = dict(zip(columns, [list(names) for names in columns.values()][::-1], strict=True))
-    text = "force and torque are exchanged"
-    yield _make_edit(description, "torque first", text, exchanged)
+    yield edit("torque first", "force and torque are exchanged", exchanged)
     for order in list(permutations(range(3)))[1:]:
         if all(len(names) == 3 for names in columns.values()):
             fields = {path: [names[i] for i in order] for path, names in columns.items()}
-            text = "axes of the wrench are exchanged"
-            yield _make_edit(description, "swapped axes", text, fields)
+            yield edit("swapped axes", "axes of the wrench are exchanged", fields)
     old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
-        fields = {f"{stream}.frame": (R @ old).tolist()}
-        yield _make_edit(description, "swapped axes", "the axes of the wrench are rotated", fields)
+        frame = {f"{stream}.frame": (R @ old).tolist()}
+        yield edit("swapped axes", "the axes of the wrench are rotated", frame)
 
 
 _THINNED_RATE_HZ = 100.0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from drake_teleop.logs.check.edits import (
     LogTables,
     call_or_none_if_unreadable,
     edit_field,
+    make_edit,
     orientation_and_gravity_sign_edits,
 )
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -42,6 +45,7 @@ MIN_REPORTED_RELATIVE_GRAVITY_ERROR = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION, _ALPHA_COMPARISON_CUTOFF_HZ = 5.0, 5.0
 _MIN_ALPHA_CORRELATION, _MAX_UNSWAPPED_OVER_BEST_CORRELATION = 0.8, 0.5
 _GRAVITY_WINDOW_RANGE_S, _MIN_GRAVITY_WINDOWS, _MAX_GRAVITY_WINDOWS = (2.0, 8.0), 6, 60
+_GYRO_UNITS = "rad/s", "deg/s", "mdeg/s"
 _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0.05, 3.0
 
 
@@ -50,20 +54,16 @@ def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding]
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
-    edit = _angle_unit_edit(description, imu, log)
-    finding = None
+    edit, finding = _angle_unit_edit(description, imu, log), None
     if edit is None and imu.specific_force is not None and imu.frame != "base":
-        gravity = float(np.linalg.norm(description.gravity_W))
-        edit = _gyro_axes_edit(description, imu, log, gravity)
-        if edit is None:
-            axes = _angular_acceleration_axes_finding(imu, log)
-            finding = axes or _gravity_magnitude_finding(imu, log, gravity)
+        edit = _gyro_axes_edit(description, imu, log)
+        if edit is None and (finding := _angular_acceleration_axes_finding(imu, log)) is None:
+            finding = _gravity_magnitude_finding(imu, log, description.gravity_W)
     finding, description = edit or (finding, description)
-    return ([] if finding is None else [finding]), description
+    return ([finding] if finding else []), description
 
 
 def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | None:
-    assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
     given_alpha, derived_alpha = _given_and_derived_alpha(log)
@@ -79,9 +79,8 @@ def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | Non
     ):
         if least < wrong < most and getattr(imu, quantity).unit == unit:
             text = f"the angular acceleration is {ratio:.3g} times the derivative of the angular"
-            line = f"imu.{quantity}.unit"
-            finding = Finding("degrees", f"{text} velocity; set {line}: {other}")
-            return finding, edit_field(description, line, other)
+            fields = {f"imu.{quantity}.unit": other}
+            return make_edit(description, "degrees", f"{text} velocity", fields)
     return None
 
 
@@ -91,14 +90,19 @@ def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
     return given, low_pass(rate, log.dt, _ALPHA_COMPARISON_CUTOFF_HZ)
 
 
-def _gyro_axes_edit(description: Description, imu: Imu, log: Log, gravity: float) -> Edit | None:
+def _gyro_axes_edit(description: Description, imu: Imu, log: Log) -> Edit | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
-    given = _relative_gravity_misfit(few, np.eye(3), gravity)
+    misfit = partial(_relative_gravity_misfit, few, float(np.linalg.norm(description.gravity_W)))
+    given, unit = misfit(np.eye(3)), imu.angular_velocity.unit
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
-    misfits = ((_relative_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
-    best, P = min(misfits, key=lambda entry: entry[0])
+    scales = {x: SI_VALUE_OF_UNIT[x] / SI_VALUE_OF_UNIT[unit] * np.eye(3) for x in _GYRO_UNITS}
+    least, best_unit = min((misfit(P), x) for x, P in scales.items())
+    if _MIN_AXES_MISFIT_REDUCTION * least < given:
+        text = f"the rotation of gravity in S shows that the gyroscope is not in {unit}"
+        return make_edit(description, "degrees", text, {"imu.angular_velocity.unit": best_unit})
+    best, P = min(((misfit(P), P) for P in signed_permutations()), key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
     text = "the axes of the gyroscope are not those of the accelerometer"
@@ -153,7 +157,7 @@ def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
     return means
 
 
-def _relative_gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> float:
+def _relative_gravity_misfit(log: Log, gravity: float, gyro_axes: Array) -> float:
     means = _mean_specific_forces_in_start_axes(log, gyro_axes) / gravity
     if means.shape[1] == 0:
         return np.nan
@@ -161,7 +165,8 @@ def _relative_gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> floa
     return float(np.sqrt(np.mean(off**2) + np.mean(np.sum((means[1] - means[0]) ** 2, axis=1))))
 
 
-def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
+def _gravity_magnitude_finding(imu: Imu, log: Log, gravity_W: Array) -> Finding | None:
+    gravity = float(np.linalg.norm(gravity_W))
     forces = _mean_specific_forces_in_start_axes(log, np.eye(3))[0]
     if len(forces) < _MIN_GRAVITY_WINDOWS:
         return None
@@ -177,7 +182,8 @@ def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | 
     measured_gravity = ratio * gravity
     remedy = f"divide the columns of imu.specific_force by {ratio:.4f}, or calibrate them"
     if imu.specific_force.unit not in ("g", "mg") and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
-        remedy = f"set gravity: {measured_gravity:.4g}"
+        vector = [float(f"{ratio * x:.4g}") for x in gravity_W]
+        remedy = f"set gravity: {vector if vector[:2] != [0, 0] or vector[2] > 0 else -vector[2]}"
     return Finding(
         "gravity",
         f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
@@ -223,11 +229,15 @@ def check_imu_against_pose(
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
-    least, most = SPEED_RATIO_RANGE_OF_DEGREES
-    if given.speed_ratio is not None and least < given.speed_ratio < most:
-        text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
-        findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
-        description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
+    gyro: Any = getattr(description.imu, "angular_velocity", None)
+    ratio = given.speed_ratio or 0.0
+    for unit in _GYRO_UNITS if gyro else ():
+        least, most = np.array(_UNIT_MATCH_RANGE) * SI_VALUE_OF_UNIT[gyro.unit]
+        if unit != gyro.unit and least < ratio * SI_VALUE_OF_UNIT[unit] < most:
+            text = f"the gyroscope reads {ratio:.3g} times the speed of the pose"
+            fields = {"imu.angular_velocity.unit": unit}
+            finding, description = make_edit(description, "degrees", text, fields)
+            findings.append(finding)
     if given.is_mirrored:
         text = (
             "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"

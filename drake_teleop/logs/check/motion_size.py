@@ -54,10 +54,8 @@ def too_little_motion(log: Log) -> str | None:
     s, omega = motion_rms(log)
     if s >= _MIN_MOTION_RMS_M_S2_AND_RAD_S[0] or omega >= _MIN_MOTION_RMS_M_S2_AND_RAD_S[1]:
         return None
-    return (
-        f"in {log.t[-1] - log.t[0]:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2,"
-        f" {omega:.2g} rad/s rms): load and offsets cannot be separated"
-    )
+    text = f"in {log.t[-1] - log.t[0]:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2,"
+    return f"{text} {omega:.2g} rad/s rms): load and offsets cannot be separated"
 
 
 @lru_cache(maxsize=1)  # edits of the wrench keep the poses, whose identity is the key
@@ -85,6 +83,5 @@ def _block_motion(poses: Poses, gravity_W: Array) -> tuple[Array, Array]:
     acceleration = np.gradient(np.gradient(poses.position, poses.t, axis=0), poses.t, axis=0)
     s = np.einsum("nji,nj->ni", R_WS, acceleration - gravity_W)
     turned = np.einsum("nji,njk->nik", R_WS[:-1], R_WS[1:])
-    axial = [turned[:, 2, 1] - turned[:, 1, 2], turned[:, 0, 2] - turned[:, 2, 0]]
-    axial.append(turned[:, 1, 0] - turned[:, 0, 1])
+    axial = [turned[:, k, j] - turned[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
     return s, 0.5 * np.stack(axial, axis=1) / np.diff(poses.t)[:, None]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common import rotations
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.read.alignment import low_pass, mean_time_step, resample, uniform_times
 from drake_teleop.logs.read.description import Description, Orientation
@@ -18,6 +18,9 @@ from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
 MIN_STREAM_SAMPLES = 16
+# Least share of lost rows, least jump to their zeros over usual steps and over the mean size.
+_MIN_LOST_ROW_SHARE, _MIN_JUMP_OVER_STEP, _MIN_JUMP_OVER_SIZE = 0.001, 5.0, 0.3
+_MAX_SUCCESSIVE_LOST_ROWS = 20
 MAX_PLAUSIBLE_VALUES = {
     "force": (1e6, "N"), "torque": (1e6, "N m"), "position": (1e9, "m"),
     "specific_force": (1e6, "m/s^2"), "gravity": (1e6, "m/s^2"),
@@ -45,6 +48,22 @@ class Stream:
     @property
     def dt(self) -> float:
         return mean_time_step(self.t)
+
+
+def check_that_no_rows_are_lost(values: Array, table: Table, where: str) -> None:
+    # Drivers write zeros for lost readings.
+    sizes = np.linalg.norm(values, axis=1)
+    runs, padded = find_runs_of_true(sizes == 0.0), np.append(sizes, 0.0)
+    beside = np.minimum(padded[runs[:, 0] - 1], padded[runs[:, 1]])
+    if not beside.any():
+        return
+    steps = np.linalg.norm(np.diff(values[sizes > 0.0], axis=0), axis=1)
+    least = max(_MIN_JUMP_OVER_STEP * np.quantile(steps, 0.99), _MIN_JUMP_OVER_SIZE * sizes.mean())
+    lost = runs[(beside > least) & (np.ptp(runs, axis=1) <= _MAX_SUCCESSIVE_LOST_ROWS)]
+    if (count := int(np.ptp(lost, axis=1).sum())) > _MIN_LOST_ROW_SHARE * len(sizes):
+        row = table.line_in_file(int(lost[0, 0]))
+        what = f"{count} rows of zeros between other values, the first is row {row}: lost readings"
+        raise DrakeTeleopError(what, where=where, remedy="delete these rows")
 
 
 def resample_to_clock(t: Array, stream: Stream, values: Array) -> Array:
