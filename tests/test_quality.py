@@ -1,8 +1,9 @@
-"""Code style by ruff and types by mypy."""
+"""Code style by ruff and types by mypy; tests leave the clock to other threads."""
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,3 +39,10 @@ def test_linters_find_nothing(check):
         [sys.executable, *check], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert answer.returncode == 0, answer.stdout + answer.stderr
+
+
+def test_no_test_replaces_the_clock_of_other_threads():
+    """A drive of a session fixture would wait until a replaced clock's time has come."""
+    replaced = re.compile(r"setattr\((\w+\.)*time, |setattr\(\"time\.")
+    texts = {path.name: path.read_text() for path in (ROOT / "tests").rglob("*.py")}
+    assert [name for name, text in texts.items() if replaced.search(text)] == []

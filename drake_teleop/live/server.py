@@ -183,12 +183,19 @@ class LiveDrive:
 
     async def _serve_pages_until_stopped(self) -> None:
         try:
-            options: Any = {"process_request": self._answer_request, "logger": _WEBSOCKET_LOGGER}
-            options |= {"max_size": MAX_MESSAGE_BYTES, "max_queue": 8, "compression": None}
-            options |= dict.fromkeys(("ping_interval", "ping_timeout"), 5)
-            options |= {"close_timeout": _PAGE_CLOSE_TIMEOUT_S}
-            where = _LOOPBACK_ADDRESS, self._port
-            server = await serve(self._handle_page_connection, *where, **options)
+            server = await serve(
+                self._handle_page_connection,
+                _LOOPBACK_ADDRESS,
+                self._port,
+                process_request=self._answer_request,
+                max_size=MAX_MESSAGE_BYTES,
+                max_queue=8,
+                compression=None,
+                ping_interval=5,
+                ping_timeout=5,
+                close_timeout=_PAGE_CLOSE_TIMEOUT_S,
+                logger=_WEBSOCKET_LOGGER,
+            )
         except OSError as error:
             self._live.close()  # removes the empty record
             what, remedy = f"cannot be opened ({error.strerror})", "use another --port"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rich.console import Console
 import drake_teleop
 from drake_teleop import identify_load, run_scenario, simulate
 from drake_teleop.cli.excitation import excite_command
+from drake_teleop.common import progress
 from drake_teleop.common.progress import show_no_progress, show_progress
 from drake_teleop.lab.analysis.analyze import analyze, analyze_command
 from drake_teleop.lab.comparison.compare_passivity import compare_command
@@ -114,7 +116,8 @@ def test_nested_bars_raise_no_error(terminal):
 def test_without_a_terminal_a_long_stage_has_a_line_every_15_s(monkeypatch, capsys, first):
     now = 100.0
     monkeypatch.setattr(rich, "_console", Console(file=io.StringIO(), force_terminal=False))
-    monkeypatch.setattr(time, "monotonic", lambda: now)
+    # Not `time.monotonic` itself, because other threads use it.
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: now))
     with show_progress(True, after=first) as stage:
         update = stage("Study")
         for second in range(1, 41):

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -309,7 +310,8 @@ def test_error_or_interrupt_neither_loses_nor_repeats_rows(tmp_path, name, error
     failing, path = FailingSink(lines.TableSink(tmp_path / name)), tmp_path / name
     failing.write_until(error, 50)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lines.time, "monotonic", lambda: (_ for _ in ()).throw(error))
+        fail = SimpleNamespace(monotonic=lambda: (_ for _ in ()).throw(error))
+        patch.setattr(lines, "time", fail)  # of this module only: other threads use the time
         with pytest.raises(error):
             failing.sink.close()
     failing.sink.close()
