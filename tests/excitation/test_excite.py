@@ -324,6 +324,7 @@ def test_readme_output(tmp_path, monkeypatch):
     assert found.period == 6.0 and (tmp_path / "out" / "arm" / "excitation.html").exists()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     box = slave.limits._replace(box_half=np.full(3, 0.01))

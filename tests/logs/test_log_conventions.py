@@ -185,6 +185,7 @@ def test_loads_and_streams_of_any_kind_raise_no_alarm(tmp_path: Path, seed: int)
     assert findings(tmp_path, columns, **streams) == {}
 
 
+@pytest.mark.long
 def test_a_short_contact_on_a_light_load_is_no_alarm(tmp_path: Path) -> None:
     columns = good(phi=phi_from_mass_com_inertia(0.15, [0.0, 0.01, 0.04], 1e-4 * np.eye(3)))
     columns["force"][900:1100, 2] += 15 * np.sin(np.linspace(0, np.pi, 200))
@@ -200,6 +201,7 @@ def test_rate_of_a_held_sensor_is_reported(tmp_path: Path) -> None:
     assert "4.0 ms ahead" in found["lag"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_coarse_sensor_at_rest_repeats_rows_by_itself(tmp_path: Path) -> None:
     columns = good()
@@ -210,6 +212,7 @@ def test_a_coarse_sensor_at_rest_repeats_rows_by_itself(tmp_path: Path) -> None:
     assert "repeated rows" not in findings(tmp_path, columns)
 
 
+@pytest.mark.long
 def test_remedy_for_a_drifting_clock_is_correct(tmp_path: Path) -> None:
     columns = good()
     planted.drifting_clock(columns)

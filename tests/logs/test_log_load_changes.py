@@ -213,6 +213,7 @@ def load_wrench(t: np.ndarray, phi: np.ndarray) -> np.ndarray:
     return non_contact_wrench(at.specific_force, at.omega, at.alpha, phi)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_delay_is_that_of_the_fit_with_the_load_change(tmp_path: Path) -> None:
     t = np.arange(0.0, 20.0, 4e-3)
