@@ -98,7 +98,6 @@ def weld_base_and_find_chain(
 def move_welds_to_world(
     plant: MultibodyPlant, joints_before: set[tree.JointIndex], X_WFile: RigidTransform
 ) -> None:
-    """Move the links of a file that are welded to the world."""
     world = plant.world_body().index()
     for joint in map(plant.get_joint, sorted(set(plant.GetJointIndices()) - joints_before)):
         if isinstance(joint, WeldJoint) and joint.parent_body().index() == world:

@@ -139,7 +139,7 @@ def ParseModel(
 ) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    S is `sensor_frame`. A free base is welded to the world at `X_WBase`. Joints in `hold` are
+    S is `sensor_frame`. `X_WBase` places a free base, or all links on the world. Joints in `hold` are
     welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at their
     defaults. Unreadable or contradictory models raise DrakeTeleopError.
     """

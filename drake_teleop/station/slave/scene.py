@@ -67,9 +67,9 @@ class Scene(Environment):
         bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WFile = RigidTransform(RollPitchYaw(self.rotation), self.position)
         if not X_WFile.IsExactlyIdentity():
-            own = [joint for joint in joints if joint.index() not in joints_before]
-            own = [joint for joint in own if joint.parent_body().index() == world.index()]
-            rest = [f"the joint {joint.name()}" for joint in own if joint.num_velocities() > 0]
+            moving = (x for x in joints if x.index() not in joints_before and x.num_velocities())
+            on_world = (x for x in moving if x.parent_body().index() == world.index())
+            rest = [f"the joint {joint.name()}" for joint in on_world]
             rest += ["a shape"] if len(shapes_on(world)) > num_world_shapes else []
             if rest:
                 what = f"position and rotation cannot move {rest[0]} on the world"
