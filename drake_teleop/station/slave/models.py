@@ -139,9 +139,9 @@ def ParseModel(
 ) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    S is `sensor_frame`. `X_WBase` places a free base, or all links on the world. Joints in `hold` are
-    welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at their
-    defaults. Unreadable or contradictory models raise DrakeTeleopError.
+    S is `sensor_frame`. `X_WBase` places a free base, or all links on the world. Joints in `hold`
+    are welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at
+    their defaults. Unreadable or contradictory models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)

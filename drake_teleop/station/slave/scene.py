@@ -48,8 +48,9 @@ class Scene(Environment):
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         before, path = plant.num_bodies(), self.path
-        shapes_on, world = plant.GetCollisionGeometriesForBody, plant.world_body()
-        num_world_shapes, joints_before = len(shapes_on(world)), set(plant.GetJointIndices())
+        world, joints_before = plant.world_body(), set(plant.GetJointIndices())
+        lists = plant.GetCollisionGeometriesForBody, plant.GetVisualGeometriesForBody
+        num_world_shapes = [len(shapes_on(world)) for shapes_on in lists]
         ParseScene(plant, path)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
@@ -70,7 +71,8 @@ class Scene(Environment):
             moving = (x for x in joints if x.index() not in joints_before and x.num_velocities())
             on_world = (x for x in moving if x.parent_body().index() == world.index())
             rest = [f"the joint {joint.name()}" for joint in on_world]
-            rest += ["a shape"] if len(shapes_on(world)) > num_world_shapes else []
+            if [len(shapes_on(world)) for shapes_on in lists] != num_world_shapes:
+                rest.append("a shape")
             if rest:
                 what = f"position and rotation cannot move {rest[0]} on the world"
                 remedy = "attach it to a link that is fixed to the world, or leave both fields out"
