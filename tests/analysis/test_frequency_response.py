@@ -9,14 +9,17 @@ import pytest
 from operator_motion import intent_at
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis import frequency_response
 from drake_teleop.lab.analysis.frequency_response import (
     MultiSine,
     StationResponse,
     measure_frequency_response,
 )
 from drake_teleop.lab.analysis.task_direction import task_direction
-from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.identification import slave_arm, true_load
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.station import MakeTeleopStation
 
 bench = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "frequency_response.py"))
 predict_frequency_response = bench["predict_frequency_response"]
@@ -102,3 +105,25 @@ def test_unsuitable_multisine_raises():
     few = StationResponse(2 * np.pi * np.array([1.0, 30.0]), {}, 1.0)
     with pytest.raises(DrakeTeleopError, match="10 Hz"):
         few.apparent_mass()
+
+
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("method", ["rls", "rtls"])
+def test_load_is_that_of_the_argument_or_else_of_the_scenarios_estimator(
+    monkeypatch, given, method
+):
+    stations = []
+
+    def stop(scenario, **_):
+        stations.append(scenario)
+        MakeTeleopStation(scenario, load_estimate=estimate)
+        raise KeyboardInterrupt
+
+    own = LoadEstimatorConfig(enabled=True, method=method)
+    scenario = replace(LoadScenario("free_motion_force"), load_estimator=own)
+    estimate = true_load(scenario) if given else None
+    monkeypatch.setattr(frequency_response, "MakeTeleopStation", stop)
+    along = task_direction(scenario, UP)
+    with pytest.raises(KeyboardInterrupt):
+        measure_frequency_response(scenario, along, MultiSine(), load_estimate=estimate)
+    assert stations[0].load_estimator == (LoadEstimatorConfig() if given else own)

@@ -515,8 +515,14 @@ def test_links_that_the_file_fixes_to_the_world_move_with_it(tmp_path, kind, yaw
 def test_moving_joints_and_shapes_on_the_world_refuse_a_pose_of_the_file(tmp_path):
     hinge = ON_WORLD.format("revolute", "<axis><xyz>0 0 1</xyz></axis>")
     sdf = f'<sdf version="1.9"><model name="m">{PLATE}{hinge}</model></sdf>'
-    mjcf = '<mujoco model="m"><worldbody><geom size="0.1"/></worldbody></mujoco>'
-    for name, text, what in (("a.sdf", sdf, "the joint j"), ("a.xml", mjcf, "a shape")):
+    mjcf = '<mujoco model="m"><worldbody><geom size="0.1"{}/></worldbody></mujoco>'
+    seen = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
+    for name, text, what in (
+        ("a.sdf", sdf, "the joint j"),
+        ("a.xml", mjcf.format(""), "a shape"),
+        ("b.xml", mjcf.format(' contype="0" conaffinity="0"'), "a shape"),
+        ("a.urdf", f'<robot name="r"><link name="world">{seen}</link></robot>', "a shape"),
+    ):
         (tmp_path / name).write_text(text)
         for place, refused in (([0.5, 0.0, 0.0], True), ([0.0, 0.0, 0.0], False)):
             scene = Scene(file=str(tmp_path / name), position=place)

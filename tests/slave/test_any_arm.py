@@ -12,7 +12,7 @@ from odd_arms import other_arm_urdf
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Role
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -29,6 +29,7 @@ from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR_COLUMN
 from drake_teleop.station.slave.chain_joints import AddSkeleton
 from drake_teleop.station.slave.joint_commands import JointRangeMonitor, used_ik_method
+from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
 from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool
@@ -181,6 +182,22 @@ def test_base_pose_moves_an_arm_with_its_pose_in_the_file(tmp_path, text):
     moved, at_rest = pose(0.3, -0.2, 0.7, 0.4, -0.3, 1.1), pose(*np.zeros(6))
     X_WBase = RigidTransform(RollPitchYaw(0.4, -0.3, 1.1), [0.3, -0.2, 0.7])
     assert moved.IsNearlyEqualTo(X_WBase @ at_rest, 1e-12)
+
+
+BESIDE = """<link name="table"/><joint name="on_floor" type="{}"><origin xyz="0.9 0.2 0.1"/>
+<parent link="world"/><child link="table"/><axis xyz="0 0 1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("kind", ["fixed", "continuous"])
+@pytest.mark.parametrize("yaw", [0.0, 1.1])
+def test_base_pose_moves_all_links_that_the_file_attaches_to_the_world(tmp_path, kind, yaw):
+    path, plant = tmp_path / "arm.urdf", MultibodyPlant(0.0)
+    path.write_text(other_arm_urdf("fixed", "world").replace("</robot>", BESIDE.format(kind)))
+    X_WBase = RigidTransform(RollPitchYaw(0.4, -0.3, yaw), [0.3, -0.2, 0.7])
+    ParseModel(plant, path, "ft", X_WBase=X_WBase)
+    plant.Finalize()
+    found = plant.GetBodyByName("table").EvalPoseInWorld(plant.CreateDefaultContext())
+    assert found.IsNearlyEqualTo(X_WBase @ RigidTransform([0.9, 0.2, 0.1]), 1e-12)
 
 
 def test_base_pose_of_a_joint_on_the_world_is_one_error(tmp_path):

@@ -500,6 +500,15 @@ def test_site_named_tip_is_the_tip_of_a_tool(tmp_path, place, inner):
     np.testing.assert_allclose(tip, np.add(place, offset), atol=1e-12)
 
 
+@pytest.mark.parametrize("z", [0.1, 0.25])
+@pytest.mark.parametrize("site", ["", '<site name="tip" pos="0 0 0.05"/>'])
+def test_body_named_tip_is_the_tip_of_a_tool_also_beside_such_a_site(tmp_path, site, z):
+    body = f'<body name="tip" pos="0.02 0 {z}">{site}</body>'
+    text = mjcf(f'<body name="hand">{INERTIAL}{body}</body>')
+    tool = Tool(model=str(written(tmp_path, text, "a.xml")))
+    np.testing.assert_allclose(NominalSlave(Slave(tool=tool)).tip, [0.02, 0.0, z], atol=1e-12)
+
+
 @pytest.mark.parametrize("root", ["", "<freejoint/>"])
 def test_tool_has_one_free_root_and_held_joints(tmp_path, root):
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)

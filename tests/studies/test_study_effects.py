@@ -88,6 +88,19 @@ def test_reason_of_any_row_is_in_the_table(failing):
     assert found["why"][failing] == "no successful run"
 
 
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ([1000001, 1000002.0], ["1000001.0", "1000002.0"]),
+        ([0.3, 0.30000001, 2.0], ["0.3", "0.30000001", "2.0"]),
+        ([1, 2.5, 1e6], ["1", "2.5", "1e+06"]),
+    ],
+)
+def test_levels_with_different_values_have_different_names(values, names):
+    study = Study(factors=[Factor("force_scaling.sigma", values=values)], measures=["effort_Ns"])
+    assert main_effects_table(study, table(study))["level"].to_list() == names
+
+
 @pytest.mark.parametrize("factor", [STUDY.factors[0], STUDY.factors[2]])
 def test_table_without_effects_has_its_columns(factor):
     """No run succeeds, or no field varies."""

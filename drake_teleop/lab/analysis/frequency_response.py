@@ -137,7 +137,7 @@ def measure_frequency_response(
         simulation__settle=start + excitation.settle,
         simulation__duration=period * excitation.periods,
         rates__log_hz=rate,
-        load_estimator=LoadEstimatorConfig(),
+        load_estimator=scenario.load_estimator if load_estimate is None else LoadEstimatorConfig(),
         contact_detection=None,
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)

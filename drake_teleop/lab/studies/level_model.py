@@ -93,6 +93,7 @@ def factor_levels(factor: Factor, column: Sequence[FactorValue], num_sections: i
     middles = (middles - middles.mean(axis=0))[present]
     values = [listed[k] for k in present]
     names = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+    names = names if len(set(names)) == len(names) else list(map(str, values))
     return Levels(index, names, None, middles[index], middles)
 
 

@@ -82,26 +82,29 @@ def weld_base_and_find_chain(
 ) -> list[Joint]:
     """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
-    It also moves a base that is welded there; for another joint a DrakeTeleopError is raised.
+    A DrakeTeleopError is raised for another pose if the base moves on the world.
     """
     chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
     if base.index() != plant.world_body().index():
         plant.WeldFrames(plant.world_frame(), base.body_frame(), X_WB)
-    elif not X_WB.IsExactlyIdentity():
-        if not isinstance(chain[0], WeldJoint):
-            what = f"slave.base_pose cannot move {chain[0].name()}, which moves on the world"
-            remedy = "leave it out, or attach the joint to a link without joint or with a fixed one"
-            raise DrakeTeleopError(what, where=where, remedy=remedy)
-        chain[0] = move_weld_to_world(plant, chain[0], X_WB)
+    elif not X_WB.IsExactlyIdentity() and not isinstance(chain[0], WeldJoint):
+        what = f"slave.base_pose cannot move {chain[0].name()}, which moves on the world"
+        remedy = "leave it out, or attach the joint to a link that is free or fixed to the world"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     return chain
 
 
-def move_weld_to_world(plant: MultibodyPlant, weld: WeldJoint, X_WFile: RigidTransform) -> Joint:
-    name, frame_M = weld.name(), weld.frame_on_child()
-    X_WM = X_WFile @ weld.frame_on_parent().GetFixedPoseInBodyFrame() @ weld.X_FM()
-    plant.RemoveJoint(weld)
-    return plant.AddJoint(WeldJoint(name, plant.world_frame(), frame_M, X_WM))
+def move_welds_to_world(
+    plant: MultibodyPlant, joints_before: set[tree.JointIndex], X_WFile: RigidTransform
+) -> None:
+    world = plant.world_body().index()
+    for joint in map(plant.get_joint, sorted(set(plant.GetJointIndices()) - joints_before)):
+        if isinstance(joint, WeldJoint) and joint.parent_body().index() == world:
+            name, frame_M = joint.name(), joint.frame_on_child()
+            X_WM = X_WFile @ joint.frame_on_parent().GetFixedPoseInBodyFrame() @ joint.X_FM()
+            plant.RemoveJoint(joint)
+            plant.AddJoint(WeldJoint(name, plant.world_frame(), frame_M, X_WM))
 
 
 def weld_free_bodies(

@@ -74,12 +74,10 @@ def check_inertia_and_holding_torque(arm: ArmModel, q: Array) -> None:
         raise DrakeTeleopError(what, where="slave.model", remedy=remedy)
     torque = holding_torque(arm, q)
     k = int((np.abs(torque) / arm.effort_limit).argmax())
-    needed, limit = abs(torque[k]), arm.effort_limit[k]
+    needed, limit, name = abs(torque[k]), arm.effort_limit[k], arm.joint_names[k]
     if needed > limit:
         unit = "N" if arm.table[k, IS_PRISMATIC_COLUMN] else "N m"
-        needs = (
-            f"{arm.joint_names[k]} needs {needed:.3g} {unit}, but its limit is {limit:.3g} {unit}"
-        )
+        needs = f"{name} needs {needed:.3g} {unit}, but its limit is {limit:.3g} {unit}"
         what = f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {needs}"
         remedy = "give a lighter tool or payload, start nearer to the base, or set"
         remedy = f"{remedy} slave.torque_limits if the model's limits are wrong"

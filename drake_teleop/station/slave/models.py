@@ -139,9 +139,9 @@ def ParseModel(
 ) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    S is `sensor_frame`. A free base is welded to the world at `X_WBase`. Joints in `hold` are
-    welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at their
-    defaults. Unreadable or contradictory models raise DrakeTeleopError.
+    S is `sensor_frame`. `X_WBase` places a free base, or all links on the world. Joints in `hold`
+    are welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at
+    their defaults. Unreadable or contradictory models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
@@ -155,6 +155,10 @@ def ParseModel(
     moving = [joint for joint in chain if joint.num_velocities() > 0]
     with translate_drake_errors(path):
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
+        is_on_world = chain and chain[0].parent_body().index() == plant.world_body().index()
+        if is_on_world and X_WBase is not None and not X_WBase.IsExactlyIdentity():
+            chain_joints.move_welds_to_world(plant, before, X_WBase)
+            chain = chain_joints.chain_to_body(plant, frame.body())
         held += chain_joints.weld_load_of_link_to_sensor_frame(plant, frame, chain)
         chain_joints.set_one_actuator_per_joint(plant, moving)
         rotors = chain_joints.add_rotor_inertias(plant, chain, frame, model.auxiliary_bodies)

@@ -6,13 +6,13 @@ from pathlib import Path
 from pydrake import geometry
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Joint
+from pydrake.multibody.tree import BodyIndex
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, ToolShapes
-from drake_teleop.station.slave.chain_joints import move_weld_to_world
+from drake_teleop.station.slave.chain_joints import move_welds_to_world
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
@@ -48,8 +48,9 @@ class Scene(Environment):
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         before, path = plant.num_bodies(), self.path
-        shapes_on, world = plant.GetCollisionGeometriesForBody, plant.world_body()
-        num_world_shapes, joints_before = len(shapes_on(world)), set(plant.GetJointIndices())
+        world, joints_before = plant.world_body(), set(plant.GetJointIndices())
+        lists = plant.GetCollisionGeometriesForBody, plant.GetVisualGeometriesForBody
+        num_world_shapes = [len(shapes_on(world)) for shapes_on in lists]
         ParseScene(plant, path)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
@@ -67,9 +68,16 @@ class Scene(Environment):
         bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WFile = RigidTransform(RollPitchYaw(self.rotation), self.position)
         if not X_WFile.IsExactlyIdentity():
-            own = [joint for joint in joints if joint.index() not in joints_before]
-            shape = "a shape" if len(shapes_on(world)) > num_world_shapes else ""
-            _move_welds_to_world(plant, own, X_WFile, shape, str(path))
+            moving = (x for x in joints if x.index() not in joints_before and x.num_velocities())
+            on_world = (x for x in moving if x.parent_body().index() == world.index())
+            rest = [f"the joint {joint.name()}" for joint in on_world]
+            if [len(shapes_on(world)) for shapes_on in lists] != num_world_shapes:
+                rest.append("a shape")
+            if rest:
+                what = f"position and rotation cannot move {rest[0]} on the world"
+                remedy = "attach it to a link that is fixed to the world, or leave both fields out"
+                raise DrakeTeleopError(what, where=str(path), remedy=remedy)
+            move_welds_to_world(plant, joints_before, X_WFile)
         name = "GetDefaultFloatingBaseBodyPose"  # older versions of Drake have the second name
         pose_in_file = getattr(plant, name, None) or plant.GetDefaultFreeBodyPose
         for body in map(plant.get_body, bases):
@@ -100,20 +108,6 @@ class Scene(Environment):
                 geometry.AddCompliantHydroelasticProperties(edge, modulus, material)
                 replace = geometry.RoleAssign.kReplace
                 scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)
-
-
-def _move_welds_to_world(
-    plant: MultibodyPlant, joints: list[Joint], X_WFile: RigidTransform, shape: str, where: str
-) -> None:
-    world = plant.world_body().index()
-    on_world = [joint for joint in joints if joint.parent_body().index() == world]
-    moving = [f"the joint {joint.name()}" for joint in on_world if joint.num_velocities() > 0]
-    for part in filter(None, (*moving, shape)):
-        what = f"position and rotation cannot move {part} on the world"
-        remedy = "attach it to a link that is fixed to the world, or leave both fields out"
-        raise DrakeTeleopError(what, where=where, remedy=remedy)
-    for weld in on_world:
-        move_weld_to_world(plant, weld, X_WFile)
 
 
 def has_hydroelastic_properties(properties: geometry.ProximityProperties) -> bool:

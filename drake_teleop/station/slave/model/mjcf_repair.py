@@ -40,7 +40,7 @@ def repair_mjcf(model: model_repair.ModelRepair) -> None:
     is_complete = purpose.is_scene or purpose.is_in_directives
     if is_complete or not purpose.sensor_name:
         world = _split_into_one_joint_bodies(reader.read_world())
-        if purpose.is_tool:
+        if purpose.is_tool and all(body.name != "tip" for body in world.with_descendants()):
             _insert_sensor_frame_at_site(world, "tip", is_force_sensor_site=False)
     else:
         world = _read_world_with_only_arm(mjcf, reader)
