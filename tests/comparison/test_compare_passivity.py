@@ -162,10 +162,12 @@ def test_scale_of_0_is_refused(tmp_path, monkeypatch, block, name):
 @pytest.mark.parametrize(
     ("scenario", "methods", "message"),
     [
-        ("{joint_control: {servo: ur_servoj}}", ["none", "ledger"], r"^joint_control\.servo: "),
-        ("{kinematic_scaling: {rotation_scale: 0}}", ["ledger"], r"passivity\.method: .* scales"),
+        ("{joint_control: {servo: ur_servoj}}", ["none", "ledger"],
+         r"^joint_control\.servo: .*; or give `methods` without ledger$"),
+        ("{kinematic_scaling: {rotation_scale: 0}}", ["ledger"],
+         r"passivity\.method: .* scales.*; or give `methods` without ledger$"),
     ],
-)
+)  # fmt: skip
 def test_scenario_that_a_method_does_not_support_is_refused(
     tmp_path, monkeypatch, scenario, methods, message
 ):

@@ -85,7 +85,11 @@ def compare_command(
     for method in methods:  # else each of its runs would count as unstable
         settings = Channel(network=networks[0]), PassivityConfig(method=method)
         setup, _ = whole_station.press_scenario(base, *settings, "contact")
-        MakeTeleopStation(setup, load_estimate=true_load(base))
+        try:
+            MakeTeleopStation(setup, load_estimate=true_load(base))
+        except DrakeTeleopError as error:
+            remedy = f"or give `methods` without {method}"
+            raise DrakeTeleopError(str(error), remedy=remedy) from error
     make_folder(out)
     with show_progress(progress and not quiet) as stage:
         limits = _run_longest_round_trip_study(methods, seed, jobs, stage)
