@@ -32,6 +32,7 @@ MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
 """Smallest reported share of repeated rows, and smallest number of rows of a reported block."""
 _MIN_FROZEN_ROWS, _MIN_MOTION_SHARE_BESIDE_FROZEN = 50, 0.3
 _MAX_DRAFT_CORRECTIONS = 5  # by the data
+_MIN_DECIMALS = 3  # numbers with a point in a first line that is no header
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _COLUMNS_THAT_MARK_CANONICAL_LOG = {"f_x", "tau_x"}
 _INSPECTED_QUANTITIES = (
@@ -105,7 +106,8 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
     table = read_table(path)
     # polars adds a suffix to repeated names.
     names = [name.partition("_duplicated_")[0] for name in table.columns]
-    header = not all(map(is_decimal_number, names))
+    numbers = [name for name in names if is_decimal_number(name)]
+    header = len(numbers) < len(names) and sum("." in name for name in numbers) < _MIN_DECIMALS
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
