@@ -41,9 +41,7 @@ Edit = tuple[Finding, Description]  # a finding, and the corrected description
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
     first, *rest = path.split(".", 1)
-    if rest:
-        model: Any = getattr(description, first)
-        value = edit_field(model, rest[0], value)
+    value = edit_field(getattr(description, first), rest[0], value) if rest else value
     return description.model_copy(update={first: value})
 
 
