@@ -68,8 +68,7 @@ def inspect_command(
         with output_folder(out):
             draft = join_drafts(drafts)
             _correct_and_write_draft(draft, _find_writable_draft_path(out), summary)
-        more = [{"name": x.name, "message": x.message} for x in draft.findings]
-        summary["findings"] = [*summary["findings"], *more]
+        summary["findings"] += [{"name": x.name, "message": x.message} for x in draft.findings]
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -286,12 +285,10 @@ def _repeated_rows_findings(
     news_after = np.flatnonzero(repeats[:-1] & ~repeats[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = (
-        repeats.mean() > MIN_REPEATED_ROW_SHARE or _longest_run(repeats) >= MIN_REPEATED_BLOCK_ROWS
-    )
+    longest = _longest_run(repeats)
+    enough = repeats.mean() > MIN_REPEATED_ROW_SHARE or longest >= MIN_REPEATED_BLOCK_ROWS
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
-    longest = _longest_run(repeats)
     fresh = np.flatnonzero(~repeats)
     period = int(np.median(np.diff(fresh)))
     news = "" if rate is None else f": new values come at {rate * len(fresh) / len(repeats):.4g} Hz"

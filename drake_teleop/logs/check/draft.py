@@ -60,6 +60,7 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 _HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+_BASE_FORCE_PATTERN = r"tcp_force(_?\d+)?$|^o_f_ext"
 _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
@@ -155,7 +156,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
-    wrench |= {"frame": "base"} if any(map(_is_in_base_axes, forces)) else {}
+    wrench |= {"frame": "base"} if any(re.search(_BASE_FORCE_PATTERN, x) for x in forces) else {}
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
         draft["wrench"] = wrench
@@ -218,7 +219,7 @@ def _other_wrench_findings(
             return
         used = {x for kind in pair for x in other[kind]}
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
-        frame = "base" if _is_in_base_axes(plain[other["force"][0]][0]) else "sensor"
+        frame = "base" if re.search(_BASE_FORCE_PATTERN, plain[other["force"][0]][0]) else "sensor"
         text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
         yield Finding("other wrench", f"{text}; to use it, set {lines} and wrench.frame: {frame}")
 
@@ -230,10 +231,6 @@ def _normalized_name_and_unit(name: str) -> tuple[str, str]:
         unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[\W_]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
-
-
-def _is_in_base_axes(force: str) -> bool:
-    return bool(re.search(r"tcp_force(_?\d+)?$|^o_f_ext", force))
 
 
 def _remove_trailing_number(name: str) -> str:
