@@ -481,6 +481,7 @@ POSE_NAMES = {  # of robots and recorders: position, orientation, and its drafte
         [f"posx_{k}" for k in (3, 4, 5)],
         ("euler", "ZYZ"),
     ),
+    "ABB EGM": ([f"cartesian.pos.{x}" for x in _XYZ], [f"orient.u{k}" for k in range(4)], ()),
     "MATLAB": ([f"Pos_{k}" for k in (1, 2, 3)], [f"Quat_{k}" for k in (1, 2, 3, 4)], ()),
     "tf": ([f"tf/translation/{x}" for x in _XYZ], [f"tf/rotation/{x}" for x in "wxyz"], ()),
 }

@@ -74,7 +74,7 @@ _ALLOWED_UNITS = {
 }  # fmt: skip
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
-_NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
+_NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?u?[0-4]$"
 _MAX_ROWS_OF_STATIC_LOG = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_OF_RAW_COUNTS = 2000.0  # median of integers that are raw counts
 _MAX_GYRO_RATE_DEG_S = 4000.0  # faster than any gyroscope measures
