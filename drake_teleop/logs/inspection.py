@@ -32,6 +32,7 @@ MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
 """Smallest reported share of repeated rows, and smallest number of rows of a reported block."""
 _MIN_FROZEN_ROWS, _MIN_MOTION_SHARE_BESIDE_FROZEN = 50, 0.3
 _MAX_DRAFT_CORRECTIONS = 5  # by the data
+_MIN_DECIMALS = 3  # numbers with a point in a first line that is no header
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _COLUMNS_THAT_MARK_CANONICAL_LOG = {"f_x", "tau_x"}
 _INSPECTED_QUANTITIES = (
@@ -67,8 +68,7 @@ def inspect_command(
         with output_folder(out):
             draft = join_drafts(drafts)
             _correct_and_write_draft(draft, _find_writable_draft_path(out), summary)
-        more = [{"name": x.name, "message": x.message} for x in draft.findings]
-        summary["findings"] = [*summary["findings"], *more]
+        summary["findings"] += [{"name": x.name, "message": x.message} for x in draft.findings]
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -105,7 +105,8 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
     table = read_table(path)
     # polars adds a suffix to repeated names.
     names = [name.partition("_duplicated_")[0] for name in table.columns]
-    header = not all(map(is_decimal_number, names))
+    numbers = [name for name in names if is_decimal_number(name)]
+    header = len(numbers) < len(names) and sum("." in name for name in numbers) < _MIN_DECIMALS
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
@@ -284,12 +285,10 @@ def _repeated_rows_findings(
     news_after = np.flatnonzero(repeats[:-1] & ~repeats[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = (
-        repeats.mean() > MIN_REPEATED_ROW_SHARE or _longest_run(repeats) >= MIN_REPEATED_BLOCK_ROWS
-    )
+    longest = _longest_run(repeats)
+    enough = repeats.mean() > MIN_REPEATED_ROW_SHARE or longest >= MIN_REPEATED_BLOCK_ROWS
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
-    longest = _longest_run(repeats)
     fresh = np.flatnonzero(~repeats)
     period = int(np.median(np.diff(fresh)))
     news = "" if rate is None else f": new values come at {rate * len(fresh) / len(repeats):.4g} Hz"

@@ -78,3 +78,14 @@ def test_no_load_is_identified_from_mirrored_poses(
         assert found.identification.mass == pytest.approx(PHI[0], rel=0.01)
     else:
         assert [x.name for x in check_log(path).findings] == ["left-handed"]
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_sign_of_the_wrench_does_not_hide_mirrored_poses(
+    tmp_path: Path, axis: str, sign: float
+) -> None:
+    c = record(MIRRORS[axis], MIRRORS[axis])
+    c["force"], c["torque"] = sign * c["force"], sign * c["torque"]
+    path = written(tmp_path, c, imu=False)
+    assert left_handed_pose_finding(read_log(path), None, 0.0) is not None

@@ -326,6 +326,18 @@ def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -
     assert read_table(tmp_path / "y.parquet").single_column("t", "here").tolist() == t.tolist()
 
 
+def test_durations_of_matlab_are_seconds(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.csv", "t,f\n0.25 sec,1\n1.5 sec,2\n")
+    assert read_table(path).single_column("t", "here").tolist() == [0.25, 1.5]
+
+
+@pytest.mark.parametrize("stamp", ["01.03.2026 23:59:50,5", "2026-03-29_00-59-55"])
+def test_error_of_other_dates_states_the_form(tmp_path: Path, stamp: str) -> None:
+    path = write(tmp_path / "x.csv", f"t;f\n{stamp};1\n")
+    with pytest.raises(DrakeTeleopError, match="write times in seconds, or as 2026-03-01T12:00"):
+        read_table(path).single_column("t", "here")
+
+
 @pytest.mark.parametrize(
     ("values", "step"),
     [

@@ -466,6 +466,87 @@ def test_numbered_quaternions_are_drafted(
     assert draft["pose"]["position"]["columns"] == ["x", "y", "z"] and left == []
 
 
+_XYZ = ("x", "y", "z")
+POSE_NAMES = {  # of robots and recorders: position, orientation, and its drafted form
+    "KUKA": ([f"RIst.{x}" for x in "XYZ"], [f"RIst.{x}" for x in "ABC"], ("euler", "ZYX")),
+    "xArm": (
+        [f"pose_{x}" for x in _XYZ],
+        ["pose_roll", "pose_pitch", "pose_yaw"],
+        ("euler", "xyz"),
+    ),
+    "Kinova": ([f"tool_pose_{x}" for x in _XYZ], [f"tool_pose_theta_{x}" for x in _XYZ], None),
+    "Denso": ([f"P{x}[mm]" for x in "XYZ"], [f"R{x}[deg]" for x in "XYZ"], None),
+    "Doosan": (
+        [f"posx_{k}" for k in (0, 1, 2)],
+        [f"posx_{k}" for k in (3, 4, 5)],
+        ("euler", "ZYZ"),
+    ),
+    "ABB EGM": ([f"cartesian.pos.{x}" for x in _XYZ], [f"orient.u{k}" for k in range(4)], ()),
+    "MATLAB": ([f"Pos_{k}" for k in (1, 2, 3)], [f"Quat_{k}" for k in (1, 2, 3, 4)], ()),
+    "tf": ([f"tf/translation/{x}" for x in _XYZ], [f"tf/rotation/{x}" for x in "wxyz"], ()),
+}
+
+
+@pytest.mark.parametrize("name", POSE_NAMES)
+def test_names_of_poses_are_drafted(tmp_path: Path, name: str) -> None:
+    position, orientation, form = POSE_NAMES[name]
+    t = np.arange(60) * 0.01
+    columns = {"datetime": t} | {f"Force_{k}": np.sin(k + t) for k in (1, 2, 3)}
+    columns |= {f"Torque_{k}": np.cos(k + t) for k in (1, 2, 3)}
+    columns |= {name: np.sin(k + t) for k, name in enumerate(position)}
+    columns |= {name: np.full(60, 0.5) for name in orientation}
+    pl.DataFrame(columns).write_csv(path := tmp_path / "x.csv")
+    streams = draft_description(read_table(path), tmp_path).streams
+    found = streams["pose"]["orientation"]
+    assert streams["pose"]["position"]["columns"] == position
+    assert found["columns"] == orientation
+    default = ("rotation_vector",) if form is None else ("quaternion_wxyz",)
+    assert tuple(found[x] for x in ("form", "axes") if x in found) == (form or default)
+    assert streams["wrench"]["force"]["columns"] == ["Force_1", "Force_2", "Force_3"]
+    assert streams["wrench"]["torque"]["columns"] == ["Torque_1", "Torque_2", "Torque_3"]
+    assert {stream["time"]["column"] for stream in streams.values()} == {"datetime"}
+
+
+@pytest.mark.parametrize("axes", ["xyz", "ZYX", "ZYZ"])
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_one_correction_of_a_rotation_vector_states_euler_angles(
+    tmp_path: Path, axes: str, unit: str
+) -> None:
+    orientation = {"columns": POSITION, "form": "rotation_vector", "unit": unit}
+    path = described(tmp_path, table(), pose__orientation=orientation)
+    edits = list(orientation_and_gravity_sign_edits(load_description(path)))
+    fields = {"pose.orientation.form": "euler", "pose.orientation.axes": axes}
+    (edited,) = [description for finding, description in edits if finding.fields == fields]
+    assert edited.pose is not None and edited.pose.orientation.form == "euler"
+    assert edited.pose.orientation.axes == axes and edited.pose.orientation.unit == unit
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("axes", "sign"), [("xyz", -1), ("ZYX", 1), ("XYZ", -1)])
+def test_rx_ry_rz_can_be_euler_angles(tmp_path: Path, axes: str, sign: int) -> None:
+    frame = table(sign=float(sign))
+    quaternion = frame.select(QUATERNION).to_numpy()[:, [1, 2, 3, 0]]
+    angles = Rotation.from_quat(quaternion).as_euler(axes, degrees=True)
+    columns = {"t": "t", **dict(zip(POSITION, _XYZ, strict=True))}
+    columns |= dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Mx", "My", "Mz"], strict=True))
+    written = renamed(frame, columns)
+    written = written.with_columns(**{f"r{x}": angles[:, k] for k, x in enumerate(_XYZ)})
+    written.write_csv(tmp_path / "table.csv")
+    draft, left = drafted(tmp_path / "table.csv")
+    found = draft["pose"]["orientation"]
+    assert [found[x] for x in ("form", "axes", "unit")] == ["euler", axes, "deg"]
+    assert draft["wrench"]["sign"] == sign and left == []
+
+
+@pytest.mark.parametrize("texts", [["ft_link"], [], ["a", "b"]])
+def test_first_line_of_numbers_is_no_header(tmp_path: Path, texts: list[str]) -> None:
+    """`ros2 topic echo --csv` writes seconds, nanoseconds, the frame and numbers without names."""
+    rows = [["170", str(k), *texts, *(f"{k + i}.5" for i in range(6))] for k in range(1, 30)]
+    (tmp_path / "x.csv").write_text("\n".join(map(",".join, rows)))
+    draft, _ = drafted(tmp_path / "x.csv")
+    assert draft["wrench"]["header"] is False
+
+
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize(
     ("sign", "push"),

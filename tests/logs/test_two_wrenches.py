@@ -60,3 +60,15 @@ def test_first_of_two_sensors_is_used(tmp_path: Path, is_first: bool) -> None:
 def test_one_wrench_has_no_finding(tmp_path: Path, name: str) -> None:
     path = write(tmp_path, [*PAIRS[name][0], "mag_x", "mag_y", "mag_z"])
     assert draft_description(read_table(path), tmp_path).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("other", "frame"), [("K_F_ext_hat_K", "sensor"), ("actual_TCP_force", "base")]
+)
+def test_lines_for_the_other_wrench_include_its_frame(
+    tmp_path: Path, other: str, frame: str
+) -> None:
+    names = [f"{name}[{k}]" for name in ("O_F_ext_hat_K", other) for k in range(6)]
+    draft = draft_description(read_table(write(tmp_path, names)), tmp_path)
+    assert draft.streams["wrench"]["frame"] == "base"
+    assert draft.findings[0].message.endswith(f" and wrench.frame: {frame}")

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drake_teleop.common.rotations import EULER_AXIS_SEQUENCES
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read import description_fields
@@ -20,7 +21,7 @@ from drake_teleop.logs.read.description_fields import known_unit
 from drake_teleop.logs.read.tables import ColumnsOnAccess, Table
 
 _TIME_NAME_PATTERN = (
-    r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?|zeit|temps|tiempo|tempo)(_?(s|ms|us|ns))?$"
+    r"(^|_)(t|(date_?)?time|time_?stamp|stamp|secs?|zeit|temps|tiempo|tempo)(_?(s|ms|us|ns))?$"
 )
 # Ends of the names of vectors, before the axis.
 _VECTOR_NAME_PATTERNS = {
@@ -28,7 +29,7 @@ _VECTOR_NAME_PATTERNS = {
     "torque": "t|m|tau|torques?|moment",
     "specific_force": "a|s|acc|accel|(?<!angular_)acceleration",
     "angular_velocity": "w|g|omega|gyro|gyr|angular_velocity",
-    "orientation": "q|quat|quaternion|orientation",
+    "orientation": "q|quat|quaternion|orientation|rotation",
     "position": "p|pos|position|translation|tcp|ee|eef",
 }
 _VECTOR_PAIRS_OF_EACH_INSTRUMENT = (
@@ -42,6 +43,7 @@ _EULER_ANGLE_NAMES = {
     ("yaw", "pitch", "roll"): "ZYX",
     ("a", "b", "c"): "ZYX",  # of KUKA
     ("w", "p", "r"): "xyz",  # of Fanuc
+    ("rx", "ry", "rz"): "rotation_vector",  # or Euler angles, which the data determine
 }
 # Names of numbered columns, and positions of the components of a vector.
 _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
@@ -50,6 +52,7 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
         "torque": (3, 4, 5),
     },
     r"tcp_pose$": {"position": (0, 1, 2), "rotation_vector": (3, 4, 5)},  # of Universal Robots
+    r"posx$": {"position": (0, 1, 2), "ZYZ": (3, 4, 5)},  # of Doosan
     r"(^|_)t_ee$": {  # of Franka, column by column
         "matrix": (0, 4, 8, 1, 5, 9, 2, 6, 10),
         "position": (12, 13, 14),
@@ -57,7 +60,7 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 _HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-_FORCE_IN_BASE_AXES_PATTERN = r"tcp_force$|^o_f_ext"
+_BASE_FORCE_PATTERN = r"tcp_force(_?\d+)?$|^o_f_ext"
 _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
@@ -71,7 +74,7 @@ _ALLOWED_UNITS = {
 }  # fmt: skip
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
-_NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
+_NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?u?[0-4]$"
 _MAX_ROWS_OF_STATIC_LOG = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_OF_RAW_COUNTS = 2000.0  # median of integers that are raw counts
 _MAX_GYRO_RATE_DEG_S = 4000.0  # faster than any gyroscope measures
@@ -138,7 +141,7 @@ _Columns = dict[str, list[str]]  # names of the columns of each recognized vecto
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
     """Return a log description guessed from names and magnitudes of columns."""
     plain = {name: _normalized_name_and_unit(name) for name in table.columns}
-    found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
+    found = _find_euler_angles(plain) | _find_pose_vectors(table, plain) | _find_vectors(plain)
     found |= _find_numbered_or_array_vectors(table, plain) | _find_quaternion(table, plain)
     ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
@@ -153,8 +156,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
-    if any(re.search(_FORCE_IN_BASE_AXES_PATTERN, name) for name in forces):
-        wrench["frame"] = "base"
+    wrench |= {"frame": "base"} if any(re.search(_BASE_FORCE_PATTERN, x) for x in forces) else {}
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
         draft["wrench"] = wrench
@@ -217,8 +219,9 @@ def _other_wrench_findings(
             return
         used = {x for kind in pair for x in other[kind]}
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
+        frame = "base" if re.search(_BASE_FORCE_PATTERN, plain[other["force"][0]][0]) else "sensor"
         text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
-        yield Finding("other wrench", f"{text}; to use it, set {lines}")
+        yield Finding("other wrench", f"{text}; to use it, set {lines} and wrench.frame: {frame}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
@@ -268,6 +271,10 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
             groups.setdefault(match[1], {}).setdefault(match[2], name)
         elif kind == "position" and words in ("x", "y", "z"):
             groups.setdefault("", {}).setdefault(words, name)
+    spelled = "|".join(x for x in names.split("|") if len(x) > 2)
+    threes = {} if groups else _group_numbered_columns(plain, rf"(^|_)({spelled})_?[0-3]$")
+    if found := {name: group for name, group in threes.items() if len(group) == len(axes) == 3}:
+        return found
     for name, (words, unit) in plain.items() if not groups else ():  # in another language
         match = re.match(r"^(.*?)_?([xyz])$", words)
         if match and known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
@@ -279,12 +286,13 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
 def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
-        prefix, _, end = words.rpartition("_")
+        prefix, _, end = re.sub("theta_(?=[xyz]$)", "r", words).rpartition("_")  # of Kinova
         ends.setdefault(prefix, {}).setdefault(end, name)
     for names, axes in _EULER_ANGLE_NAMES.items():
         for group in ends.values():
             if all(name in group for name in names):
-                return {axes: [group[name] for name in names]}
+                position = {"position": [group[x] for x in "xyz"]} if {*"xyz"} <= {*group} else {}
+                return {axes: [group[name] for name in names]} | position
     return {}
 
 
@@ -388,7 +396,7 @@ def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[st
         orientation = {"columns": found["orientation"], "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
         orientation = {"columns": found[form], "form": form}
-    elif euler := next((name for name in found if name in _EULER_ANGLE_NAMES.values()), None):
+    elif euler := next((name for name in found if name in EULER_AXIS_SEQUENCES), None):
         orientation = _draft_quantity(table, plain, "euler", found[euler])
         orientation |= {"form": "euler", "axes": euler}
     elif (name := "rotation_vector") in found:

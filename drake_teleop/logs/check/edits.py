@@ -41,9 +41,7 @@ Edit = tuple[Finding, Description]  # a finding, and the corrected description
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
     first, *rest = path.split(".", 1)
-    if rest:
-        model: Any = getattr(description, first)
-        value = edit_field(model, rest[0], value)
+    value = edit_field(getattr(description, first), rest[0], value) if rest else value
     return description.model_copy(update={first: value})
 
 
@@ -109,11 +107,13 @@ def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edi
     if orientation.form in forms:
         text = f"the quaternions are not {orientation.form}"
         yield edit("quaternion order", text, {f"{where}.form": forms[orientation.form]})
-    for axes in EULER_AXIS_SEQUENCES if orientation.form == "euler" else ():
-        if axes != orientation.axes:
-            text = f"the Euler angles are not about the axes {orientation.axes}"
-            yield edit("Euler axes", text, {f"{where}.axes": axes})
     if orientation.form in ("rotation_vector", "euler"):
+        form = {} if orientation.form == "euler" else {f"{where}.form": "euler"}
+        text = "the angles are Euler angles, not a rotation vector"
+        text = text if form else f"the Euler angles are not about the axes {orientation.axes}"
+        for axes in EULER_AXIS_SEQUENCES:
+            if axes != orientation.axes:
+                yield edit("Euler axes", text, form | {f"{where}.axes": axes})
         text = f"the angles are not in {orientation.unit}"
         unit = "deg" if orientation.unit == "rad" else "rad"
         yield edit("degrees", text, {f"{where}.unit": unit})

@@ -33,7 +33,8 @@ def left_handed_pose_finding(
     kinds = [(P, torque_sign) for P in signed_permutations() for torque_sign in (1.0, -1.0)]
     right = np.stack([wrench @ P.T * [[1.0], [k]] / scale[:, None] for P, k in kinds], axis=-1)
     right = right.reshape(-1, len(kinds))
-    is_mirrored = np.array([np.linalg.det(P) < 0.0 and k < 0.0 for P, k in kinds])
+    # Two reversed axes and a reversed torque are more likely a mirror with a reversed wrench.
+    is_mirrored = np.array([k < 0.0 and min(np.linalg.det(P), P.trace()) < 0.0 for P, k in kinds])
     least = {True: np.inf, False: np.inf}
     size = 9.81 if log.gravity is None else float(np.median(np.linalg.norm(log.gravity, axis=1)))
     for gravity_W in size * np.vstack([np.eye(3), -np.eye(3)]):

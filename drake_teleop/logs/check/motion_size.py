@@ -9,7 +9,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array, white_noise_deviations
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
-from drake_teleop.logs.read.alignment import low_pass_log
+from drake_teleop.logs.read.alignment import low_pass_log, vectors_of_skew_parts
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.17, 0.06
@@ -23,9 +23,7 @@ def motion_rms(log: Log) -> tuple[float, float]:
     """Return rms changes of specific force [m/s^2] and angular velocity [rad/s], without noise."""
     smooth = low_pass_log(log, min(_CUTOFF_HZ, 0.2 / log.dt))
     s, omega = (float(np.linalg.norm(x.std(axis=0))) for x in smooth.motion[:2])
-    if log.posed is None:
-        return s, omega
-    by_pose = _motion_rms_of_poses(log.posed)
+    by_pose = None if log.posed is None else _motion_rms_of_poses(log.posed)
     if by_pose is None:
         return s, omega
     imu = None if log.described is None else log.described.imu
@@ -66,10 +64,8 @@ def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
     rows = len(poses.t) // (2 * count) * 2 * count
     if rows < 2 * count * _MIN_BLOCKS:
         return None
-    halves = [
-        Poses(poses.t[k:rows:2], poses.position[k:rows:2], poses.quaternion[k:rows:2])
-        for k in (0, 1)
-    ]
+    arrays = poses.t, poses.position, poses.quaternion
+    halves = [Poses(*(x[k:rows:2] for x in arrays)) for k in (0, 1)]
     motions = [_block_motion(half.average_consecutive(count), posed.gravity_W) for half in halves]
     s, omega = (
         np.sqrt(max(0.0, float(((a - a.mean(axis=0)) * (b - b.mean(axis=0))).mean(axis=0).sum())))
@@ -83,5 +79,4 @@ def _block_motion(poses: Poses, gravity_W: Array) -> tuple[Array, Array]:
     acceleration = np.gradient(np.gradient(poses.position, poses.t, axis=0), poses.t, axis=0)
     s = np.einsum("nji,nj->ni", R_WS, acceleration - gravity_W)
     turned = np.einsum("nji,njk->nik", R_WS[:-1], R_WS[1:])
-    axial = [turned[:, k, j] - turned[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
-    return s, 0.5 * np.stack(axial, axis=1) / np.diff(poses.t)[:, None]
+    return s, vectors_of_skew_parts(turned) / np.diff(poses.t)[:, None]

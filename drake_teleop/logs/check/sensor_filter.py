@@ -33,8 +33,7 @@ def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
                 high = _high_passed(V, cutoff, dt)
                 second = lfilter(*butter(2, 2.0 * cutoff * dt), V - V[0], axis=0) + V[0]
                 models = [("none", V), ("high-pass", high), ("low-pass", V - high)]
-                models.append(("low-pass", second))
-                for name, columns in models:
+                for name, columns in [*models, ("low-pass", second)]:
                     misfit = _sum_squared_residuals(columns, wrench, basis)
                     if misfit < least[name]:
                         least[name], fitting[name] = misfit, float(cutoff)

@@ -222,8 +222,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     reach = min(MAX_SEARCHED_DELAY_S, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    gap = ~is_far_from_gaps(log, cutoff)
-    inside &= samples_to_nearest_flag(gap) > math.ceil(reach / log.dt)
+    inside &= samples_to_nearest_flag(~is_far_from_gaps(log, cutoff)) > math.ceil(reach / log.dt)
     inside = np.flatnonzero(inside)
     if len(inside) < _MIN_SAMPLES_FOR_DELAY:
         return None

@@ -35,10 +35,9 @@ _MCAP_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large (more than 1.5 GB, or 200 times the file)"
 _SPLIT_REMEDY = "cut the bag, or write each topic to its own bag"
-_SHORT_NAME_OF_FIELD = dict.fromkeys(("orientation", "rotation"), "orientation")
-_SHORT_NAME_OF_FIELD |= dict.fromkeys(("position", "translation"), "position")
-_FIELDS_THAT_ARE_SHORT_NAMES = ("force", "torque", "linear_acceleration", "angular_velocity")
-_SHORT_NAME_OF_FIELD |= {field: field for field in _FIELDS_THAT_ARE_SHORT_NAMES}
+_SHORT_NAMES = "orientation", "position", "force", "torque", "linear_acceleration"
+_SHORT_NAME_OF_FIELD = {x: x for x in (*_SHORT_NAMES, "angular_velocity")}
+_SHORT_NAME_OF_FIELD |= {"rotation": "orientation", "translation": "position"}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),

@@ -62,8 +62,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
             text = f"{same.sum()} rows that repeat the previous row and its time stamp are removed"
             notes.append(text)
     t = t[rows]
-    shared = int((np.diff(t) == 0).sum())
-    if shared:
+    if shared := int((np.diff(t) == 0).sum()):
         even = smooth_duplicate_stamps(t)
         if (np.diff(even) <= 0).any():
             row = table.line_in_file(rows[int(np.argmax(np.diff(even) <= 0))])

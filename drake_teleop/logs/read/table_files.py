@@ -239,11 +239,10 @@ def _header_in_comment(comments: list[str], rows: list[str], separator: str) -> 
 
 
 def is_decimal_number(cell: str) -> bool:
-    try:
+    with suppress(ValueError):
         float(cell.replace(",", "."))
-    except ValueError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _strip_column_names(names: list[str]) -> list[str]:
@@ -295,9 +294,8 @@ def _read_excel(path: Path) -> Table:
             wide += [name] if rows[name] and sum(full) >= _MIN_WRENCH_COLUMNS else []
     best = max(wide or rows, key=lambda name: rows[name])
     if similar := [x for x in wide if x != best and rows[x] >= _MIN_SHEET_ROW_RATIO * rows[best]]:
-        what = (
-            f"the sheets {best!r} and {', '.join(map(repr, similar))} have tables of similar size"
-        )
+        names = ", ".join(map(repr, similar))
+        what = f"the sheets {best!r} and {names} have tables of similar size"
         raise DrakeTeleopError(what, where=str(path), remedy="save each sheet as a CSV file")
     others = ", ".join(repr(name) for name in sheets if name != best)
     note = f"{path.name}: the sheet {best!r} was read; other sheets: {others}" if others else ""

@@ -165,7 +165,9 @@ class Table:
     def _not_a_number_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         what = f"{cell!r} in row {self.line_in_file(row)} is not a number"
         remedy = "correct the cell or delete the row"
-        if row == 0:
+        if isinstance(cell, str) and (":" in cell or cell[4:5] == "-"):
+            remedy = "write times in seconds, or as 2026-03-01T12:00:00.002"
+        elif row == 0:
             remedy += ", for example a row of units, which belong into the log description"
         return DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
 
@@ -201,7 +203,8 @@ def _column_to_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleop
     numbers = np.empty(len(column))
     for row, cell in enumerate(column):
         try:
-            numbers[row] = np.nan if cell is None else float(cell)
+            number = cell.removesuffix(" sec") if isinstance(cell, str) else cell  # of MATLAB
+            numbers[row] = np.nan if cell is None else float(number)
         except (TypeError, ValueError) as error:
             raise bad(row, cell) from error
         if isinstance(cell, str) and "_" in cell:  # which Python ignores
