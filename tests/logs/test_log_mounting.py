@@ -23,6 +23,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read import auto_frames
+from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import (
     LeverArm,
@@ -367,14 +368,24 @@ def test_mirrored_axes_are_found_despite_a_lag() -> None:
     assert mounting(recorder, tables).is_mirrored
 
 
-def test_lag_of_the_imu_is_reported_but_not_corrected() -> None:
+@pytest.mark.quick_cases(1)
+@pytest.mark.parametrize("later", [0.2, -0.3])
+def test_lag_of_the_imu_is_reported_but_not_corrected(later: float) -> None:
     tables = Recorder(RIGHT_ANGLED, np.zeros(3)).tables()
-    late = tables[Path("i")].columns["t"] + 0.2
-    tables[Path("i")] = replace(tables[Path("i")], columns=tables[Path("i")].columns | {"t": late})
-    log = read_described_log(described(frame="auto"), "log.yaml", tables=tables)
-    assert any("lags that of the pose by 0.206 s" in note for note in log.notes)
-    s = motion_at(log.t - LAG - 0.2).specific_force
+
+    def read_with_imu_stamps_later(shift: float) -> Log:
+        columns = tables[Path("i")].columns
+        moved = replace(tables[Path("i")], columns=columns | {"t": columns["t"] + shift})
+        shifted = tables | {Path("i"): moved}
+        return read_described_log(described(frame="auto"), "log.yaml", tables=shifted)
+
+    log = read_with_imu_stamps_later(later)
+    (note,) = (note for note in log.notes if "lags that of the pose" in note)
+    assert f" by {later + LAG:.3f} s" in note
+    s = motion_at(log.t - LAG - later).specific_force
     assert np.abs(log.specific_force - s)[20:-20].mean() < 0.4
+    offset = float(note.split("; add ")[1].split(" to imu.time.offset")[0])
+    assert not any("lags" in x for x in read_with_imu_stamps_later(later + offset).notes)
 
 
 def test_gaps_are_excluded_from_the_mounting() -> None:
