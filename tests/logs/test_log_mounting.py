@@ -28,9 +28,11 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import (
     LeverArm,
     Mounting,
+    are_lever_arm_axes_observable,
     find_mounting,
     lag_of_imu_clock,
     lever_arm_from_wrench,
+    lever_matrix,
 )
 from drake_teleop.logs.read.reading import read_described_log, read_log
 from drake_teleop.logs.read.tables import Table
@@ -358,6 +360,29 @@ def test_undetermined_rotation_raises_error(changes: dict[str, Any], words: list
     assert message.startswith("log.yaml:imu.frame: the data do not determine the rotation")
     for word in words:
         assert word in message
+
+
+@pytest.mark.parametrize("gyroscope", [False, True])
+@pytest.mark.parametrize("place", [[0.08, -0.05, 0.02], [-0.02, 0.03, 0.1]])
+def test_specific_force_is_that_of_the_origin_of_S(place: list[float], gyroscope: bool) -> None:
+    found = []
+    for p in (place, [0.0, 0.0, 0.0]):
+        tables = Recorder(np.eye(3), np.array(p), noise=0.0, lag=0.0, seconds=2.0).tables()
+        description = described(gyroscope=gyroscope, position=p)
+        found.append(read_described_log(description, "log.yaml", tables=tables).specific_force)
+    assert np.abs(found[0] - found[1])[50:-50].max() < 0.1  # of 5 m/s^2
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_noise_about_an_axis_hides_coordinates_across_it(axis: int) -> None:
+    t = np.arange(0, 4, 2e-3)
+    at, noise = (
+        motion_at(t),
+        np.outer(np.random.default_rng(0).normal(size=len(t)), np.eye(3)[axis]),
+    )
+    log = Log(t, np.zeros((len(t), 6)), at.specific_force, at.omega, at.alpha + 3000.0 * noise)
+    observable = are_lever_arm_axes_observable(lever_matrix(at.omega, at.alpha), log, 8.0)
+    assert np.flatnonzero(observable).tolist() == [axis]
 
 
 def test_mirrored_axes_are_found_despite_a_lag() -> None:

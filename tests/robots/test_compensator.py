@@ -359,6 +359,14 @@ def test_wrong_rate_is_flagged() -> None:
     assert not any(compensator.step(each, each.t).flags for each in kept)  # an eighth is lost
 
 
+@pytest.mark.parametrize("count", [100, 250])
+def test_rate_is_measured_anew_after_a_restart(count: int) -> None:
+    compensator = Compensator(load(), DT)
+    again = readings(450, start=5.0)
+    flags = [compensator.step(each, each.t).flags for each in (*readings(count), *again)]
+    assert np.flatnonzero(flags).tolist() == [count] and flags[count] == ReadingFlag.RESTART
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("channel", range(6))
 def test_wrench_is_limited_to_the_range_of_the_sensor(channel: int, sign: float) -> None:
