@@ -137,6 +137,18 @@ def test_force_and_position_of_haply_use_the_same_axes():
     )
 
 
+@pytest.mark.parametrize("axis", np.eye(3).tolist())
+@pytest.mark.parametrize("angle", [-1.2, 0.4])
+def test_rotations_of_haply_are_in_the_axes_of_its_positions(axis, angle):
+    cursor = {"device_id": "a", "state": {"cursor_position": dict(zip("xyz", axis, strict=True))}}
+    turn = quaternion_exponential(tuple(angle * np.array(axis)))
+    grip = {"state": {"orientation": dict(zip("wxyz", turn, strict=True))}}
+    text = json.dumps({"inverse3": [cursor], "verse_grip": [grip]})
+    _, state = parse_device_message(text)
+    expected = quaternion_exponential(tuple(angle * np.array(state.position)))
+    assert state.quaternion_wxyz == pytest.approx(expected)
+
+
 @pytest.mark.parametrize(
     ("packet", "reason"),
     [

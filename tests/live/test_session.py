@@ -441,6 +441,14 @@ def test_weight_scale_is_separate_or_that_of_the_inertia_at_minus_one(scenario, 
 
 
 @pytest.mark.parametrize(
+    ("percent", "scale"), [(-1, None), (0, 0.0), (1, 0.01), (50, 0.5), (300, 3.0)]
+)
+def test_weight_scale_is_absent_only_at_minus_one(percent, scale):
+    inputs = Inputs().with_changes({"sigma": 50, "sigma_weight": percent})
+    assert inputs.force_scales["sigma_weight"] == scale
+
+
+@pytest.mark.parametrize(
     "scales",
     [
         {"force_scale": 2.0},

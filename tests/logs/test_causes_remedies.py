@@ -343,6 +343,21 @@ def test_remedy_adds_the_weight_and_composes_the_pose_frame(seed: int, tmp_path:
     assert log.wrench == pytest.approx(right, abs=0.01)
 
 
+@pytest.mark.parametrize("late", [0.04, -0.06])
+def test_restored_weight_has_the_direction_of_gravity_in_each_wrench(
+    late: float, tmp_path: Path
+) -> None:
+    """The clock of the poses differs from that of the wrench."""
+    record = replace(Record.simulate(seconds=4.0, noise=0.0), imu_at=None)
+    right = record.wrench.copy()
+    record.without_weight(0.4, [0.1, -0.2, 0.3])
+    record.wrench_lines = {"weight": [0.4, 0.04, -0.08, 0.12]}
+    record.pose_lines = {"time": {"column": "t", "offset": late}}
+    log = read_log(record.write(tmp_path))
+    rows = np.round(log.t / 0.02).astype(int)[5:-5]
+    assert log.wrench[5:-5] == pytest.approx(right[rows], abs=0.01)
+
+
 def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> None:
     record = Record.simulate(seconds=1.0)
     cause = Finding("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from known_motion import motion_at
+from known_motion import GRAVITY_W, motion_at
 from scipy.signal import savgol_filter
 
 from drake_teleop.common.numeric import white_noise_deviations
@@ -99,6 +99,17 @@ def test_undelayed_shifts_motion_but_not_wrench() -> None:
     np.testing.assert_allclose(back.specific_force, now.specific_force, atol=1e-3)
     np.testing.assert_allclose(back.angular_velocity, now.omega, atol=1e-3)
     np.testing.assert_allclose(back.angular_acceleration, now.alpha, atol=1e-2)
+
+
+@pytest.mark.parametrize("delay_s", [0.0123, -0.02])
+def test_orientation_and_gravity_are_shifted_with_the_motion(delay_s: float) -> None:
+    t = np.arange(0, 2, 0.001)
+    R_WS = motion_at(t - delay_s).R_WS
+    log = replace(make_log(t), R_WS=R_WS, gravity=GRAVITY_W @ R_WS)
+    back = remove_delay(log, delay_s)
+    now = motion_at(back.t)
+    np.testing.assert_allclose(back.R_WS, now.R_WS, atol=1e-4)
+    np.testing.assert_allclose(back.gravity, GRAVITY_W @ now.R_WS, atol=1e-3)
 
 
 def test_gaps_of_wrench_and_motion_are_both_flagged_after_a_delay() -> None:

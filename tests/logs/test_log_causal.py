@@ -16,6 +16,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass, compute_causal_wrench, filter_lag
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.read.reading import read_log
 
 DT, CUTOFF = 1e-3, 30.0
 
@@ -103,6 +104,19 @@ def test_contact_free_start_excludes_gaps(period: float, recorded: float, tmp_pa
     found = eliminate_log(log, LOAD, **options).causal
     assert found is not None
     np.testing.assert_allclose(found.offsets, OFFSETS, atol=0.012)
+
+
+@pytest.mark.parametrize("start", [-3.0, 1e3])
+def test_spans_without_contact_begin_with_the_first_sample(start: float, tmp_path: Path) -> None:
+    path = log_with_gaps(tmp_path / "log.parquet", 4.0, 4.0, 4.0)
+    options = {"delay": 0.0, "causal": "delayed", "causal_tare_s": 1.5, "untouched_s": (0.5, 2.0)}
+    wanted, log = eliminate_log(path, LOAD, **options), read_log(path)
+    write_log(replace(log, t=log.t + start), path)
+    found = eliminate_log(path, LOAD, **options)
+    assert found.log.t[0] == pytest.approx(start)
+    assert found.causal is not None and wanted.causal is not None
+    np.testing.assert_allclose(found.offsets, wanted.offsets, atol=1e-9)
+    np.testing.assert_allclose(found.causal.offsets, wanted.causal.offsets, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from known_motion import motion_at
+from known_motion import motion_at, quaternions
 from planted import good, written
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
@@ -182,6 +182,24 @@ def test_causal_wrench_is_independent_of_later_samples(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("span", [(0.3, 0.7), (1.2, 1.9)])
+def test_wrench_without_weight_has_its_own_offsets(
+    span: tuple[float, float], tmp_path: Path, load: Path
+) -> None:
+    """The inertial wrench of the span is part of them."""
+    path, t = simulated(tmp_path / "log.parquet"), np.arange(0, 4, 1e-3)
+    names = ("q_w", "q_x", "q_y", "q_z")
+    turns = dict(zip(names, quaternions(motion_at(t).R_WS).T, strict=True))
+    pl.read_parquet(path).with_columns(**turns).write_parquet(path)
+    known = Identification.load(load)
+    found = eliminate_log(path, known, delay=0.0, cutoff_hz=None, untouched_s=span)
+    log, rest = found.log, np.zeros((len(found.log), 3))
+    left = log.wrench - non_contact_wrench(-log.gravity, rest, rest, known.phi)
+    inside = (log.t >= span[0]) & (log.t <= span[1])
+    assert np.linalg.norm((left - found.offsets)[inside, :3].mean(axis=0)) > 0.5
+    np.testing.assert_allclose(found.gravity_only, left - left[inside].mean(axis=0), atol=1e-9)
+
+
 def test_tare_requires_enough_samples(tmp_path: Path, load: Path) -> None:
     log = simulated(tmp_path / "log.parquet")
     for seconds in (1e-3, 9.0):

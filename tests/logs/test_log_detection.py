@@ -21,7 +21,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import detect_log, eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.logs.summaries import summarize_log
+from drake_teleop.logs.summaries import shares_of_samples_above_force, summarize_log
 
 TOOL = phi_from_mass_com_inertia(1.5, [0.01, -0.02, 0.1], np.diag([0.01, 0.009, 0.004]))
 OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
@@ -144,6 +144,17 @@ def test_ntnu_hammer_is_not_detected_as_contact(ntnu: Path, tmp_path: Path, stat
     itself = detect_command(calm, tmp_path / "itself", free=calm, **options)
     assert itself["above_threshold"] == 0.0
     assert itself["above_force_threshold"]["raw"] > 0.85
+
+
+@pytest.mark.parametrize("offset", [0.0, -2.0, 30.0])
+def test_force_of_a_tared_sensor_is_relative_to_its_first_sample(offset: float) -> None:
+    contact = np.outer(np.arange(8.0), [0.0, 0.6, -0.8, 50.0, 0.0, 0.0])
+    wrenches: dict[str, Any] = {"measured": contact + offset, "contact": 0.5 * contact}
+    for weightless, share in ((None, None), (2.0 * contact, 4 / 6)):
+        edge = np.arange(8) > 5
+        found = SimpleNamespace(**wrenches, gravity_only=weightless, edge=edge)
+        shares = shares_of_samples_above_force(found, 3.5)
+        assert shares == {"raw": 2 / 6, "gravity_only": share, "eliminated": 0.0}
 
 
 def missing(summary: dict[str, Any], path: str = "") -> list[str]:

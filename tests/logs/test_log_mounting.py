@@ -23,13 +23,16 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read import auto_frames
+from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import (
     LeverArm,
     Mounting,
+    are_lever_arm_axes_observable,
     find_mounting,
     lag_of_imu_clock,
     lever_arm_from_wrench,
+    lever_matrix,
 )
 from drake_teleop.logs.read.reading import read_described_log, read_log
 from drake_teleop.logs.read.tables import Table
@@ -359,6 +362,29 @@ def test_undetermined_rotation_raises_error(changes: dict[str, Any], words: list
         assert word in message
 
 
+@pytest.mark.parametrize("gyroscope", [False, True])
+@pytest.mark.parametrize("place", [[0.08, -0.05, 0.02], [-0.02, 0.03, 0.1]])
+def test_specific_force_is_that_of_the_origin_of_S(place: list[float], gyroscope: bool) -> None:
+    found = []
+    for p in (place, [0.0, 0.0, 0.0]):
+        tables = Recorder(np.eye(3), np.array(p), noise=0.0, lag=0.0, seconds=2.0).tables()
+        description = described(gyroscope=gyroscope, position=p)
+        found.append(read_described_log(description, "log.yaml", tables=tables).specific_force)
+    assert np.abs(found[0] - found[1])[50:-50].max() < 0.1  # of 5 m/s^2
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_noise_about_an_axis_hides_coordinates_across_it(axis: int) -> None:
+    t = np.arange(0, 4, 2e-3)
+    at, noise = (
+        motion_at(t),
+        np.outer(np.random.default_rng(0).normal(size=len(t)), np.eye(3)[axis]),
+    )
+    log = Log(t, np.zeros((len(t), 6)), at.specific_force, at.omega, at.alpha + 3000.0 * noise)
+    observable = are_lever_arm_axes_observable(lever_matrix(at.omega, at.alpha), log, 8.0)
+    assert np.flatnonzero(observable).tolist() == [axis]
+
+
 def test_mirrored_axes_are_found_despite_a_lag() -> None:
     recorder = Recorder(random_rotation(3), np.zeros(3), seconds=3.0, lag=0.4)
     tables = recorder.tables()
@@ -367,14 +393,24 @@ def test_mirrored_axes_are_found_despite_a_lag() -> None:
     assert mounting(recorder, tables).is_mirrored
 
 
-def test_lag_of_the_imu_is_reported_but_not_corrected() -> None:
+@pytest.mark.quick_cases(1)
+@pytest.mark.parametrize("later", [0.2, -0.3])
+def test_lag_of_the_imu_is_reported_but_not_corrected(later: float) -> None:
     tables = Recorder(RIGHT_ANGLED, np.zeros(3)).tables()
-    late = tables[Path("i")].columns["t"] + 0.2
-    tables[Path("i")] = replace(tables[Path("i")], columns=tables[Path("i")].columns | {"t": late})
-    log = read_described_log(described(frame="auto"), "log.yaml", tables=tables)
-    assert any("lags that of the pose by 0.206 s" in note for note in log.notes)
-    s = motion_at(log.t - LAG - 0.2).specific_force
+
+    def read_with_imu_stamps_later(shift: float) -> Log:
+        columns = tables[Path("i")].columns
+        moved = replace(tables[Path("i")], columns=columns | {"t": columns["t"] + shift})
+        shifted = tables | {Path("i"): moved}
+        return read_described_log(described(frame="auto"), "log.yaml", tables=shifted)
+
+    log = read_with_imu_stamps_later(later)
+    (note,) = (note for note in log.notes if "lags that of the pose" in note)
+    assert f" by {later + LAG:.3f} s" in note
+    s = motion_at(log.t - LAG - later).specific_force
     assert np.abs(log.specific_force - s)[20:-20].mean() < 0.4
+    offset = float(note.split("; add ")[1].split(" to imu.time.offset")[0])
+    assert not any("lags" in x for x in read_with_imu_stamps_later(later + offset).notes)
 
 
 def test_gaps_are_excluded_from_the_mounting() -> None:

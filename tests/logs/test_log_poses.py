@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -241,6 +242,33 @@ def test_undetermined_auto_raises_error(folder, tmp_path):
 def test_contradictory_description_raises_error(folder, pose, wrench, message):
     with pytest.raises(DrakeTeleopError, match=message):
         load_description(described(folder, "own", wrench, **pose))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_found_frame_and_described_frame_are_composed(seed):
+    """The description has put the pose into a frame that is shifted and rotated in S."""
+    X_SD, X_DP = np.tile(np.eye(4), (2, 1, 1))
+    rng = np.random.default_rng(seed)
+    for X in (X_SD, X_DP):
+        X[:3, :3] = rotation_matrices(rng.uniform(-1.0, 1.0, (1, 3)), "rotation_vector")[0]
+        X[:3, 3] = rng.uniform(-0.1, 0.1, 3)
+    found = SimpleNamespace(
+        frame=SimpleNamespace(
+            is_shifted=True, is_rotated=True, p_SoPo_S=X_SD[:3, 3], R_SP=X_SD[:3, :3],
+            position_stds_m=np.full(3, 1e-3), rotation_stds_deg=np.full(3, 0.1),
+        ),
+        units_and_axes=SimpleNamespace(
+            position_unit_ratio=1.0, position_unit_ratio_std=0.01, is_usable=False
+        ),
+        free_frame_fit=SimpleNamespace(parameters=SimpleNamespace(theta=np.r_[np.zeros(6), PHI])),
+    )  # fmt: skip
+    _, _, poses = record(Kind(seed=4))
+    posed = PosesOfLog(poses, GRAVITY_W, X_DP[:3, 3], X_DP[:3, :3])
+    lines = pose_frame_finding(found, posed).message.split("; set ")[1].split(" and ")
+    place, turn = (json.loads(line.split(": ")[1]) for line in lines)
+    X_SP = X_SD @ X_DP
+    np.testing.assert_allclose(place, X_SP[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(turn, X_SP[:3, :3], atol=1e-4)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 8.8507])

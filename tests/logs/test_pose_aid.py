@@ -17,7 +17,7 @@ from drake_teleop.logs.pose_motion.imu_rows import (
     _fit_imu_gain_errors_bias_and_shift,
     correct_imu_data,
 )
-from drake_teleop.logs.pose_motion.poses import ImuData, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.pose_motion.spectra import (
     FitWindow,
     Spectra,
@@ -191,3 +191,26 @@ def write_record(folder: Path, kind: Kind) -> Path:
     path = folder / "log.yaml"
     path.write_text(yaml.safe_dump(document))
     return path
+
+
+@pytest.mark.parametrize("start", [-4.0, 50.0, 1e6])
+def test_poses_and_imu_of_a_log_keep_one_clock(start):
+    poses, imu = poses_of(Kind(seed=4))[2], imu_data(4)
+    late = PosesOfLog(
+        replace(poses, t=poses.t + start), GRAVITY_W, imu=replace(imu, t=imu.t + start)
+    )
+    moved = late.with_times_relative_to(start)
+    np.testing.assert_allclose(moved.poses.t, poses.t, atol=1e-9)
+    np.testing.assert_allclose(moved.imu.t, imu.t, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("gap_s", [0.0, 0.02, 3.0])
+def test_means_of_an_imu_are_not_across_gaps(gap_s, count):
+    t = np.arange(203.0) / RATE
+    t[101:] += gap_s
+    imu = ImuData(t, np.outer(t, [1.0, -2.0, 0.5]), None)
+    found = imu.average_to_rate(0.99 * RATE / count)
+    assert len(found.t) == len(t) // count - (gap_s > 0.0)
+    np.testing.assert_allclose(found.specific_force, np.outer(found.t, [1.0, -2.0, 0.5]))
+    assert np.abs(t - found.t[:, None]).min(axis=1).max() < 0.51 / RATE

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -19,6 +20,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.robots import replay_log
 from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
@@ -108,6 +110,34 @@ def test_replayed_log_equals_eliminate(log: Path, mode: str, weight: float | Non
         assert all(not row.contact.any() for row in kept.rows if row.flags)
 
     at()
+
+
+@pytest.mark.parametrize("start", [0.0, 1e3, -7.5])
+def test_replay_in_real_time_begins_with_the_first_sample(
+    start: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.array([each.values for each in readings(60, start=start)])
+    t, now, found = start + DT * np.arange(60), [50.0], []
+    write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "log.parquet")
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds + 1e-3
+
+    monkeypatch.setattr(replay_log, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    source = ReplayLogSource(tmp_path / "log.parquet", None, real_time=True)
+    while (arrived := source.read(0.01)) is not None:
+        found += [each.t for each in arrived]
+        assert abs(len(found) - min((now[0] - 50.0) / DT + 1.0, 60)) < 1.01
+    np.testing.assert_array_equal(found, t)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.013, 0.04])
+def test_replayed_log_at_rest_has_the_delay_of_the_load(delay_s: float, tmp_path: Path) -> None:
+    values = np.array([each.values for each in resting(300, OFFSETS)])
+    write_log(Log(DT * np.arange(300), *np.split(values, [6, 9, 12], axis=1)), tmp_path / "l.csv")
+    source = ReplayLogSource(tmp_path / "l.csv", replace(load(), delay_s=delay_s))
+    assert source.delay_readings == math.ceil(delay_s / DT)
+    assert len(source.read(0.0) or ()) == 256 and len(source.read(0.0) or ()) < 45
 
 
 @pytest.mark.parametrize("rate_hz", [8.0, 15.0, 20.0, 25.0])
@@ -329,11 +359,24 @@ def test_wrong_rate_is_flagged() -> None:
     assert not any(compensator.step(each, each.t).flags for each in kept)  # an eighth is lost
 
 
-def test_wrench_is_limited_to_the_range_of_the_sensor() -> None:
-    compensator = Compensator(load(), DT, gamma=30.0, sensor_range=np.full(6, 60.0))
-    out = [compensator.step(each, each.t) for each in readings(20, touched=5.0)][-1]
-    assert out.flags == ReadingFlag.CLIPPED and out.scaled[0] == 60.0
-    np.testing.assert_allclose(out.contact[0], 5.0)
+@pytest.mark.parametrize("count", [100, 250])
+def test_rate_is_measured_anew_after_a_restart(count: int) -> None:
+    compensator = Compensator(load(), DT)
+    again = readings(450, start=5.0)
+    flags = [compensator.step(each, each.t).flags for each in (*readings(count), *again)]
+    assert np.flatnonzero(flags).tolist() == [count] and flags[count] == ReadingFlag.RESTART
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("channel", range(6))
+def test_wrench_is_limited_to_the_range_of_the_sensor(channel: int, sign: float) -> None:
+    limits, unit = np.array([60.0, 70.0, 80.0, 6.0, 7.0, 8.0]), np.eye(6)[channel]
+    compensator = Compensator(load(), DT, gamma=4.0, sensor_range=limits)
+    push = 0.3 * sign * limits * unit
+    out = [compensator.step(each, each.t) for each in resting(5, OFFSETS + push)][-1]
+    assert out.flags == ReadingFlag.CLIPPED
+    np.testing.assert_allclose(out.contact, push, atol=1e-12)
+    np.testing.assert_allclose(out.scaled, sign * limits * unit, atol=1e-12)
 
 
 def test_delayed_wrenches_are_clipped() -> None:

@@ -26,9 +26,9 @@ from websockets.sync.client import connect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots import rtde
+from drake_teleop.robots import netft, rtde
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.connections import open_sink
+from drake_teleop.robots.connections import SOURCES, open_sink
 from drake_teleop.robots.netft import NetFtSource, SampleClock, parse_counts_and_rate
 from drake_teleop.robots.ros2_zenoh import ZenohSource
 from drake_teleop.robots.rtde import RtdeSource
@@ -316,12 +316,41 @@ def test_netft_status_and_repeated_samples_are_flagged(status: int, flag: int, s
     source.close()
 
 
-def test_netft_page_contains_counts_units_and_rate() -> None:
-    page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
-        <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
-    assert parse_counts_and_rate(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
+@pytest.mark.parametrize(
+    ("force", "torque", "newtons", "newton_metres"),
+    [("lbf", "N-mm", 4.4482216, 1e-3), ("klbf", "lbf-in", 4448.2216, 0.11298483),
+     ("N", "N-m", 1.0, 1.0), ("kN", "kN-m", 1e3, 1e3), ("kgf", "kgf-cm", 9.80665, 0.0980665)],
+)  # fmt: skip
+def test_netft_page_contains_counts_units_and_rate(
+    force: str, torque: str, newtons: float, newton_metres: float
+) -> None:
+    page = f"""<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>{force}</scfgfu>
+        <scfgtu>{torque}</scfgtu><comrdtrate>500</comrdtrate></netft>"""
+    counts = [4448 / newtons, 1e6 / newton_metres]
+    assert parse_counts_and_rate(page.encode()) == pytest.approx([*counts, 500.0])
     for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
         with pytest.raises((ValueError, KeyError, SyntaxError)):
             parse_counts_and_rate(bad)
     with pytest.raises(DrakeTeleopError, match=r"page .*; check the host, or give netft://HOST"):
         NetFtSource("netft://127.0.0.9")
+
+
+@pytest.mark.parametrize("rate_hz", [None, 250.0, 2000.0])
+@pytest.mark.parametrize(
+    ("query", "counts", "rate"),
+    [("", (10, 20), None), ("?counts=2,4", (2, 4), None), ("?rate=1000", (10, 20), 1000.0),
+     ("?counts=2,4&rate=1000", (2, 4), 1000.0)],
+)  # fmt: skip
+def test_counts_and_rate_of_netft_are_those_of_the_address_then_of_the_option_then_of_the_page(
+    query: str,
+    counts: tuple[int, int],
+    rate: float | None,
+    rate_hz: float | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(netft, "_fetch_counts_per_unit_and_rate", lambda _: [10.0, 20.0, 500.0])
+    source = SOURCES["netft"](f"netft://127.0.0.1{query}", rate_hz, ())
+    assert 1.0 / source.dt == pytest.approx(rate or rate_hz or 500.0)
+    part = source.reading_of_packet(struct.pack(">III6i", 1, 7, 0, *[40] * 6), 0.0)
+    np.testing.assert_allclose(part.values, -40.0 / np.repeat(counts, 3))
+    source.close()

@@ -137,6 +137,24 @@ def test_stated_lag_is_that_of_the_window(rate_hz: int, cutoff_hz: float) -> Non
     assert max(ages) < assembly.lag_s + 2.0 / rate_hz
 
 
+@pytest.mark.quick_cases(2)
+@pytest.mark.parametrize(
+    ("delay", "first", "last"), [("auto", 0.003, 0.004), (0.0, 0.0, 0.0), (-0.01, -0.01, -0.01)]
+)
+def test_only_an_automatic_delay_is_tracked_from_that_of_the_load(
+    delay: str | float, first: float, last: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poses are stamped 4 ms late."""
+    posed = StreamStub(WRENCH, POSE)
+    monkeypatch.setattr(connections, "_open_registered_source", lambda *_: posed)
+    known = dataclasses.replace(load(), delay_s=0.003)
+    place = (*X_FS[4:], 0.0, math.degrees(0.6), 0.0)
+    source = open_source("posed", known, rate_hz=500.0, delay=delay, sensor_pose=place)
+    assert source.delay_s == first
+    played(source, 0.8, later=0.004)
+    assert source.delay_s == pytest.approx(last, abs=3e-4 if delay == "auto" else 0.0)
+
+
 def test_pose_of_the_sensor_is_refused_for_an_imu(monkeypatch: pytest.MonkeyPatch) -> None:
     stubs = {"imu": StreamStub(WRENCH, IMU), "posed": StreamStub(WRENCH, POSE)}
     monkeypatch.setattr(connections, "_open_registered_source", lambda at, *_: stubs[at])
