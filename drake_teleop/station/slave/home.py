@@ -61,8 +61,7 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
         k = int(outside.argmax())
         limits = f"{arm.lower[k]:.4g} to {arm.upper[k]:.4g}"
         what = f"joint {arm.joint_names[k]} at {q[k]:g} is outside its limits, {limits}"
-        remedy = "give a position within these limits"
-        raise DrakeTeleopError(what, where="slave.home", remedy=remedy)
+        raise DrakeTeleopError(what, where="slave.home", remedy="give a position within them")
     return q
 
 
@@ -77,9 +76,8 @@ def check_inertia_and_holding_torque(arm: ArmModel, q: Array) -> None:
     needed, limit = abs(torque[k]), arm.effort_limit[k]
     if needed > limit:
         unit = "N" if arm.table[k, IS_PRISMATIC_COLUMN] else "N m"
-        needs = (
-            f"{arm.joint_names[k]} needs {needed:.3g} {unit}, but its limit is {limit:.3g} {unit}"
-        )
+        name, limit_text = arm.joint_names[k], f"its limit is {limit:.3g} {unit}"
+        needs = f"{name} needs {needed:.3g} {unit}, but {limit_text}"
         what = f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {needs}"
         remedy = "give a lighter tool or payload, start nearer to the base, or set"
         remedy = f"{remedy} slave.torque_limits if the model's limits are wrong"
