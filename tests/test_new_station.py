@@ -97,7 +97,9 @@ def test_place_is_in_front_with_a_reachable_cube():
         pose = np.array([*w, *(found.position + found.cube_half_m * np.array(signs))])
         assert find_posture(arm, pose, found.q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
-    with pytest.raises(DrakeTeleopError, match="no posture found in which z_S points down"):
+    stiff.upper[2] = -0.005
+    said = r"no posture found in which z_S points down.* \(joint_3: -0.01 to -0.005 rad or m\)"
+    with pytest.raises(DrakeTeleopError, match=said):
         find_start_place(stiff)
 
 
@@ -173,6 +175,10 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
     assert (plan.tool_axis_advice, plan.tip_S, plan.place.is_set_by_position) == ("", [], True)
 
 
+def rotation_at(arm, q=0.4):
+    return RotationMatrix(Quaternion(arm.pose(np.array([q]))[:4])).matrix()
+
+
 @pytest.mark.parametrize(
     ("name", "where"),
     [
@@ -186,6 +192,24 @@ def test_advised_line_names_the_file_only_if_it_includes_no_models(name, where):
     advice = place.tool_frame_advice(Path(name), "hand", "x")
     assert where in advice
     assert (name in advice) == ("add to" in where)
+
+
+@pytest.mark.parametrize(("axis", "sensor"), [("x", "force"), ("y", "camera"), ("-z", "torque")])
+def test_advised_site_turns_z_to_the_tool_and_keeps_the_load(axis, sensor, tmp_path):
+    pose, joint = 'pos="0.1 0.2 0.3" euler="20 -30 50"', '<geom size="0.1"/><joint name="j"/>'
+    advice = place.tool_frame_advice(Path("a.xml"), "ft", axis, is_site=True)
+    advised = advice.split("write the site ft as ")[1].split(", where POSE")[0]
+    arms = []
+    for site in (f'<site name="ft" {pose}/>', advised.replace("POSE", pose)):
+        tail = f'<sensor><{sensor} site="ft"/></sensor>'
+        body = f"<worldbody><body>{joint}{site}</body></worldbody>{tail}"
+        path = tmp_path / f"{len(arms)}.xml"
+        path.write_text(f"<mujoco>{body}</mujoco>")
+        arms.append(NominalSlave(Slave(model=str(path), sensor_frame="ft", home=[0.4])).arm)
+    (before, after), (R_before, R_after) = arms, (rotation_at(each) for each in arms)
+    z_in_site = R_before.T @ R_after[:, 2]
+    np.testing.assert_allclose(z_in_site, place.R_SA_BY_AXIS[axis].matrix()[:, 2], atol=1e-4)
+    assert after.phi_load[0] == pytest.approx(before.phi_load[0])
 
 
 def test_advised_quaternion_has_no_rounding_errors():

@@ -130,7 +130,11 @@ ERRORS = {
     "a property that is used": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')).replace(
         "<link", '<xacro:property name="m" value="2"/><link', 1), "is a xacro file"),
     "a macro's number": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')),
-                         "link l3: mass ..m. kg is not between 0 and"),
+                         "link l3: mass ..m. kg is not between 0 and.*; expand it first"),
+    "a macro's length": ("urdf", arm(j3=joint(3).replace('xyz="', 'xyz="${h} ', 1)),
+                         "joint j3: origin xyz='..h.*; expand it first"),
+    "a macro's limits": ("urdf", arm().replace('effort="', 'effort="$(arg e)'),
+                         "j2: effort limit '..arg e.*; expand it first"),
     # Trees
     "a loop": ("urdf", arm(beyond=joint(9, parent="l6", child="l2")),
                "l2 is the child of two joints, j2 and j9"),

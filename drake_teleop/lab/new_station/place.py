@@ -171,7 +171,10 @@ def find_start_place(
             f" (of {NUM_RANDOM_POSTURES} random postures, {causes}; {len(postures.q)} are left on"
             " the best side)"
         )
-        remedy = "check joint limits and the orientation of sensor_frame"
+        slides, ranges = arm.sliding_joints, arm.upper - arm.lower
+        k = min(range(arm.num_joints), key=lambda j: (j in slides, ranges[j]))
+        limits = f"{arm.joint_names[k]}: {arm.lower[k]:.3g} to {arm.upper[k]:.3g} rad or m"
+        remedy = f"check joint limits ({limits}) and the orientation of sensor_frame"
         raise DrakeTeleopError(what, where="new", remedy=remedy)
     pose = best.pose if axis == "z" else arm.pose(best.q)
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
@@ -393,31 +396,34 @@ def opposite_axis(axis: str) -> str:
 
 
 def tool_frame_advice(
-    model: Path, sensor_frame: str, axis: str, *, is_along_tool: bool = True
+    model: Path, frame: str, axis: str, *, is_along_tool: bool = True, is_site: bool = False
 ) -> str:
     """Return how to add a sensor frame with z along `axis`, as a text; "" for axis "z"."""
     if axis == "z":
         return ""
-    R_SA, name = R_SA_BY_AXIS[axis], f"{sensor_frame}_z_to_tool"
-    rpy = " ".join(f"{angle + 0.0:.5g}" for angle in RollPitchYaw(R_SA).vector())
-    degrees = ", ".join(f"{angle + 0.0:.5g}" for angle in np.degrees(RollPitchYaw(R_SA).vector()))
+    R_SA, name = R_SA_BY_AXIS[axis], f"{frame}_z_to_tool"
+    angles = RollPitchYaw(R_SA).vector() + 0.0
+    rpy = " ".join(f"{angle:.5g}" for angle in angles)
+    degrees = ", ".join(f"{angle:.5g}" for angle in np.degrees(angles))
     quaternion = " ".join(f"{part:.5g}" for part in R_SA.ToQuaternion().wxyz().round(5) + 0.0)
+    kind = model.suffix.lower()
     lines = {
-        ".xml": f'<body name="{name}" quat="{quaternion}"/> in the body {sensor_frame}',
-        ".sdf": f'<frame name="{name}" attached_to="{sensor_frame}"><pose>0 0 0 {rpy}</pose>'
-        f"</frame> in the model of {sensor_frame}",
-        ".yaml": f"- add_frame: {{name: {name}, X_PF: {{base_frame: MODEL::{sensor_frame},"
+        ".xml": f'<body name="{name}" quat="{quaternion}"/> in the body {frame}',
+        ".sdf": f'<frame name="{name}" attached_to="{frame}"><pose>0 0 0 {rpy}</pose></frame>'
+        f" in the model of {frame}",
+        ".yaml": f"- add_frame: {{name: {name}, X_PF: {{base_frame: MODEL::{frame},"
         f" rotation: !Rpy {{deg: [{degrees}]}}}}}}",
+        ".urdf": f'<link name="{name}"/><joint name="{name}_joint" type="fixed">'
+        f'<parent link="{frame}"/><child link="{name}"/><origin rpy="{rpy}"/></joint>',
     }
-    urdf = (
-        f'<link name="{name}"/><joint name="{name}_joint" type="fixed">'
-        f'<parent link="{sensor_frame}"/><child link="{name}"/><origin rpy="{rpy}"/></joint>'
-    )
     # MJCF and SDF files may include the file with the sensor frame.
-    place = f" to {model.name}" if model.suffix.lower() not in (".xml", ".sdf") else ""
+    place = f" to {model.name}" if kind not in (".xml", ".sdf") else ""
+    advice = f"add{place} {lines[kind]} and give --sensor-frame {name}"
+    if is_site:  # force sensors at the site keep their body as load
+        turned = f'<frame POSE><site name="{frame}" quat="{quaternion}"/></frame>'
+        advice = f"write the site {frame} as {turned}, where POSE is its pos and orientation"
     what = f"the tool points along {axis}_S" if is_along_tool else f"{axis}_S points down"
     return (
         f"{what}, so the start is in slave.home and the contact point in"
-        f" slave.tip; to use slave.position, or another direction of the tool, add{place}"
-        f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame {name}"
+        f" slave.tip; to use slave.position, or another direction of the tool, {advice}"
     )

@@ -16,6 +16,7 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.slave.arm import ArmModel, holding_torque
+from drake_teleop.station.slave.model.model_repair import SITE_ASSUMPTION
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
 from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
@@ -97,6 +98,7 @@ def plan_station(
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, tool_axis)
     on_sensor = None if tool is not None else slave.tool
     is_along_tool = axis == tool_axis or on_sensor is not None
+    is_site = f"{SITE_ASSUMPTION} {sensor_frame}" in shapes.assumptions
     share = 1.0 if own_tool else start.MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
     model, weak_joints, texts = _without_weak_torque_limits(shapes.arm, place.q, share)
     if axis != tool_axis:
@@ -139,7 +141,7 @@ def plan_station(
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *texts),
         tool_axis_advice=start.tool_frame_advice(
-            arm, sensor_frame, axis, is_along_tool=is_along_tool
+            arm, sensor_frame, axis, is_along_tool=is_along_tool, is_site=is_site
         ),
         direction_at_start=f"{'tool' if is_along_tool else f'{axis}_S'} {direction}",
         overlap_warnings=tuple(overlap_warnings(shapes, slave_only=True)),
@@ -170,10 +172,8 @@ def _find_start_and_tool_axis(
             errors.append(error)
             continue
         found.append((place, axis, shapes))
-        is_sufficient = place.posture_score > _SUFFICIENT_POSTURE_SCORE
-        if axis == tool_axis:
-            is_sufficient = not (is_stand_in and place.has_overlaps)
-        if is_sufficient:
+        is_usable = not (is_stand_in and place.has_overlaps)
+        if is_usable if axis == tool_axis else place.posture_score > _SUFFICIENT_POSTURE_SCORE:
             break
     if not found:
         raise errors[0]

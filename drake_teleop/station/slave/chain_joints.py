@@ -34,8 +34,7 @@ _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
 def joints_by_child(plant: MultibodyPlant) -> dict[tree.BodyIndex, Joint]:
-    joints = map(plant.get_joint, plant.GetJointIndices())
-    return {joint.child_body().index(): joint for joint in joints}
+    return {j.child_body().index(): j for j in map(plant.get_joint, plant.GetJointIndices())}
 
 
 def chain_to_body(plant: MultibodyPlant, body: RigidBody) -> list[Joint]:
@@ -181,8 +180,7 @@ def weld_joints_outside_chain(
         if joint.num_velocities() > 0:
             names.append(joint.name())
             _replace_joint_by_weld(plant, joint)
-    names.sort()
-    return [f"held: {join_names(names)}"] if names else []
+    return [f"held: {join_names(sorted(names))}"] if names else []
 
 
 def weld_load_of_link_to_sensor_frame(

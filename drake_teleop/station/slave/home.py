@@ -61,8 +61,7 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
         k = int(outside.argmax())
         limits = f"{arm.lower[k]:.4g} to {arm.upper[k]:.4g}"
         what = f"joint {arm.joint_names[k]} at {q[k]:g} is outside its limits, {limits}"
-        remedy = "give a position within these limits"
-        raise DrakeTeleopError(what, where="slave.home", remedy=remedy)
+        raise DrakeTeleopError(what, where="slave.home", remedy="give a position within them")
     return q
 
 

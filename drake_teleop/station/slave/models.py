@@ -22,11 +22,10 @@ from drake_teleop.common.texts import read_text, read_yaml
 from drake_teleop.station.slave import chain_joints
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles
-from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
+from drake_teleop.station.slave.model.model_repair import XACRO_REMEDY, ModelPurpose, ModelRepair
 from drake_teleop.station.slave.model.urdf_and_sdf_repair import repair_sdf, repair_urdf
 
 _XACRO_FAULT = "is a xacro file, not a model"
-_XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the resulting URDF"
 _UNUSED_XACRO_TAGS = ("xacro:property", "xacro:arg")  # of no effect without ${...} and $(...)
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 _ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
@@ -45,7 +44,7 @@ def repair_and_parse_model(
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
     if kind == ".xacro":
-        raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=_XACRO_REMEDY)
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=XACRO_REMEDY)
     if kind == ".xml":
         read_text(path)  # raises an error for invalid encoding
     if kind == ".yaml":
@@ -76,8 +75,7 @@ def _add_model_file(parser: parsing.Parser, model: ModelRepair) -> list[ModelIns
     _repair_model_text(model)
     with raise_logged_errors():
         if model.text:
-            kind = model.path.suffix.lower().removeprefix(".")
-            return parser.AddModelsFromString(model.text, kind)
+            return parser.AddModelsFromString(model.text, model.path.suffix.lower()[1:])
         return parser.AddModels(str(model.path))
 
 
@@ -101,11 +99,9 @@ def _add_directives(parser: parsing.Parser, model: ModelRepair) -> list[ModelIns
 
 
 def _repair_model_text(model: ModelRepair) -> None:
-    repair = _REPAIR_FUNCTION_OF_SUFFIX.get(model.path.suffix.lower())
-    if repair is None:
-        return
-    _remove_unused_xacro_elements(model)
-    repair(model)
+    if repair := _REPAIR_FUNCTION_OF_SUFFIX.get(model.path.suffix.lower()):
+        _remove_unused_xacro_elements(model)
+        repair(model)
 
 
 def _remove_unused_xacro_elements(model: ModelRepair) -> None:
@@ -114,11 +110,10 @@ def _remove_unused_xacro_elements(model: ModelRepair) -> None:
     values = [value for each in elements for value in (*each.attrib.values(), each.text or "")]
     uses = any("${" in value or "$(" in value for value in values)
     if found and (uses or found.difference(_UNUSED_XACRO_TAGS)):
-        raise DrakeTeleopError(_XACRO_FAULT, where=str(model.path), remedy=_XACRO_REMEDY)
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(model.path), remedy=XACRO_REMEDY)
     for parent in elements:
-        for tag in found:
-            for child in parent.findall(tag):
-                parent.remove(child)
+        for child in [each for each in parent if each.tag in found]:
+            parent.remove(child)
 
 
 class ParsedArm(NamedTuple):
@@ -166,7 +161,7 @@ def ParseModel(
     if len(of_chain) > 1:
         names = sorted(map(plant.GetModelInstanceName, of_chain))
         what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
-        remedy = "write the chain up to the sensor as one model"
+        remedy = 'make them one model, in SDF by <include merge="true">'
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     instance = next(iter(of_chain), frame.model_instance())
     return ParsedArm(instance, frame, [*model.assumptions, *free, *held, *rotors])

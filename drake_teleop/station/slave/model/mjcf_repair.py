@@ -96,7 +96,7 @@ def _read_world_with_only_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
         sensors = [each for each in mjcf.elements_in("sensor") if each.tag in ("force", "torque")]
         is_measured = any(each.get("site") == sensor for each in sensors)
         _insert_sensor_frame_at_site(world, sensor, is_force_sensor_site=is_measured)
-        model.add_assumption("a frame of the model in place of the site", sensor)
+        model.add_assumption(model_repair.SITE_ASSUMPTION, sensor)
     return world
 
 
@@ -291,4 +291,4 @@ def _sum_of_masses_in_file(model: model_repair.ModelRepair) -> float:
     reader = BodyReader(Mjcf(unchanged))
     bodies = reader.read_world().with_descendants()[1:]
     mass = sum(reader.mass_properties_of_body(body).mass for body in bodies)
-    return mass if mass > 0.0 else np.inf
+    return mass or np.inf

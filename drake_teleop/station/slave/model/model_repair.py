@@ -14,6 +14,8 @@ from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 
 MISSING_SHAPES_TEXT = "shapes are missing of"
+SITE_ASSUMPTION = "a frame of the model in place of the site"
+XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the resulting URDF"
 _MAX_LISTED_NAMES = 12  # names in one statement
 
 
@@ -116,7 +118,8 @@ class ModelRepair:
             shown = sum(length <= MAX_ERROR_LINE_LENGTH - len(frame) for length in lengths)
             texts[shown:] = [f"and {count - shown} more"] if shown < count else []
             what = f"the model has {count} faults: {'; '.join(texts)}"
-        raise DrakeTeleopError(what, where=str(self.path))
+        remedy = XACRO_REMEDY if any("${" in x or "$(" in x for x in self._causes) else ""
+        raise DrakeTeleopError(what, where=str(self.path), remedy=remedy)
 
 
 def join_names(names: Iterable[str]) -> str:
