@@ -236,10 +236,8 @@ def _inspect_stream_and_list_bad_rows(
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
     if not good.all():
         first = table.line_in_file(int(np.argmin(good)))
-        text = (
-            f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}), the"
-            f" longest block has {figures['nan_longest']} rows; {delete} or repair them"
-        )
+        text = f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}),"
+        text += f" the longest block has {figures['nan_longest']} rows; {delete} or repair them"
         findings.append(Finding("nan", text))
     repeats = np.zeros(len(values), bool)
     repeats[1:] = (values[1:] == values[:-1]).all(axis=1)
@@ -256,10 +254,9 @@ def _inspect_stream_and_list_bad_rows(
         saturated = 0
         if i in frozen:
             first, last = (table.line_in_file(row) for row in frozen[i])
-            text = (
-                f"{at}: {column} keeps the value {x[frozen[i][0]]:.4g} in rows {first} to {last},"
-                f" but other channels vary: sensor or connection failed; {delete} these rows"
-            )
+            value = f"{x[frozen[i][0]]:.4g}"
+            text = f"{at}: {column} keeps the value {value} in rows {first} to {last}, but other"
+            text += f" channels vary: sensor or connection failed; {delete} these rows"
             findings.append(Finding("dead channel", text))
         elif time is not None and moving:
             saturated = _count_saturated_samples(x, repeats)
@@ -268,10 +265,8 @@ def _inspect_stream_and_list_bad_rows(
         mean = {"mean": float(finite.mean()), "noise": noise, "saturated": saturated}
         figures["columns"][column] = ends | mean
         if saturated:
-            text = (
-                f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
-                f" {finite.max():.4g}) for {saturated} samples; {delete} them or move slower"
-            )
+            text = f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
+            text += f" {finite.max():.4g}) for {saturated} samples; {delete} them or move slower"
             findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
     return figures, findings, rows if table.kept_rows is None else table.kept_rows[rows]
