@@ -115,7 +115,7 @@ def output_folder(
 def refuse_to_replace_inputs(path: Path, *input_paths: str | Path) -> None:
     """Raise DrakeTeleopError if `path` is one of `input_paths` or a file of a recorded drive.
 
-    Names that are no files, such as shipped names, are ignored.
+    Missing files, such as shipped names, are ignored.
     """
     if not path.exists():
         return
