@@ -179,17 +179,19 @@ def _inspect_described_log(
 ) -> list[Finding]:
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
+    timed = [x for x in (description.wrench, description.imu, description.pose) if x]
+    unstamped = {stream.source for stream in timed if stream.time.column is None}
     for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_bag_topic_or_table(stream)
             if note := tables[stream.source].note:
                 findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)
-        figures, more, rows = _inspect_stream_and_list_bad_rows(name, stream, table, source)
+        delete = "empty" if stream.source in unstamped else "delete"
+        figures, more, rows = _inspect_stream_and_list_bad_rows(name, stream, table, source, delete)
         summary["streams"][name] = figures
         findings += more
-        if getattr(stream, "time", None) and stream.time.column is None:
-            # Removal would shift the times of the following rows.
+        if stream.source in unstamped:  # removal would shift the times of the following rows
             tables[stream.source] = _empty_cells(tables[stream.source], stream.columns, rows)
             rows = rows[:0]
         bad.setdefault(stream.source, []).append(rows)
@@ -212,7 +214,7 @@ def _inspect_described_log(
 
 
 def _inspect_stream_and_list_bad_rows(
-    name: str, stream: Any, table: Table, source: str
+    name: str, stream: Any, table: Table, source: str, delete: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)
@@ -225,7 +227,6 @@ def _inspect_stream_and_list_bad_rows(
     figures: dict[str, Any] = {"rows": len(values)}
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
-    delete = "empty" if time is not None and time.column is None else "delete"
     if time is not None:
         more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, columns, figures)
         findings += more
@@ -325,10 +326,8 @@ def _inspect_clock_and_flag_usable_rows(
     findings = []
     if gaps:
         where = float(t[int(np.argmax(inner))] - t[0])
-        text = (
-            f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s (missing rows, or a"
-            " jump of the clock), are not used; record again if these parts are required"
-        )
+        text = f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s (missing rows, or"
+        text += " a jump of the clock), are not used; record again if these parts are required"
         findings.append(Finding("gap", text))
     if back:
         finite = np.flatnonzero(np.isfinite(stamps))
