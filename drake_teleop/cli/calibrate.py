@@ -46,7 +46,7 @@ def calibrate_command(
     console = Console(stderr=True, quiet=quiet)
     processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
-        files.refuse_to_replace_inputs(path, source.removeprefix("replay:"))
+        files.refuse_to_replace_inputs(path, *stream.files)
         with Live(console=console, auto_refresh=False) as live:
 
             def show_progress(at: RecordEvaluation) -> None:

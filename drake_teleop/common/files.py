@@ -112,15 +112,15 @@ def output_folder(
         raise CannotWrite(str(error), remedy=f"{out} contains {_join_file_names(valid)}") from error
 
 
-def refuse_to_replace_inputs(path: Path, input_path: str | Path | None = None) -> None:
-    """Raise DrakeTeleopError if `path` is the file `input_path` or a file of a recorded drive.
+def refuse_to_replace_inputs(path: Path, *input_paths: str | Path) -> None:
+    """Raise DrakeTeleopError if `path` is one of `input_paths` or a file of a recorded drive.
 
-    An `input_path` that is no file, such as a shipped name, is ignored.
+    Missing files, such as shipped names, are ignored.
     """
     if not path.exists():
         return
     what = "a recorded drive" if (path.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
-    if input_path is not None and os.path.isfile(input_path) and os.path.samefile(input_path, path):
+    if any(os.path.exists(x) and os.path.samefile(x, path) for x in input_paths):
         what = f"the input {path.name}"
     if what:
         what = f"contains {what}, which the results would replace"

@@ -96,7 +96,7 @@ def run_command(
     if drive is not None and (seed is not None or fresh):
         what = "a recorded drive contains its seed and load, which cannot be replaced"
         raise DrakeTeleopError(what, where="run --inputs", remedy="remove --seed and --fresh")
-    files.refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario)
+    files.refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario or "")
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario

@@ -180,17 +180,19 @@ def _inspect_described_log(
 ) -> list[Finding]:
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
+    timed = [x for x in (description.wrench, description.imu, description.pose) if x]
+    unstamped = {stream.source for stream in timed if stream.time.column is None}
     for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_bag_topic_or_table(stream)
             if note := tables[stream.source].note:
                 findings.append(Finding("sheet", note))
         table = tables[stream.source].rows_with_any_number(stream.columns)
-        figures, more, rows = _inspect_stream_and_list_bad_rows(name, stream, table, source)
+        delete = "empty" if stream.source in unstamped else "delete"
+        figures, more, rows = _inspect_stream_and_list_bad_rows(name, stream, table, source, delete)
         summary["streams"][name] = figures
         findings += more
-        if getattr(stream, "time", None) and stream.time.column is None:
-            # Removal would shift the times of the following rows.
+        if stream.source in unstamped:  # removal would shift the times of the following rows
             tables[stream.source] = _empty_cells(tables[stream.source], stream.columns, rows)
             rows = rows[:0]
         bad.setdefault(stream.source, []).append(rows)
@@ -213,7 +215,7 @@ def _inspect_described_log(
 
 
 def _inspect_stream_and_list_bad_rows(
-    name: str, stream: Any, table: Table, source: str
+    name: str, stream: Any, table: Table, source: str, delete: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)
@@ -226,7 +228,6 @@ def _inspect_stream_and_list_bad_rows(
     figures: dict[str, Any] = {"rows": len(values)}
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
-    delete = "empty" if time is not None and time.column is None else "delete"
     if time is not None:
         more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, columns, figures)
         findings += more
@@ -237,10 +238,8 @@ def _inspect_stream_and_list_bad_rows(
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
     if not good.all():
         first = table.line_in_file(int(np.argmin(good)))
-        text = (
-            f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}), the"
-            f" longest block has {figures['nan_longest']} rows; {delete} or repair them"
-        )
+        text = f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}),"
+        text += f" the longest block has {figures['nan_longest']} rows; {delete} or repair them"
         findings.append(Finding("nan", text))
     repeats = np.zeros(len(values), bool)
     repeats[1:] = (values[1:] == values[:-1]).all(axis=1)
@@ -257,10 +256,9 @@ def _inspect_stream_and_list_bad_rows(
         saturated = 0
         if i in frozen:
             first, last = (table.line_in_file(row) for row in frozen[i])
-            text = (
-                f"{at}: {column} keeps the value {x[frozen[i][0]]:.4g} in rows {first} to {last},"
-                f" but other channels vary: sensor or connection failed; {delete} these rows"
-            )
+            value = f"{x[frozen[i][0]]:.4g}"
+            text = f"{at}: {column} keeps the value {value} in rows {first} to {last}, but other"
+            text += f" channels vary: sensor or connection failed; {delete} these rows"
             findings.append(Finding("dead channel", text))
         elif time is not None and moving:
             saturated = _count_saturated_samples(x, repeats)
@@ -269,10 +267,8 @@ def _inspect_stream_and_list_bad_rows(
         mean = {"mean": float(finite.mean()), "noise": noise, "saturated": saturated}
         figures["columns"][column] = ends | mean
         if saturated:
-            text = (
-                f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
-                f" {finite.max():.4g}) for {saturated} samples; {delete} them or move slower"
-            )
+            text = f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
+            text += f" {finite.max():.4g}) for {saturated} samples; {delete} them or move slower"
             findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
     return figures, findings, rows if table.kept_rows is None else table.kept_rows[rows]
@@ -329,10 +325,8 @@ def _inspect_clock_and_flag_usable_rows(
     findings = []
     if gaps:
         where = float(t[int(np.argmax(inner))] - t[0])
-        text = (
-            f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s (missing rows, or a"
-            " jump of the clock), are not used; record again if these parts are required"
-        )
+        text = f"{at}: {gaps} gaps, the longest {longest:.3g} s at {where:.3g} s (missing rows, or"
+        text += " a jump of the clock), are not used; record again if these parts are required"
         findings.append(Finding("gap", text))
     if back:
         finite = np.flatnonzero(np.isfinite(stamps))

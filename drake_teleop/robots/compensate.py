@@ -143,7 +143,7 @@ def run_compensate_command(
     control_port = None if control is None else TareRequestPort(control)
     file = [Path(sink)] if is_file_address(sink) else []
     for path in file:
-        refuse_to_replace_inputs(path, source.removeprefix("replay:"))
+        refuse_to_replace_inputs(path, *readings.files)
     if earlier := move_earlier_recordings(*file if readings.live else ()):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)

@@ -38,7 +38,8 @@ class ReplayLogSource(Source):
         if log.static:
             what = "is a log of static poses, which have no order in time"
             raise DrakeTeleopError(what, where=str(path), remedy="give a log of a motion")
-        delay_s = 0.0
+        recorded = () if log.described is None else log.described.streams.values()
+        delay_s, self.files = 0.0, (Path(path), *(stream.file for stream in recorded))
         if load is not None:
             log = replace_specific_force_by_acceleration(log) if load.weight_removed else log
             phi = phi_with_inertia_replaced(load)[0]

@@ -6,6 +6,7 @@ Readings are in the sensor frame S, in SI units, with the sign of Eq. (1): wrenc
 from __future__ import annotations
 
 from enum import IntFlag
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -89,10 +90,12 @@ class Source(Protocol):
         dt: period of the wrenches [s].
         live: whether the readings arrive in real time; else as fast as they are read.
         streams: WRENCH_AND_MOTION, or streams of wrench and motion to combine.
+        files: replayed files.
     """
 
     dt: float
     live: bool = True
+    files: tuple[Path, ...] = ()
     streams: tuple[str, ...] = (WRENCH_AND_MOTION,)
 
     def read(self, timeout_s: float) -> list[Reading] | None:

@@ -218,6 +218,20 @@ def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) ->
     )
 
 
+@pytest.mark.quick_cases(2)
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [0.35, -0.25, 0.25, -0.35, 0.06, -0.06])
+def test_steps_are_found_except_within_two_tenths_of_a_second_of_an_end(at: float) -> None:
+    s, omega, alpha, *_ = moving(T)
+    wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS
+    step = T[0] + at if at > 0.0 else T[-1] + at
+    wrench += (step < T)[:, None] * np.array([30.0, -5.0, -7.0, 1.0, 3.0, 0.7])
+    wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
+    found = add_step_change(FittedModel.fit_record(record(wrench), LoadModel()), "offsets")
+    times = () if found is None else found.model.step_times
+    assert times == pytest.approx((step,) if abs(at) > 0.2 else (), abs=0.02)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [0.06, -0.06])
 def test_steps_at_the_ends_of_a_record_are_no_changes(at: float) -> None:

@@ -138,6 +138,22 @@ def described_imu(**changed: dict[str, Any]) -> Description:
     return Description.model_validate(document)
 
 
+@pytest.mark.parametrize(
+    ("unit", "bias", "size_rad"),
+    [("rad/s", 0.05, 0.0), ("rad/s", 0.02, 0.01), ("deg/s", 0.03, 0.02), ("mdeg/s", 0.02, 0.0)],
+)
+def test_bias_of_a_gyroscope_at_rest_is_no_wrong_unit_or_axis(
+    unit: str, bias: float, size_rad: float
+) -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    s = 9.80665 * Rotation.from_rotvec(np.outer(-size_rad * np.sin(t), [0, 1, 0])).apply([0, 0, 1])
+    for axis in np.eye(3):
+        omega = np.outer(size_rad * np.cos(t), [0, 1, 0]) + bias * (axis + 0.1)
+        log = Log(t, np.zeros((len(t), 6)), s, omega, np.zeros((len(t), 3)))
+        description = described_imu(angular_velocity={"unit": unit})
+        assert check_imu_signals(description, log) == ([], description)
+
+
 def test_axes_of_the_gyroscope_in_another_order_are_named() -> None:
     t = np.arange(0.0, 20.0, 0.02)
     at = motion_at(t)

@@ -502,11 +502,49 @@ def test_rows_of_zeros_between_other_values_are_lost_readings(
     read_log(path)
 
 
-@pytest.mark.parametrize("kind", ["starts at zero", "crosses zero", "dead band", "contact", "few"])
+@pytest.mark.parametrize("lost", [(399,), (300, 301, 900), (7, 700, 1400)])
+def test_remedy_for_lost_readings_keeps_the_times_of_a_given_rate(
+    tmp_path: Path, lost: tuple[int, ...]
+) -> None:
+    table, is_lost = canonical("s", "omega"), pl.Series(np.isin(np.arange(len(T)), [1, *lost]))
+    time = {"file": "log.csv", "time": {"rate": 500.0}}
+    names = "force", "torque", "specific_force", "angular_velocity"
+    groups = (
+        *np.split(np.array(WRENCH_COLUMNS), 2),
+        SPECIFIC_FORCE_COLUMNS,
+        ANGULAR_VELOCITY_COLUMNS,
+    )
+    fields = {name: {"columns": list(map(str, x))} for name, x in zip(names, groups, strict=True)}
+    wrench, imu = (time | {name: fields[name] for name in part} for part in (names[:2], names[2:]))
+    (tmp_path / "log.yaml").write_text(yaml.safe_dump({"wrench": wrench, "imu": imu}))
+    for value in 0.0, None:
+        cells = [pl.when(is_lost).then(value).otherwise(x).alias(x) for x in table.columns]
+        table.with_columns(cells).write_csv(tmp_path / "log.csv")
+        if value == 0.0:
+            with pytest.raises(DrakeTeleopError, match=r"empty their cells if time\.rate is given"):
+                read_log(tmp_path / "log.yaml")
+    log = read_log(tmp_path / "log.yaml")
+    assert log.t[-1] - log.t[0] == pytest.approx(T[-1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("starts at zero", "crosses zero", "dead band", "contact", "few", "resolution"),
+        *("constant", "opposite speeds", "stop and go", "taps"),
+    ],
+)
 def test_measured_zeros_are_no_lost_readings(kind: str) -> None:
     t = np.arange(0.0, 4.0, 0.002)
     x = np.stack([np.sin(3.0 * t), np.sin(3.0 * t), 2.0 * np.sin(3.0 * t)], axis=1)
+    rng, speed, about_x = np.random.default_rng(0), np.sin(12.5 * t), np.array([1.0, 0.0, 0.0])
+    rest, free = np.abs(speed) < 0.12, (np.sin(60.0 * t) < -0.7) | (np.sin(3.0 * t) < 0.0)
     values = {
+        "resolution": np.outer(rng.random(len(t)) < 0.7, about_x),
+        "constant": np.outer(rng.random(len(t)) > 0.003, [0.0, -0.1, 0.0]),
+        "opposite speeds": np.outer(np.where(rest, 0.0, np.sign(speed)), about_x),
+        "stop and go": np.outer(~rest, about_x),
+        "taps": np.outer(np.where(free, 0.0, 10.0 + 0.1 * rng.random(len(t))), about_x),
         "starts at zero": np.where(t[:, None] < 0.02, 0.0, x + 3.0),
         "crosses zero": np.round(x, 2),
         "dead band": np.where(np.abs(x) < 0.05, 0.0, x),

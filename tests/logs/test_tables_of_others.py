@@ -796,6 +796,20 @@ def test_gaps_of_episodes_do_not_include_those_between_them(
     assert f"the longest {length:.3g} s at {4.996 + first:.3g} s" in str(summary["findings"])
 
 
+@pytest.mark.parametrize("column", ["f1", "q2"])
+def test_rows_with_nan_keep_the_times_of_a_stream_without_stamps_in_their_table(
+    tmp_path: Path, column: str
+) -> None:
+    lost = pl.int_range(pl.len()).is_between(600, 700)
+    frame = table().with_columns(pl.when(lost).then(None).otherwise(column).alias(column))
+    path = described(tmp_path, frame, wrench__time={"rate": 500.0})
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    names = [finding["name"] for finding in summary["findings"]]
+    assert names[0] == "nan" and set(names) <= {"nan", "gap"}
+    assert "empty or repair them" in summary["findings"][0]["message"]
+    assert abs(summary["delay_s"]) < 1e-3
+
+
 @pytest.mark.parametrize("lost", [20, 400])
 def test_rows_with_nan_of_a_stream_without_stamps_keep_the_times_of_others(
     tmp_path: Path, lost: int

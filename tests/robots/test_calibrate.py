@@ -32,7 +32,13 @@ from drake_teleop.load.tolerance import (
     tolerances_in_display_units,
 )
 from drake_teleop.logs.processing import identify_log
-from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.read.canonical import (
+    ANGULAR_VELOCITY_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    WRENCH_COLUMNS,
+    Log,
+    write_log,
+)
 from drake_teleop.robots.calibration import (
     RecordEvaluation,
     advise_motion,
@@ -185,6 +191,38 @@ def test_replayed_log_is_never_replaced(tmp_path: Path, name: str) -> None:
         with pytest.raises(DrakeTeleopError, match=r"contains the input log.parquet, .* --out"):
             command()
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("names", [("log.parquet", "b.parquet"), ("a.csv", "log.parquet")])
+def test_files_of_a_replayed_description_are_never_replaced(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    wrench, *motion = np.split(recorded(2.0, [0]), [6, 9, 12], axis=1)
+    zeros = np.zeros_like(motion)
+    write_log(Log(DT * np.arange(400), wrench, *zeros), tmp_path / names[0])
+    write_log(Log(DT * np.arange(400), 0.0 * wrench, *motion), tmp_path / names[1])
+    groups = (
+        *np.split(np.array(WRENCH_COLUMNS), 2),
+        SPECIFIC_FORCE_COLUMNS,
+        ANGULAR_VELOCITY_COLUMNS,
+    )
+    fields = [{"columns": list(map(str, group))} for group in groups]
+    described = {
+        "wrench": {"file": names[0], "force": fields[0], "torque": fields[1]},
+        "imu": {"file": names[1], "specific_force": fields[2], "angular_velocity": fields[3]},
+    }
+    for stream in described.values():
+        stream["time"] = {"column": "t"}
+    (tmp_path / "log.yaml").write_text(json.dumps(described))
+    load().save(tmp_path / "load.json")
+    before = [(tmp_path / name).read_bytes() for name in names]
+    source = f"replay:{tmp_path / 'log.yaml'}"
+    for name in names:
+        with pytest.raises(DrakeTeleopError, match=rf"contains the input {name}, .* --out"):
+            run_compensate_command(source, tmp_path / "load.json", str(tmp_path / name))
+    with pytest.raises(DrakeTeleopError, match=r"contains the input log.parquet, .* --out"):
+        calibrate_command(source, tmp_path, until="mass 50 %", quiet=True)
+    assert [(tmp_path / name).read_bytes() for name in names] == before
 
 
 def evaluate(values: np.ndarray, until: str, path: Path) -> RecordEvaluation:

@@ -23,7 +23,7 @@ from drake_teleop.logs.causes.state import (
 
 _MIN_SCORE_STATISTIC_OF_STEP = 60.0
 _STEP_TIME_REFINEMENT_ROWS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
-_MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
+_MIN_TIME_BETWEEN_STEPS_S, _MIN_TIME_TO_END_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 0.2, 80.0
 MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
 _NUM_TRIED_STEP_TIMES, _MIN_STEP_OVER_DEVIATION, _MIN_OFFSET_STEP_OVER_NOISE = 2, 5.0, 2.0
 _MIN_MASS_STEP_OVER_MASS, _MIN_MOMENT_STEP_OVER_MASS_M = 0.01, 0.002
@@ -50,8 +50,7 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
     scan = _StepTimeScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
     gains = np.array([scan.score_statistic_of_step_at_row(int(n)) for n in starts])
-    others = (*state.model.step_times, float(data.t[0]), float(data.t[-1]))
-    for time in others:
+    for time in state.model.step_times:
         gains[np.abs(data.t[starts] - time) < _MIN_TIME_BETWEEN_STEPS_S] = 0.0
     out: list[float] = []
     for _ in range(_NUM_TRIED_STEP_TIMES):
@@ -60,7 +59,8 @@ def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
         time = float(data.t[max(near, key=scan.score_statistic_of_step_at_row)]) - 0.5 * data.dt
-        if all(abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in others):
+        far = [abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in state.model.step_times]
+        if all(far) and min(time - data.t[0], data.t[-1] - time) > _MIN_TIME_TO_END_S:
             out.append(time)
         distance = max(2.0 * _MIN_TIME_BETWEEN_STEPS_S, 3.0 * rows * data.dt)
         gains[np.abs(data.t[starts] - time) < distance] = 0.0
@@ -190,7 +190,7 @@ def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> F
 def _is_step_significant(state: FittedModel, i: int) -> bool:
     values, covariance = state.parameters_of_extension(f"step {i}")
     deviations, t, time = np.sqrt(np.diag(covariance)), state.data.t, state.model.steps[i].time
-    if min(time - t[0], t[-1] - time) < 0.5 * _MIN_TIME_BETWEEN_STEPS_S:
+    if min(time - t[0], t[-1] - time) < _MIN_TIME_TO_END_S:
         return False  # the few samples before or after it do not determine the change
     if state.model.steps[i].kind == "offsets":
         clear = np.abs(values) > _MIN_STEP_OVER_DEVIATION * deviations

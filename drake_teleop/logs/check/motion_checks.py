@@ -99,11 +99,13 @@ def _gyro_axes_edit(description: Description, imu: Imu, log: Log) -> Edit | None
         return None
     scales = {x: SI_VALUE_OF_UNIT[x] / SI_VALUE_OF_UNIT[unit] * np.eye(3) for x in _GYRO_UNITS}
     least, best_unit = min((misfit(P), x) for x, P in scales.items())
-    if _MIN_AXES_MISFIT_REDUCTION * least < given:
+    # At rest a bias of the gyroscope is the only rotation, which another unit can remove.
+    limit = min(given, misfit(np.zeros((3, 3)))) / _MIN_AXES_MISFIT_REDUCTION
+    if least < limit:
         text = f"the rotation of gravity in S shows that the gyroscope is not in {unit}"
         return make_edit(description, "degrees", text, {"imu.angular_velocity.unit": best_unit})
     best, P = min(((misfit(P), P) for P in signed_permutations()), key=lambda entry: entry[0])
-    if _MIN_AXES_MISFIT_REDUCTION * best > given:
+    if best > limit:
         return None
     text = "the axes of the gyroscope are not those of the accelerometer"
     names = imu.angular_velocity.columns

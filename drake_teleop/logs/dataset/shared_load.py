@@ -107,13 +107,9 @@ class _FittedEpisode(NamedTuple):
 
     def faultless_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
         """Return the faultless hypothesis of load phi (10,) at the best lag, and its residual."""
-        search = episode_verdict.HypothesisSearch(
-            self.signals, phi, self.own.lag, _MIN_RESIDUAL_HALF_WIDTH
-        )
-        steps = np.arange(
-            -episode_verdict.TRIED_LAGS_PER_FRAME, episode_verdict.TRIED_LAGS_PER_FRAME + 1
-        )
-        lags = self.own.lag + steps / episode_verdict.TRIED_LAGS_PER_FRAME
+        lag, count = self.own.lag, episode_verdict.TRIED_LAGS_PER_FRAME
+        search = episode_verdict.HypothesisSearch(self.signals, phi, lag, _MIN_RESIDUAL_HALF_WIDTH)
+        lags = lag + np.arange(-count, count + 1) / count
         found = (
             search.with_spread_and_cost(episode_verdict.hypothesis_without_fault(float(lag)))
             for lag in lags
