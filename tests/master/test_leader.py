@@ -129,6 +129,16 @@ def test_hand_holds_only_the_shown():
     assert heavy.get("twist_master")[2] < -0.01
 
 
+@pytest.mark.parametrize("hand", [(0.2, 0.0), (0.0, 3e-3), (0.15, 2e-4)])
+def test_hand_adds_its_mass_and_its_inertia_about_every_axis(hand):
+    free, held = leader(hand=(0.0, 0.0)), leader(hand=hand)
+    for away in (0.0, 0.4, -0.7):
+        q = free.home + away * np.array([1.0, -0.5, 0.8, 1.2, -0.9, 2.0])
+        J = free.jacobian(q)
+        added = held.mass_matrix(q) - free.mass_matrix(q)
+        np.testing.assert_allclose(added, J.T @ np.diag(np.repeat(hand, 3)) @ J, atol=1e-14)
+
+
 def test_work_of_hand_and_motors_equals_energy_plus_friction():
     """Kinetic energy only, because the motors carry the weight."""
     device = leader(friction=[0.01], damping=[0.02])
