@@ -17,11 +17,13 @@ from drake_teleop.station.slave.arm import (
     SENSOR_MOTION_SIZE,
     forward_dynamics,
     forward_kinematics,
+    holding_torque,
     inverse_dynamics,
     jacobian,
     sensor_motion,
 )
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, fill_missing_joint_limits
+from drake_teleop.station.slave.home import check_inertia_and_holding_torque
 
 
 @pytest.fixture(
@@ -197,6 +199,20 @@ def test_missing_limits_of_a_joint_are_those_of_its_type(slides, given):
     if not given:
         expected[[0, 4]] = 6.0, 8.0
     np.testing.assert_allclose(found.acceleration_limit, expected)
+
+
+def test_each_overloaded_joint_is_named():
+    """Only one motor is too weak, and it is not that of the largest torque."""
+    arm, q = ArmModelFromPlant(*other_plant()), np.linspace(0.4, -0.7, 7)
+    torque = np.abs(holding_torque(arm, q))
+    loaded = np.flatnonzero(torque > 1e-3)
+    assert len(loaded) >= 5
+    for joint in loaded:
+        limit = 1.1 * torque + 1e-6
+        check_inertia_and_holding_torque(dataclasses.replace(arm, effort_limit=limit), q)
+        limit[joint] = 0.9 * torque[joint]
+        with pytest.raises(DrakeTeleopError, match=rf"at the start: j{joint + 1} needs"):
+            check_inertia_and_holding_torque(dataclasses.replace(arm, effort_limit=limit), q)
 
 
 def test_weaker_of_two_motors_sets_effort_limit():
