@@ -17,6 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.master.device import AddDeviceAndForceDisplay
+from drake_teleop.station.master.leader import _update_pose_and_twist
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -211,6 +212,18 @@ def test_joints_have_end_stops():
         False,
         True,
     ]
+
+
+@pytest.mark.parametrize("joint", [0, 3, 5])
+def test_quaternion_of_the_grip_is_continuous_over_two_turns(joint):
+    device = leader()
+    q, pose = device.home.copy(), device.forward_kinematics(device.home)
+    for _ in range(80):
+        q[joint] += 4 * np.pi / 80
+        before = pose.copy()
+        _update_pose_and_twist(device.arm.table, q, np.zeros(6), pose, np.empty(6))
+        assert pose[:4] @ before[:4] > 0.9
+    np.testing.assert_allclose(pose, device.forward_kinematics(device.home), atol=1e-12)
 
 
 @pytest.mark.long
