@@ -389,7 +389,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
 
 @pytest.mark.parametrize("size", [[0.2, 0.1, 0.05], [0.06, 0.08, 0.3]])
 def test_block_of_any_edges_starts_on_its_table(size):
-    """Its table may be smaller than its height."""
+    """Tables may be smaller than the height of the block."""
     block = Block(position=[0.6, 0.1, 0.2], yaw=0.4, size=size, table=[0.25, 0.26])
     block.check("environment")
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
