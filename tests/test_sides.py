@@ -64,6 +64,18 @@ def written(name: str, direction: str, without: tuple[str, ...] = ()) -> dict[st
     }
 
 
+@pytest.mark.parametrize("rate", [10.0, 25.0, 8000.0])
+def test_sample_is_valid_for_two_periods_of_a_slow_sensor_or_50_ms(rate):
+    scenario = replace(Scenario(), wrist_sensor__ideal=True, rates__sensor_hz=rate)
+    block = MakeSlaveSide(scenario).GetSubsystemByName("force_scaling")
+    context, oldest = block.CreateDefaultContext(), max(0.05, 2 / rate)
+    context.SetTime(3.0)
+    block.GetInputPort("load_estimate").FixValue(context, np.zeros(16))
+    for age, fault in ((0.99 * oldest, Fault.NONE), (1.01 * oldest, Fault.OLD_SAMPLE)):
+        block.GetInputPort("sample").FixValue(context, np.append(np.zeros(22), 3.0 - age))
+        assert block.GetOutputPort("fault").Eval(context)[0] == fault
+
+
 @pytest.mark.parametrize("direct", [True, False], ids=["direct", "network"])
 def test_ports_equal_the_documented_ports(direct):
     scenario = replace(LoadScenario("contact_transition"), operator__task=Touch())

@@ -45,7 +45,7 @@ def run(
 ):
     """Return a log with a hand force of 2 N at 0.1 m/s back and forth, and contact from CONTACT on.
 
-    The tool stays at its start.
+    The hand's torque of 0.5 N m turns the stylus at 0.06 rad/s. The tool stays at its start.
     """
     state = np.zeros((len(T), STATE_SIZE))
     state[T >= START, 0] = phase
@@ -55,9 +55,9 @@ def run(
     if early:
         state[(T >= 1.0) & (T < 1.2), 2] = 1.0
     hand, twist, contact = np.zeros((len(T), 6)), np.zeros((len(T), 6)), np.zeros((len(T), 6))
-    hand[:, 1] = 2.0
-    twist[:, 1] = np.where(T < 2.0, 0.1, -0.1)
-    contact[T >= CONTACT, 2] = force
+    hand[:, 1], hand[:, 5] = 2.0, 0.5
+    twist[:, [1, 5]] = np.where(T[:, None] < 2.0, 1.0, -1.0) * [0.1, 0.06]
+    contact[T >= CONTACT, 2:4] = force, 40.0
     signals = {
         "task_state": state,
         "hand_wrench_E": hand,
@@ -78,7 +78,7 @@ def test_measures_of_a_touch():
     assert found["contact_force_overshoot_N"] == pytest.approx(6.0)
     assert found["effort_Ns"] == pytest.approx(2.0 * (END - START))
     # Both directions cost effort: the net work would be less.
-    assert found["task_work_J"] == pytest.approx(0.2 * (END - START))
+    assert found["task_work_J"] == pytest.approx(0.23 * (END - START))
     assert found["detection_time_s"] == pytest.approx(NOTICED - CONTACT)
     assert found["false_notices"] == 0.0
     assert math.isnan(found["press_error_N"])

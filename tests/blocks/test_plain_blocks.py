@@ -22,6 +22,7 @@ from rendered_wrench import wrench_to_master
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
+from drake_teleop.load.contact.detection import HELD_SQUARES_START
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.regressor import non_contact_wrench, wrench_of_load
 from drake_teleop.station import blocks
@@ -224,16 +225,19 @@ def samples(rng, count):
     return arm, q, plain, fused
 
 
-def test_load_estimator_equals_that_of_the_station():
+@pytest.mark.parametrize("method", ["rls", "rtls"])
+def test_load_estimator_equals_that_of_the_station(method):
     _, _, plain, fused = samples(np.random.default_rng(4), 60)
-    config = load_estimator.LoadEstimatorConfig(enabled=True)
-    station = load_estimator.LoadEstimator(
-        config, np.ones(6), np.zeros(9), T, len(fused[0]["sample"]), np.zeros(16)
-    )
-    block = blocks.LoadEstimator(np.ones(6), T)
-    found = stepped(block, plain, "load_estimate")
-    np.testing.assert_array_equal(found, stepped(station, fused, "load_estimate"))
-    assert found[20, 6] == pytest.approx(2.0, abs=0.3)
+    config = load_estimator.LoadEstimatorConfig(enabled=True, method=method)
+    size, found = len(fused[0]["sample"]), []
+    for std in (np.zeros(9), np.repeat([0.2, 0.1, 0.3], 3)):
+        station = load_estimator.LoadEstimator(config, np.ones(6), std, T, size, np.zeros(16))
+        block = blocks.LoadEstimator(np.ones(6), T, motion_std=std, config=config)
+        found.append(stepped(block, plain, "load_estimate"))
+        np.testing.assert_array_equal(found[-1], stepped(station, fused, "load_estimate"))
+    assert found[0][20, 6] == pytest.approx(2.0, abs=0.3)
+    # Only total least squares uses the noise of the motion.
+    assert (found[0] != found[1]).any() == (method == "rtls")
 
 
 def test_contact_detector_equals_that_of_the_station():
@@ -248,6 +252,27 @@ def test_contact_detector_equals_that_of_the_station():
     expected = stepped(station, [row | estimate for row in fused], "contact")
     np.testing.assert_array_equal(found, expected)
     assert not found[:25].any() and found[-1] == 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_contact_detectors_remove_gravity_from_the_specific_force(seed):
+    """The acceleration raises the noise floor; its square is held in the memory."""
+    rng = np.random.default_rng(seed)
+    arm, _, (plain,), (fused,) = samples(rng, 1)
+    q, R_WS, p_WS = rng.uniform(-2.0, 2.0, 6), np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm.table, q, R_WS, p_WS)
+    fused["sample"][16:22] = q
+    config, estimate = contact_detection.ContactDetectionConfig(), np.append(OFFSETS, PHI)
+    noise_floor = replace(floor(), per_acceleration=np.full((6, 2), 0.1))
+    station = contact_detection.ContactDetection(config, noise_floor, arm, T)
+    square = np.sum((plain["specific_force_S"] + R_WS.T @ GRAVITY_W) ** 2)
+    for block, values in (
+        (station, fused),
+        (blocks.ContactDetector(noise_floor, T), plain | {"R_WS": R_WS}),
+    ):
+        context = fixed(block, load_estimate=estimate, **values)
+        memory = block.EvalUniquePeriodicDiscreteUpdate(context).get_value(1)
+        assert memory[HELD_SQUARES_START] == pytest.approx(square, rel=1e-12)
 
 
 @pytest.mark.parametrize("method", ["rls", "rtls"])
@@ -408,6 +433,7 @@ def test_contact_flag_of_a_packet_is_0_or_1(contact, flag):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_ends_and_networks_equal_the_channel_of_the_station(method):
+    """Some silences are longer than the timeout."""
     line = NetworkConfig(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1)
     passivity, scales = PassivityConfig(method=method), np.array([2.0, 1.0])
     if method == "ledger":
@@ -423,12 +449,13 @@ def test_ends_and_networks_equal_the_channel_of_the_station(method):
         "saturated",
         "load_wrench_B",
     )
+    (R_WB,), timeout = rotations(1, np.random.default_rng(6)), 0.003
     channel = TeleopChannel(
-        Channel(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1, timeout=0.1), passivity,
-        np.eye(3), scales, 0.1, START, T, 7,
+        Channel(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1, timeout=timeout), passivity,
+        R_WB, scales, 0.1, START, T, 7,
     )  # fmt: skip
     builder = DiagramBuilder()
-    same = dict(scales=scales, force_scale=0.1)
+    same = dict(R_WB=R_WB, scales=scales, force_scale=0.1, timeout=timeout)
     master = builder.AddSystem(blocks.PassivityAtMaster(passivity, T, START, **same))
     slave = builder.AddSystem(blocks.PassivityAtSlave(passivity, T, START, **same))
     there, back = (

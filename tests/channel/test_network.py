@@ -22,6 +22,7 @@ from drake_teleop.station.channel.network import (
     PRESETS,
     NetworkConfig,
     initial_network_state,
+    mean_delay,
     network_parameters,
     newest_packets,
     receive_packet,
@@ -481,6 +482,17 @@ def test_trace_is_replayed_periodically(tmp_path):
     np.testing.assert_array_equal(newest_packets(config, 0, FORWARD, 15, PERIOD), expected)
     packets = random_packets(15)
     np.testing.assert_array_equal(exchange(config, packets)[1], expected)
+
+
+@pytest.mark.parametrize("playout", [0.0, 0.03, 0.1])
+def test_mean_delay_is_that_of_arriving_packets_after_the_playout_buffer(tmp_path, playout):
+    config = write_trace(tmp_path / "net.csv", "time,delay\n5,0.01\n5.1,\n5.3,0.05\n5.6,0.02\n")
+    number, delay = np.array([100, 300, 1]), np.array([0.01, 0.05, 0.02])
+    expected = number @ np.maximum(delay, playout) / number.sum()
+    assert mean_delay(replace(config, playout=playout)) == pytest.approx(expected, rel=1e-12)
+    lost = write_trace(tmp_path / "lost.csv", "time,delay\n0,\n1,\n")
+    assert mean_delay(replace(lost, playout=playout)) == playout
+    assert mean_delay(NetworkConfig(delay=0.04, playout=playout)) == max(0.04, playout)
 
 
 def test_losses_add_to_those_of_a_trace(tmp_path):

@@ -38,7 +38,7 @@ from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.plant import AddSlavePlant, hull_points_of
 from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
     PROXIMITY_NEAR_MONITORED,
@@ -385,6 +385,31 @@ def test_separation_of_tool_and_unmodelled_shapes():
         PROXIMITY_TOUCHING,
         PROXIMITY_NEAR_MONITORED,
     ]  # from 0.45 - 0.1 - 0.002 - 0.02
+
+
+@pytest.mark.parametrize("size", [[0.2, 0.1, 0.05], [0.06, 0.08, 0.3]])
+def test_block_of_any_edges_starts_on_its_table(size):
+    """Tables may be smaller than the height of the block."""
+    block = Block(position=[0.6, 0.1, 0.2], yaw=0.4, size=size, table=[0.25, 0.26])
+    block.check("environment")
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
+    block.AddTo(plant)
+    plant.Finalize()
+    context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
+    middle = np.add(block.position, [0.0, 0.0, size[2] / 2])
+    below = np.add(block.position, [0.0, 0.0, -0.025])
+    for name, yaw, centre, edges in (
+        ("block", 0.4, middle, size),
+        ("table", 0.0, below, [0.25, 0.26, 0.05]),
+    ):
+        body = plant.GetBodyByName(name)
+        found = plant.EvalBodyPoseInWorld(context, body)
+        assert found.IsNearlyEqualTo(RigidTransform(RollPitchYaw(0.0, 0.0, yaw), centre), 1e-12)
+        shapes = plant.GetCollisionGeometriesForBody(body)
+        points = [hull_points_of(inspector, shape) for shape in shapes]
+        for part in (points[0], np.concatenate(points)):
+            np.testing.assert_allclose(part.max(axis=0), np.divide(edges, 2), atol=1e-12)
+            np.testing.assert_allclose(part.min(axis=0), np.divide(edges, -2), atol=1e-12)
 
 
 @pytest.mark.long

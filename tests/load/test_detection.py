@@ -120,6 +120,20 @@ def test_known_noise_floor_is_estimated(seed):
         assert (level[rows] ** 2 > chi2.isf(0.01, 6)).mean() == pytest.approx(0.01, abs=0.004)
 
 
+@pytest.mark.parametrize("fade", [0.0, 0.9, 0.997])
+def test_fitted_noise_floor_holds_accelerations_as_requested(fade):
+    rng, motion = np.random.default_rng(2), swing(6000, 2)
+    growth = np.repeat([[0.08, 0.05], [0.004, 0.002]], 3, axis=0)
+    true = NoiseFloor(NOISE, np.zeros((16, 16)), growth, np.eye(6), np.zeros(6), fade=fade)
+    contact = true.noise_std_along(*motion) * rng.normal(size=(6000, 6))
+    found = fit_noise_floor(contact, *motion, np.zeros((16, 16)), fade=fade)
+    assert found.fade == fade
+    ratio = found.noise_std_along(*motion) / true.noise_std_along(*motion)
+    np.testing.assert_allclose(ratio.mean(axis=0), 1.0, atol=0.1)
+    maxima = statistics_of_log(found, contact, *motion).max(axis=0)
+    np.testing.assert_array_equal(found.free_maxima, maxima)
+
+
 def test_coloured_noise_is_whitened():
     rng, rho = np.random.default_rng(5), 0.9
     noise = rng.normal(size=(50_000, 6)) * NOISE

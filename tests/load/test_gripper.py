@@ -68,6 +68,19 @@ def test_parameters_undetermined_for_the_gripper_are_undetermined_for_the_object
     assert consistency_margin(found)[1] == np.inf
 
 
+@pytest.mark.parametrize(("of_total", "of_gripper"), [(0, 3), (3, 0), (6, 15), (12, 12)])
+def test_only_a_prior_of_the_grippers_load_dominates_that_of_the_object(
+    of_total: int, of_gripper: int
+) -> None:
+    """The offsets of the object are those of the record with the object."""
+    total, gripper = (
+        replace(estimate(phi, seed), prior_dominated=np.arange(16) == k)
+        for phi, seed, k in ((GRIPPER + OBJECT, 1, of_total), (GRIPPER, 2, of_gripper))
+    )
+    expected = {of_total} | ({of_gripper} if of_gripper >= 6 else set())
+    assert set(np.flatnonzero(load_of_object(total, gripper).prior_dominated)) == expected
+
+
 @pytest.mark.parametrize(
     ("withdrawn", "identified"), [((6, 16), 6), ((6, 7), 6), ((8, 9), 6), ((0, 6), 16)]
 )

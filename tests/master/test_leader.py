@@ -17,6 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.master.device import AddDeviceAndForceDisplay
+from drake_teleop.station.master.leader import _update_pose_and_twist
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -129,6 +130,16 @@ def test_hand_holds_only_the_shown():
     assert heavy.get("twist_master")[2] < -0.01
 
 
+@pytest.mark.parametrize("hand", [(0.2, 0.0), (0.0, 3e-3), (0.15, 2e-4)])
+def test_hand_adds_its_mass_and_its_inertia_about_every_axis(hand):
+    free, held = leader(hand=(0.0, 0.0)), leader(hand=hand)
+    for away in (0.0, 0.4, -0.7):
+        q = free.home + away * np.array([1.0, -0.5, 0.8, 1.2, -0.9, 2.0])
+        J = free.jacobian(q)
+        added = held.mass_matrix(q) - free.mass_matrix(q)
+        np.testing.assert_allclose(added, J.T @ np.diag(np.repeat(hand, 3)) @ J, atol=1e-14)
+
+
 def test_work_of_hand_and_motors_equals_energy_plus_friction():
     """Kinetic energy only, because the motors carry the weight."""
     device = leader(friction=[0.01], damping=[0.02])
@@ -201,6 +212,18 @@ def test_joints_have_end_stops():
         False,
         True,
     ]
+
+
+@pytest.mark.parametrize("joint", [0, 3, 5])
+def test_quaternion_of_the_grip_is_continuous_over_two_turns(joint):
+    device = leader()
+    q, pose = device.home.copy(), device.forward_kinematics(device.home)
+    for _ in range(80):
+        q[joint] += 4 * np.pi / 80
+        before = pose.copy()
+        _update_pose_and_twist(device.arm.table, q, np.zeros(6), pose, np.empty(6))
+        assert pose[:4] @ before[:4] > 0.9
+    np.testing.assert_allclose(pose, device.forward_kinematics(device.home), atol=1e-12)
 
 
 @pytest.mark.long

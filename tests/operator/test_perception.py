@@ -9,10 +9,13 @@ from hypothesis import strategies as st
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.operator.perception import (
+    _FORCE_MODEL_DRIFT_STD_PER_SQRT_S,
+    _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ,
     CONTACT_NOTICED_INDEX,
     DETECTION_THRESHOLD_INDEX,
     EXCESS_FORCE_START,
     Perception,
+    _update_force_model_by_kalman_filter,
     perceive_contact,
 )
 
@@ -20,6 +23,21 @@ RATE = 200.0
 T = np.arange(0.0, 6.0, 1 / RATE)
 HUMAN = Perception()
 PUSH = 5.0  # s, when a contact begins
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_update_of_the_force_model_is_that_of_all_three_forces_at_once(seed):
+    """Compare with the equations of the Kalman filter."""
+    rng, dt = np.random.default_rng(seed), 0.005
+    theta, root, rows = rng.normal(size=6), rng.normal(size=(6, 6)), rng.normal(size=(3, 6))
+    prior, excess = root @ root.T, rng.normal(size=3)
+    P = prior + np.diag(_FORCE_MODEL_DRIFT_STD_PER_SQRT_S**2 * dt)
+    noise = _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ**2 / dt * np.eye(3)
+    gain = P @ rows.T @ np.linalg.inv(rows @ P @ rows.T + noise)
+    found, covariance = theta.copy(), prior.copy()
+    _update_force_model_by_kalman_filter(found, covariance, rows, excess, dt)
+    np.testing.assert_allclose(found, theta + gain @ excess, rtol=1e-7)
+    np.testing.assert_allclose(covariance, P - gain @ rows @ P, rtol=1e-6, atol=1e-6)
 
 
 def record(mass: float, steady: float, push: float, amplitude: float = 0.0):

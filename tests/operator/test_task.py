@@ -24,6 +24,7 @@ from drake_teleop.station.operator.decision import (
     STATE_SIZE,
 )
 from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into, plan_move
+from drake_teleop.station.operator.operator import Operator
 from drake_teleop.station.operator.perception import (
     CONTACT_NOTICED_INDEX,
     Perception,
@@ -393,3 +394,23 @@ def test_training_contains_scales_and_delays_of_the_station(monkeypatch):
     np.testing.assert_allclose(training.R_WB, R_WB)
     slave = NominalSlave(scenario.slave)
     np.testing.assert_array_equal(tip, [*slave.tip, *slave.p_WTip_start])
+
+
+@pytest.mark.parametrize(("forward", "backward"), [(0.02, 0.1), (0.3, 0.0), (0.0, 0.0)])
+@pytest.mark.parametrize(("vision", "reaction"), [(0.2, 0.1), (0.05, 0.4)])
+def test_each_delay_of_the_operator_has_its_own_use(forward, backward, vision, reaction):
+    """View and feeling are late by a queue; the effect of a movement comes after a round trip."""
+    training = decision.OperatorTraining(np.eye(3), 1.0, 0.5, forward, backward, 0)
+    senses = Perception(vision_delay=vision, reaction_time=reaction)
+    person = decision.pack_operator_parameters(training, senses, Movement())
+    round_trip = forward + backward + decision._STATION_RESPONSE_TIME_S
+    assert person.vision_delay == pytest.approx(vision + round_trip)
+    assert person.force_delay == pytest.approx(reaction + round_trip)
+    config = replace(Scenario(), operator__task=Reach(), operator__perception=senses).operator
+    arm = NominalSlave(Scenario().slave).arm
+    block = Operator(config, np.eye(7)[0], training, arm, np.zeros(6))
+    context = block.CreateDefaultContext()
+    sizes = [context.get_discrete_state(k).size() for k in range(5)]
+    # A value that is stored now is used after all others of its queue.
+    rows = np.rint(np.array([vision + backward, reaction]) / decision.DECISION_PERIOD_S) + 1
+    np.testing.assert_array_equal(sizes[3:], rows * [3, 5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.passivity import four_channel, ledger_slave, pspm, tdpa, two_layer, wave
 from drake_teleop.station.passivity.force_limit import _HAND_WRENCH_LIMIT, ForceLimitConfig
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
@@ -276,6 +278,77 @@ def test_limits_and_servo_have_their_own_scales(power, motion, limits):
     for part, values in ((SERVO_K, (11, 12)), (SERVO_D, (13, 14)), (SLAVE_MASS, (15, 16))):
         np.testing.assert_allclose(p[part] / power, values)
     np.testing.assert_array_equal(p[SLAVE_PER_MASTER_MOTION], motion)
+
+
+_TDPA_PARAMETERS = {
+    "release": tdpa._WRENCH_RELEASE_TIME,
+    "drain_rate": tdpa._LEDGER_DRAIN_RATE,
+    "drift_rate": tdpa._COMMAND_DRIFT_RATE,
+    "speed": tdpa._MAX_COMMAND_SPEED,
+    "reserve": tdpa._TARGET_RESERVE,
+    "drag": tdpa._DRAG_WRENCH,
+    "hand_stiffness": tdpa._HAND_STIFFNESS,
+}
+PARAMETER_OF_SETTING = {
+    "tdpa": _TDPA_PARAMETERS,
+    "charged_tdpa": _TDPA_PARAMETERS,
+    "wave": {
+        "impedance": wave.WAVE_IMPEDANCE,
+        "filter": wave._WAVE_FILTER_TIME,
+        "matching": wave._MATCHING_DAMPER_SHARE,
+        "patience": wave._MAX_SILENCE_BEFORE_HOLD,
+        "drift_rate": wave._POSE_DRIFT_CORRECTION_RATE,
+    },
+    "two_layer": {
+        "send_rate": two_layer._SEND_RATE,
+        "drain_rate": two_layer._MAX_TANK_DRAIN_RATE,
+        "initial": two_layer._INITIAL_TANK_ENERGY,
+        "level": two_layer._TARGET_TANK_LEVEL,
+        "capacity": two_layer._TANK_CAPACITY,
+        "damper": two_layer._DAMPING_PER_MISSING_ENERGY,
+        "acceleration": two_layer.MAX_PORT_ACCELERATION,
+    },
+    "pspm": {
+        "initial": pspm._INITIAL_ENERGY,
+        "ceiling": pspm._MAX_STORED_ENERGY,
+        "stiffness": pspm._SPRING_STIFFNESS,
+        "damping": pspm._HAND_DAMPING,
+    },
+    "four_channel": {
+        "stiffness": four_channel._COUPLING_STIFFNESS,
+        "damping": four_channel._COUPLING_DAMPING,
+        "slave_feedback": four_channel._SLAVE_FEEDBACK_GAIN,
+        "hand_feedback": four_channel._HAND_FEEDBACK_GAIN,
+    },
+    "ledger": {
+        "initial": ledger_slave.INITIAL_LEDGER_ENERGY,
+        "reserve": ledger_slave.SLAVE_RESERVE,
+        "hand_reserve": ledger_slave.MASTER_RESERVE,
+        "drag": ledger_slave.DRAG_WRENCH,
+        "touch": ledger_slave.CONTACT_THRESHOLD,
+        "encoder_step": ledger_slave.ENCODER_STEP,
+    },
+}
+#: Settings at the hand: the power of the kinematic scale that converts them.
+POWER_OF_SCALE = {"drag": -1, "touch": -1, "encoder_step": 1, "hand_stiffness": -2}
+
+
+@pytest.mark.parametrize("motion", [(1.0, 1.0), (4.0, 0.25)])
+@pytest.mark.parametrize("method", PARAMETER_OF_SETTING)
+def test_each_setting_of_a_method_is_its_own_parameter(method, motion):
+    own, places = getattr(PassivityConfig(), method), PARAMETER_OF_SETTING[method]
+    assert {field.name for field in dataclasses.fields(own)} == places.keys()
+    pairs = {name: isinstance(place, slice) for name, place in places.items()}
+    numbers = {
+        name: [0.01 + 0.002 * k, 0.011 + 0.002 * k] if is_pair else 0.01 + 0.002 * k
+        for k, (name, is_pair) in enumerate(pairs.items())
+    }
+    config = PassivityConfig(method=method, **{method: dataclasses.replace(own, **numbers)})
+    p = method_parameters(config, motion_scale=motion)
+    for name, place in places.items():
+        scale = np.power(motion, POWER_OF_SCALE.get(name, 0))
+        expected = numbers[name] * scale if pairs[name] else numbers[name]
+        np.testing.assert_allclose(p[place], expected, rtol=1e-12, err_msg=name)
 
 
 def test_limits_are_those_of_the_default_device_unless_given():

@@ -166,6 +166,22 @@ def test_sample_too_old_or_from_the_future_is_a_fault(arm, age, fault):
     assert np.isnan(block.GetOutputPort("wrench_B").Eval(context)).all() == bool(fault)
 
 
+@pytest.mark.parametrize("oldest", [0.05, 0.2])
+def test_last_sample_of_a_stopped_sensor_becomes_too_old(arm, oldest):
+    """The sample does not change, so that only the time does."""
+    block = ForceScaling(ForceScalingConfig(), arm, np.eye(3), oldest=oldest)
+    context = block.CreateDefaultContext()
+    block.GetInputPort("sample").FixValue(context, np.concatenate([np.zeros(16), Q, [3.0]]))
+    block.GetInputPort("load_estimate").FixValue(context, np.zeros(16))
+    for age in (0.0, 0.9 * oldest, 1.1 * oldest, 10.0, 0.0):
+        context.SetTime(3.0 + age)
+        fault = age > oldest
+        assert block.GetOutputPort("fault").Eval(context)[0] == fault
+        assert block.GetOutputPort("scaled_contact_and_fault").Eval(context)[12] == fault
+        for name in ("wrench_B", "load_wrench_B"):
+            assert np.isnan(block.GetOutputPort(name).Eval(context)).all() == fault
+
+
 def test_new_change_begins_with_the_present_scales(arm):
     block = ForceScaling(ForceScalingConfig(sigma=0.0, gamma=1.0), arm, np.eye(3))
     context = block.CreateDefaultContext()

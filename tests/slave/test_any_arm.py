@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from itertools import product
 
 import numpy as np
 import odd_arms
@@ -32,7 +33,7 @@ from drake_teleop.station.slave.joint_commands import JointRangeMonitor, used_ik
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool
+from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool, end_of_tool_shapes
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HOME = [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]
@@ -453,6 +454,15 @@ def test_tip_of_a_tool_file_is_at_the_end_of_its_shapes(tmp_path, shape, end):
     (tmp_path / "tool.urdf").write_text(f'<robot name="tool">{link}</robot>')
     slave = Slave(tool=Tool(model=str(tmp_path / "tool.urdf")))
     np.testing.assert_allclose(NominalSlave(slave).tip, end, atol=1e-12)
+
+
+@pytest.mark.parametrize("rpy", [[0.0, 0.0, 0.7], [0.3, -0.8, 1.9], [1.1, 0.4, -2.5]])
+def test_tip_of_a_rotated_box_is_at_the_height_of_its_farthest_corner(rpy):
+    box = Block(edges=[0.02, 0.06, 0.1], position=[0.01, -0.02, 0.1], rpy=rpy)
+    corners = [box.pose @ (0.5 * np.array(x) * box.edges) for x in product((-1, 1), repeat=3)]
+    tool = Tool(mass=1.0, shapes=[Ball(position=[0.0, 0.0, 0.1]), box])
+    expected = [*box.position[:2], max(corner[2] for corner in corners)]
+    np.testing.assert_allclose(end_of_tool_shapes(tool), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])

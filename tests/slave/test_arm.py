@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from odd_arms import other_arm_urdf, other_plant, rx90_plant, sliding_plant
@@ -15,11 +17,13 @@ from drake_teleop.station.slave.arm import (
     SENSOR_MOTION_SIZE,
     forward_dynamics,
     forward_kinematics,
+    holding_torque,
     inverse_dynamics,
     jacobian,
     sensor_motion,
 )
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, fill_missing_joint_limits
+from drake_teleop.station.slave.home import check_inertia_and_holding_torque
 
 
 @pytest.fixture(
@@ -164,6 +168,51 @@ def test_limits_are_read_from_the_model():
     np.testing.assert_array_equal(arm.velocity_limit, np.full(7, 3.0))
     np.testing.assert_array_equal(arm.acceleration_limit, np.full(7, np.inf))
     np.testing.assert_array_equal(arm.effort_limit, np.full(7, 40.0))
+
+
+@pytest.mark.parametrize("slides", [False, True])
+@pytest.mark.parametrize("given", [(), (9.0,), tuple(np.arange(1.0, 7.0))])
+def test_missing_limits_of_a_joint_are_those_of_its_type(slides, given):
+    """One joint has all limits, and each of the others lacks some."""
+    arm, inf = ArmModelFromPlant(*rx90_plant()), np.inf
+    table = arm.table.copy()
+    table[:-1, IS_PRISMATIC_COLUMN] = slides
+    half, speed = (1.0, 1.0) if slides else (np.pi, np.pi)
+    acceleration = np.array([6.0, inf, 0.0, inf, 8.0, np.nan])
+    incomplete = dataclasses.replace(
+        arm,
+        table=table,
+        lower=np.array([-2.0, -inf, -inf, 0.5, -1.0, -2.0]),
+        upper=np.array([2.5, inf, 0.8, inf, 3.0, 2.0]),
+        velocity_limit=np.array([2.0, inf, 0.0, 1.5, np.nan, 4.0]),
+        acceleration_limit=acceleration,
+        effort_limit=np.array([7.0, 0.0, inf, 9.0, np.nan, 4.0]),
+    )
+    found, _ = fill_missing_joint_limits(incomplete, "arm", given)
+    middle = half if slides else inf  # a joint without limits that rotates has none
+    np.testing.assert_allclose(found.lower, [-2.0, -middle, 0.8 - 2 * half, 0.5, -1.0, -2.0])
+    np.testing.assert_allclose(found.upper, [2.5, middle, 0.8, 0.5 + 2 * half, 3.0, 2.0])
+    velocity = [2.0, speed, speed, 1.5, speed, 4.0]
+    np.testing.assert_allclose(found.velocity_limit, velocity)
+    np.testing.assert_allclose(found.effort_limit, [7.0, inf, inf, 9.0, inf, 4.0])
+    expected = np.broadcast_to(given, 6) if given else np.divide(velocity, 0.4)
+    if not given:
+        expected[[0, 4]] = 6.0, 8.0
+    np.testing.assert_allclose(found.acceleration_limit, expected)
+
+
+def test_each_overloaded_joint_is_named():
+    """Only one motor is too weak, and it is not that of the largest torque."""
+    arm, q = ArmModelFromPlant(*other_plant()), np.linspace(0.4, -0.7, 7)
+    torque = np.abs(holding_torque(arm, q))
+    loaded = np.flatnonzero(torque > 1e-3)
+    assert len(loaded) >= 5
+    for joint in loaded:
+        limit = 1.1 * torque + 1e-6
+        check_inertia_and_holding_torque(dataclasses.replace(arm, effort_limit=limit), q)
+        limit[joint] = 0.9 * torque[joint]
+        with pytest.raises(DrakeTeleopError, match=rf"at the start: j{joint + 1} needs"):
+            check_inertia_and_holding_torque(dataclasses.replace(arm, effort_limit=limit), q)
 
 
 def test_weaker_of_two_motors_sets_effort_limit():

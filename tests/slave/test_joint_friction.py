@@ -1,19 +1,23 @@
 """Dry joint friction: in the plant and the compiled dynamics, but in no controller."""
 
+import re
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.arm import (
     ARM_FRICTION_TANH_SPEED_RAD_OR_M_S,
     forward_dynamics,
     inverse_dynamics,
 )
-from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.joint_control import mass_matrix
+from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave_side import MakeSlaveSide
 from drake_teleop.station.station import MakeTeleopStation
 
 FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
@@ -130,3 +134,19 @@ def test_invalid_friction_raises_one_line(friction, expected):
     scenario = LoadScenario("free_motion_force")
     with pytest.raises(DrakeTeleopError, match=expected):
         MakeTeleopStation(replace(scenario, slave__friction=friction, force_scaling__sigma=1.0))
+
+
+@pytest.mark.parametrize(
+    ("rate", "max_step", "step"),
+    [(2000.0, 1e-3, 5e-4), (500.0, 1e-3, 1e-3), (500.0, 2e-4, 2e-4)],
+)
+def test_friction_may_stop_a_joint_within_half_of_the_shorter_step(rate, max_step, step):
+    """Steps end at a change of the torque and are at most `max_step` long."""
+    nominal = NominalSlave(Slave())
+    slope = np.linalg.inv(mass_matrix(nominal.arm, nominal.start))
+    fastest = np.linalg.eigvals(slope).real.max() / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
+    timing = {"rates__joint_control_hz": rate, "simulation__max_step": max_step}
+    largest = 2.0 / (fastest * step)
+    MakeSlaveSide(replace(Scenario(), **timing, slave__friction=[0.99 * largest]))
+    with pytest.raises(DrakeTeleopError, match=re.escape(f"for steps of {1e3 * step:g} ms")):
+        MakeSlaveSide(replace(Scenario(), **timing, slave__friction=[1.01 * largest]))

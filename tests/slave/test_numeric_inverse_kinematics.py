@@ -15,6 +15,7 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import ArmModel, jacobian
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.home import q_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
@@ -410,3 +411,18 @@ def test_station_gives_same_result_with_both_methods(rx90):
     ]
     assert np.ptp(commands[0], axis=0).max() > 1e-3
     np.testing.assert_allclose(commands[1], commands[0], atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_start_posture_is_within_ranges_that_exclude_zero(seed):
+    """Four joints of the posture that has the pose are slightly beyond their limits near zero."""
+    rng, arm = np.random.default_rng(seed), ArmModelFromPlant(*other_plant())
+    ends = np.outer(rng.choice([-1.0, 1.0], 7), [0.3, 1.3])
+    limited = dataclasses.replace(arm, lower=ends.min(axis=1), upper=ends.max(axis=1))
+    sizes = np.concatenate([rng.uniform(0.22, 0.29, 4), rng.uniform(0.4, 0.9, 3)])
+    pose = arm.pose(np.sign(ends[:, 0]) * rng.permutation(sizes))
+    R_WS = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4])))
+    q, status = q_with_tool_down(limited, pose[4:], R_WS)
+    assert ((limited.lower <= q) & (q <= limited.upper)).all()
+    reached = np.abs(arm.pose(q)[4:] - pose[4:]).max() < 1e-6
+    assert reached == (status == IkStatus.OK)

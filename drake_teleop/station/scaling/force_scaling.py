@@ -271,9 +271,8 @@ class ForceScaling(LeafSystem):
             inputs = block()._evaluate_inputs(context)
             calculate_into(*inputs, *constants, output.get_mutable_value())
 
-        # Without time: a change of scales advances with each new sample.
-        inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-        self.DeclareVectorOutputPort(name, size, calculate, inputs)
+        # The output depends on time, because the last sample of a stopped sensor becomes too old.
+        self.DeclareVectorOutputPort(name, size, calculate)
 
     def SetScales(
         self,
