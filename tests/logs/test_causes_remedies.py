@@ -435,7 +435,10 @@ def test_inspect_and_repeated_fits_accept_a_removed_weight(tmp_path: Path) -> No
         ({"gravity": "up"}, "must be a number, three numbers"),
         ({"gravity": "auto", "wrench": {"weight": "removed"}}, "cannot be combined"),
         ({"pose": {"position_in_sensor": "auto"}, "gravity": "auto"}, "cannot be combined"),
-        ({"pose": None, "imu": True, "gravity": "auto"}, "gravity: auto requires a wrench and a pose alone"),
+        (
+            {"pose": None, "imu": True, "gravity": "auto"},
+            "gravity: auto requires a wrench and a pose alone",
+        ),
         ({"pose": None, "imu": True, "wrench": {"weight": "removed"}}, "add pose"),
     ],
 )
