@@ -108,8 +108,6 @@ WRITING = {
     ("lab/new_station/__init__.py", ".write_text"),
     ("robots/controller/export.py", ".write_text"),  # temporary folder for the compiler
     ("robots/controller/export.py", ".write_bytes"),  # by `replace_file_on_success`
-    # Figures in the file of --json.
-    ("live/device_client.py", ".write_text"),
     # Files in the output folder, by `replace_file_on_success`; a dataset of the package.
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_bytes"),

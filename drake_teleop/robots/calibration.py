@@ -195,6 +195,7 @@ def _information_of_advised_motions(
 DEFAULT_TOLERANCES_TEXT = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
 _STREAM_READ_TIMEOUT_S = 0.05
+_MIN_SILENCE_S = 10.0  # peers of ROS 2 are found within seconds
 
 
 def calibrate(
@@ -210,7 +211,7 @@ def calibrate(
 ) -> list[RecordEvaluation]:
     """Record a stream until the tolerance is met or it ends; return evaluations.
 
-    Record and silence last at most `seconds`.
+    Record and silence last at most `seconds`; silence may last 10 s.
     """
     results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S
@@ -233,6 +234,7 @@ def calibrate(
         recorder.write(path)
 
     done, grown_s, grown_at = False, 0.0, time.monotonic()
+    max_silence_s = max(seconds, _MIN_SILENCE_S)
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
             while not (done or INTERRUPTED_EVENT.is_set()):
@@ -251,7 +253,7 @@ def calibrate(
                         break
                 if recorder.longest_part_s > grown_s:
                     grown_s, grown_at = recorder.longest_part_s, time.monotonic()
-                done = done or (source.live and time.monotonic() - grown_at > seconds)
+                done = done or (source.live and time.monotonic() - grown_at > max_silence_s)
     except Exception:  # raised again: the record is kept whatever ended the loop
         if recorder.longest_part_s:
             write_record()

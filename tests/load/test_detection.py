@@ -120,9 +120,9 @@ def test_known_noise_floor_is_estimated(seed):
         assert (level[rows] ** 2 > chi2.isf(0.01, 6)).mean() == pytest.approx(0.01, abs=0.004)
 
 
-@pytest.mark.parametrize("fade", [0.0, 0.9, 0.997])
-def test_fitted_noise_floor_holds_accelerations_as_requested(fade):
-    rng, motion = np.random.default_rng(2), swing(6000, 2)
+@pytest.mark.parametrize(("fade", "seed"), [(0.0, 0), (0.9, 3), (0.997, 5)])
+def test_fitted_noise_floor_holds_accelerations_as_requested(fade, seed):
+    rng, motion = np.random.default_rng(seed), swing(6000, seed)
     growth = np.repeat([[0.08, 0.05], [0.004, 0.002]], 3, axis=0)
     true = NoiseFloor(NOISE, np.zeros((16, 16)), growth, np.eye(6), np.zeros(6), fade=fade)
     contact = true.noise_std_along(*motion) * rng.normal(size=(6000, 6))

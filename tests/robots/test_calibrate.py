@@ -175,6 +175,22 @@ def test_source_without_valid_readings_ends_after_the_maximum(
     assert path.read_text() == "earlier"
 
 
+def test_short_calibration_waits_for_a_late_source(tmp_path: Path) -> None:
+    """Peers of ROS 2 are found after a second or more."""
+
+    class LateStream(UselessStream):
+        start = time.monotonic() + 0.3
+
+        def read(self, timeout_s: float) -> list[Reading]:
+            time.sleep(0.01)
+            return Stream.read(self, timeout_s) if time.monotonic() > self.start else []
+
+    recorder = Recorder()
+    source = LateStream(recorded(1.0, [0]))
+    calibrate(source, recorder, tmp_path / "log.parquet", TOLERANCE, seconds=0.2)
+    assert recorder.longest_part_s == pytest.approx(0.2, abs=1.1 * DT)
+
+
 @pytest.mark.parametrize("name", ["log.parquet", "../{}/log.parquet"])
 def test_replayed_log_is_never_replaced(tmp_path: Path, name: str) -> None:
     log = Log(DT * np.arange(400), *np.split(recorded(2.0, [0]), [6, 9, 12], axis=1))

@@ -267,21 +267,20 @@ def fit_noise_floor(
     noise_std_into(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)
     held = np.empty((2, *rows[0].shape))
     for unit, out in zip(np.eye(2), held, strict=True):
-        noise_std_into(*rows[1:], np.zeros(6), np.zeros((16, 16)), np.tile(unit, (6, 1)), fade, out)
+        growth = np.tile(unit, (6, 1))
+        noise_std_into(*rows[1:], np.zeros(6), np.zeros((16, 16)), growth, fade, out)
     fitted = np.zeros((6, 3))
     for c in range(6):
         square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
         variance = np.full(len(square), max(float(square.mean()), MIN_WRENCH_NOISE_STD[c] ** 2))
-        for number in range(3 * _MAX_VARIANCE_FITS):
+        for _ in range(_MAX_VARIANCE_FITS):
             previous = fitted[c].copy()
             weighted = np.column_stack([terms, square - explained]) / variance[:, None]
             R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
             fitted[c] = nnls(R[:, :3], R[:, 3])[0]
             fitted[c, 0] = max(fitted[c, 0], MIN_WRENCH_NOISE_STD[c] ** 2)
-            # Damping of later fits: some records alternate between two solutions.
-            share = 1.0 if number < _MAX_VARIANCE_FITS else 0.5
-            variance = variance ** (1.0 - share) * (terms @ fitted[c] + explained) ** share
+            variance = terms @ fitted[c] + explained
             if np.allclose(fitted[c], previous, rtol=_VARIANCE_FIT_TOLERANCE, atol=0.0):
                 break
     noise, per_acceleration = np.sqrt(fitted[:, 0]), np.sqrt(fitted[:, 1:])
