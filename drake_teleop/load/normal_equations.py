@@ -150,7 +150,9 @@ class SecondMoments:
         covariance = mark_undetermined(covariance, undetermined)
         degrees[undetermined] = np.inf
         return Identification(
-            *(theta[6:], theta[:6], covariance),
+            phi=theta[6:],
+            offsets=theta[:6],
+            covariance=covariance,
             identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
             delay_s=float(finite_array("delay_s", delay_s)),

@@ -186,19 +186,25 @@ def main_effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
     names = "measure factor level runs mean mean_half effect effect_half combinations left_out why"
     table = [
-        (
-            *(measure, field, name, int(found.num_runs[index])),
-            *(found.mean[index], found.half_width[index]),
-            *(found.effect[index], found.effect_half_width[index]),
-            *(found.num_used_combinations, found.num_unused_combinations),
-            found.missing_reasons[index] or None,
-        )
+        {
+            "measure": measure,
+            "factor": field,
+            "level": name,
+            "runs": int(found.num_runs[index]),
+            "mean": found.mean[index],
+            "mean_half": found.half_width[index],
+            "effect": found.effect[index],
+            "effect_half": found.effect_half_width[index],
+            "combinations": found.num_used_combinations,
+            "left_out": found.num_unused_combinations,
+            "why": found.missing_reasons[index] or None,
+        }
         for measure in study.measures
         for field, found in main_effects(study, rows, measure).items()
         for index, name in enumerate(found.level_names)
     ]
     # All rows determine the types: the first reason may be in a late row.
-    return pl.DataFrame(table, schema=names.split(), orient="row", infer_schema_length=None)
+    return pl.DataFrame(table, schema=names.split(), infer_schema_length=None)
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:

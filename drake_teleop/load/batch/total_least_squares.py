@@ -95,9 +95,11 @@ def _solve_noise_compensated_equations(
     gram_basis = gram @ basis[:, kept]
     variance = np.sum(basis**2, axis=1)
     return SolvedNormalEquations(
-        (gram_basis * remaining[kept]) @ gram_basis.T,
-        gram_basis @ (basis[:, kept].T @ right),
-        *(theta, W, scale),
+        gram=(gram_basis * remaining[kept]) @ gram_basis.T,
+        right=gram_basis @ (basis[:, kept].T @ right),
+        theta=theta,
+        weights=W,
+        noise_scale=scale,
         map_from_ordinary=inverse @ gram,
         is_undetermined=np.sum(basis[:, ~kept] ** 2, axis=1) > 0.5 * variance,
     )

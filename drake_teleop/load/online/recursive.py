@@ -196,7 +196,9 @@ class RecursiveEstimator(ABC):
         covariance = self.covariance
         deviations = np.sqrt(np.diag(covariance))
         return Identification(
-            *(self.phi, self.offsets, covariance),
+            phi=self.phi,
+            offsets=self.offsets,
+            covariance=covariance,
             identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_SCALED_STD),
             condition_number=self._condition_number(),
             delay_s=0.0,

@@ -279,7 +279,10 @@ def explain_misfit(
         if not causes and (only_noise or may_be_coloured_noise(state)):
             causes = _findings_if_load_is_absent(state, covariance)
         return MisfitExplanation(
-            *(tuple(causes), only_noise, state.x[OFFSETS_AND_LOAD], covariance),
+            causes=tuple(causes),
+            explained=only_noise,
+            theta=state.x[OFFSETS_AND_LOAD],
+            covariance=covariance,
             misfit_deviations=deviations_of_load_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(cause.loads_between_changes(state, covariance)),

@@ -95,7 +95,8 @@ def _low_passed_samples(log: Log) -> _LowPassedSamples:
         (s, omega, alpha),
         gravity if "weight" in log.estimated else None,
         cutoff,
-        *(log.dt, float(log.t[-1] - log.t[0])),
+        log.dt,
+        float(log.t[-1] - log.t[0]),
         white_noise_deviations(log.wrench),
     )
 

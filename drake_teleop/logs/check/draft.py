@@ -156,7 +156,8 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
-    wrench |= {"frame": "base"} if any(re.search(_BASE_FORCE_PATTERN, x) for x in forces) else {}
+    if any(re.search(_BASE_FORCE_PATTERN, name) for name in forces):
+        wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
         draft["wrench"] = wrench

@@ -299,7 +299,9 @@ def _pose_frame_from_free_fit(free: RigidFit, described: RigidParameters) -> Pos
     limits = MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG
     tilted = _is_change_significant(turned, covariance[3:, 3:], *np.radians(limits))
     return PoseFrame(
-        *(origin, R_SP, deviations),
+        p_SoPo_S=origin,
+        R_SP=R_SP,
+        position_stds_m=deviations,
         rotation_stds_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
         is_shifted=bool(wald > _MIN_FRAME_ERROR_WALD_STATISTIC and shifted),
         is_rotated=bool(wald > _MIN_FRAME_ERROR_WALD_STATISTIC and tilted),
