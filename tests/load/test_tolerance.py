@@ -70,11 +70,12 @@ def test_values_of_undetermined_parameters_have_infinite_deviations() -> None:
 
 
 @pytest.mark.parametrize("inertia", [INERTIA, 1e-9 * INERTIA, np.zeros((3, 3)), -INERTIA])
+@pytest.mark.parametrize("com", [[0.02, 0.0, 0.1], [0.0, 0.0, 0.0]])
 @pytest.mark.parametrize("mass", [3.1, -0.2])
 def test_shown_tolerances_are_those_that_the_deviations_are_compared_with(
-    inertia: np.ndarray, mass: float
+    inertia: np.ndarray, mass: float, com: list[float]
 ) -> None:
-    tolerance, phi = parse_tolerance(ALL), phi_from_mass_com_inertia(mass, [0.02, 0, 0.1], inertia)
+    tolerance, phi = parse_tolerance(ALL), phi_from_mass_com_inertia(mass, com, inertia)
     covariance = np.diag(np.linspace(1e-6, 2e-6, 16))
     relative = deviations_over_tolerances(derivatives_over_tolerances(tolerance, phi), covariance)
     step, shown = 1e-6, partial(display_values_of_required_entries, tolerance)
