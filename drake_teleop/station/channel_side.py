@@ -109,6 +109,6 @@ def slave_wrench_power_scale(scenario: Scenario) -> Array:
 
 
 def _rendered_force_per_contact_force(scenario: Scenario) -> float:
-    """Return rendered over measured contact force: force_scale times gamma, 1 for 0."""
+    """Return rendered over measured contact force, with 1 for a scale of 0."""
     scaling = scenario.force_scaling
     return (scaling.force_scale or 1.0) * (scaling.scales().gamma or 1.0)

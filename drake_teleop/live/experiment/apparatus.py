@@ -109,8 +109,8 @@ def make_apparatus(
     mass_at_hand = float(mass) * at_hand
     largest = mass_at_hand * (0.01 * _MAX_FORCE_SCALE_PERCENT - condition.load_share)
     if isinstance(task, design.ApparentMass) and largest < task.low:
-        what = f"its largest added mass is {largest:.3g} kg at the hand, less than low of the task"
-        remedy = "reduce sigma or low, or increase force_scale of the task's scenario"
+        what = f"adds at most {largest:.3g} kg at the hand, below `low` of the task ({task.low:g})"
+        remedy = "reduce sigma or `low`, or increase force_scale of the task's scenario"
         raise DrakeTeleopError(what, where=f"condition {condition.name!r}", remedy=remedy)
     return Apparatus(task, condition, setup, load, mass_at_hand, scenario)
 
