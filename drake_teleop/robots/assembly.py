@@ -67,7 +67,7 @@ class DelayTracker:
     def __init__(
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
     ) -> None:
-        self.delay_s = delay_s
+        self.load, self.delay_s = load, delay_s
         self._phi = tuple(phi_with_inertia_replaced(load)[0])
         self._noise = white_wrench_noise(load, dt, cutoff_hz)
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
@@ -338,6 +338,7 @@ class ReadingAssembler(Source):
             raise removed_weight_needs_orientation_error(streams.where)
         self._streams, self._delay, self.dt = streams, delay_s, streams.dt
         self._tracker = None if track is None else DelayTracker(track, self.dt, cutoff_hz, delay_s)
+        self._cutoff_hz = cutoff_hz
         self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY_W)
         self._clocks = _ClockOffsetEstimator(), _ClockOffsetEstimator()
         self._motions: deque[tuple[float, Array]] = deque()
@@ -346,6 +347,11 @@ class ReadingAssembler(Source):
     @property
     def delay_s(self) -> float:
         return self._delay if self._tracker is None else self._tracker.delay_s
+
+    def track_delay_with(self, load: Identification) -> None:
+        """Estimate the delay with this load from now on, if the delay is estimated."""
+        if self._tracker is not None and self._tracker.load is not load:
+            self._tracker = DelayTracker(load, self.dt, self._cutoff_hz, self.delay_s)
 
     @property
     def lag_s(self) -> float:

@@ -74,6 +74,8 @@ def compensate_stream(
 
     with suppress(KeyboardInterrupt), raise_interrupt_on_sigint():
         while not INTERRUPTED_EVENT.is_set():
+            if isinstance(source, ReadingAssembler):
+                source.track_delay_with(compensator.load)
             left_s = compensator.time_to_stale(time.monotonic()) or _ZERO_WRENCH_SEND_PERIOD_S
             if (readings := source.read(min(left_s, _ZERO_WRENCH_SEND_PERIOD_S))) is None:
                 break
@@ -120,6 +122,7 @@ def run_compensate_command(
     scales = {name: options.pop(name) for name in SIGMA_GAMMA_NAMES if name in options}
     limits = None if sensor_range is None else np.repeat(sensor_range, 3)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
+    input_files = [load, *readings.files]
 
     def make_compensator(load: Identification) -> Compensator:
         if load.weight_removed != found.weight_removed:
@@ -130,6 +133,7 @@ def run_compensate_command(
         ahead_s = delay_readings * dt + filter_lag(dt, cutoff_hz) if predicted else 0.0
         stream = dt, cutoff_hz, options.get("delay", "auto"), ahead_s
         detector = None if free is None else StreamContactDetector(load, free, *stream)
+        input_files.extend(() if detector is None else detector.files)
         lag: Any = {"delay_readings": delay_readings, "predicted": predicted}
         monitors: Any = {"watch": ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None}
         monitors |= {"detector": detector, "sensor_range": limits}
@@ -143,7 +147,7 @@ def run_compensate_command(
     control_port = None if control is None else TareRequestPort(control)
     file = [Path(sink)] if is_file_address(sink) else []
     for path in file:
-        refuse_to_replace_inputs(path, *readings.files)
+        refuse_to_replace_inputs(path, *input_files)
     if earlier := move_earlier_recordings(*file if readings.live else ()):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)

@@ -106,6 +106,7 @@ class Compensator:
         detector: StreamContactDetector | None = None,
         **scales: Any,
     ) -> None:
+        self.load = load
         self._phi, self._zero_phi = processing.phi_with_inertia_replaced(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
         self.stale_age_s = max(STALE_AGE_S, _STALE_PERIODS * dt)

@@ -80,7 +80,7 @@ _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 class StreamContactDetector:
     """Contact detector with the noise floor of the free-motion log `free`.
 
-    `ahead_s`: extrapolation of the contact wrenches [s].
+    `ahead_s`: extrapolation of the contact wrenches [s]; `files`: those of the log.
     """
 
     def __init__(
@@ -96,6 +96,7 @@ class StreamContactDetector:
             what = f"needs a low-pass below half the stream's rate, {0.5 / dt:g} Hz"
             raise DrakeTeleopError(what, where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
+        self.files = source.files
         if abs(source.dt / dt - 1.0) > _RELATIVE_FREE_LOG_RATE_TOLERANCE:
             what = f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz"
             remedy = "use the log that `calibrate` wrote from this stream"

@@ -117,7 +117,19 @@ def test_auto_without_the_required_streams_raises_error(tmp_path: Path) -> None:
     _expect_error(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
     data["imu"]["frame"] = "sensor"
     del data["imu"]["specific_force"]
-    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "estimated from specific_force"])
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "require specific_force: add"])
+
+
+@pytest.mark.parametrize("unused", [{"sign": -1}, {"position": [0.0, 0.0, 0.1]}])
+def test_settings_of_a_missing_specific_force_raise_error(tmp_path: Path, unused: dict) -> None:
+    data = yaml.safe_load(THREE_INSTRUMENTS)
+    data["imu"]["angular_velocity"] = {"columns": ["wx", "wy", "wz"]}
+    data["imu"].pop("specific_force", None)
+    data["imu"] |= {"sign": 1, "position": [0.0, 0.0, 0.0], "frame": "sensor"}
+    (tmp_path / "log.yaml").write_text(yaml.safe_dump(data))
+    assert load_description(tmp_path / "log.yaml").imu
+    data["imu"] |= unused
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "sign, position and auto require"])
 
 
 def test_missing_description_raises_error(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from test_changes import ListSink
 from test_compensator import OFFSETS, PHI, load
 from test_reading_assembly import DT as WRENCH_DT
 from test_reading_assembly import X_FS, StreamStub, played, truth
@@ -15,6 +18,8 @@ from drake_teleop.robots.assembly import (
     ReadingAssembler,
     WrenchAndMotionStreams,
 )
+from drake_teleop.robots.compensate import compensate_stream
+from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import POSE, WRENCH
 
 DT = 1.01 * DELAY_SAMPLE_PERIOD_S
@@ -99,6 +104,23 @@ def test_delay_is_constant_at_rest() -> None:
         wrench = still + NOISE * rng.normal(size=6)
         follower.update_delay((t, rest), wrench, (t - 0.001, rest), (t + 0.001, shaken))
     assert follower.delay_s == 0.005
+
+
+def test_another_load_takes_over_the_delay_and_tracks_it() -> None:
+    stub = StreamStub(WRENCH, POSE)
+    stub.read = lambda timeout_s: None  # the stream ends at once
+    streams = WrenchAndMotionStreams(stub)
+    other = replace(load(), offsets=OFFSETS - 30.0)
+    assembly = ReadingAssembler(streams, X_FS=X_FS, track=other, delay_s=0.001)
+    for each in played(assembly, 0.5, later=0.004):
+        assert each.t < 0.5 and assembly.delay_s == 0.001  # no sample agrees with this load
+    compensate_stream(assembly, Compensator(load(), WRENCH_DT), ListSink())
+    assert assembly.delay_s == 0.001
+    list(played(assembly, 1.6, later=0.004))
+    assert assembly.delay_s == pytest.approx(0.004, abs=3e-4)
+    fixed = ReadingAssembler(streams, X_FS=X_FS, delay_s=0.002)
+    fixed.track_delay_with(load())
+    assert fixed.delay_s == 0.002
 
 
 def test_assembly_tracks_an_unknown_delay() -> None:

@@ -165,6 +165,19 @@ def test_command_gives_delay_and_prediction_to_the_detector(
     assert ahead_s == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("sink", ["free.csv", "load.csv", "log.csv"])
+def test_output_does_not_replace_an_input(tmp_path: Path, sink: str) -> None:
+    t, values = readings()
+    for name in ("free.csv", "log.csv"):
+        write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / name)
+    LOAD.save(tmp_path / "load.csv")
+    before = (tmp_path / sink).read_bytes()
+    loop = f"replay:{tmp_path / 'log.csv'}", tmp_path / "load.csv", str(tmp_path / sink)
+    with pytest.raises(DrakeTeleopError, match=f"contains the input {sink}"):
+        run_compensate_command(*loop, free=tmp_path / "free.csv", delay=0.0)
+    assert (tmp_path / sink).read_bytes() == before
+
+
 @pytest.mark.parametrize("removed", [False, True])
 def test_another_load_with_or_without_weight_is_refused(tmp_path: Path, removed: bool) -> None:
     """The motion of the open source fits the load at the start."""

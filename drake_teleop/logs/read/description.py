@@ -179,10 +179,9 @@ class Imu(_RecordedStreamDescription):
     def _check_imu_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
-        if self.is_mounting_auto and not self.specific_force:
-            raise ValueError(
-                "auto is estimated from specific_force: add it, or give frame and position"
-            )
+        uses_force = self.is_mounting_auto or self.sign != 1 or any(self.position)
+        if uses_force and not self.specific_force:
+            raise ValueError("sign, position and auto require specific_force: add or remove them")
         return self
 
     @property
