@@ -103,7 +103,7 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: its `specific_force` is the acceleration if the robot has removed the weight.
+        log: `specific_force` is the acceleration, `gravity` 0, if the robot removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
         log_with_differentiated_motion: log with numerically differentiated motion, if requested.

@@ -86,7 +86,7 @@ def _corrected_fields_and_names_by_cause(
 ) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
-    column = _column_of_each_axis(fields["wrench.frame"])
+    column = _wrench_column_of_each_axis(fields["wrench.frame"])
     changed_names: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
@@ -127,7 +127,7 @@ def _correctable_fields(description: Description, by_pose: bool) -> DescriptionF
     return out
 
 
-def _column_of_each_axis(frame: Any) -> list[int] | None:
+def _wrench_column_of_each_axis(frame: Any) -> list[int] | None:
     if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
         return None
     return [int(j) for j in np.abs(frame).argmax(axis=1)]
@@ -175,14 +175,14 @@ def _correct_fields_by_cause(
             fields[name][column[c % 3]] /= values["gain"]
 
 
-def _correct_wrench_sign_and_frame(fields: DescriptionFields, Q: Array) -> None:
-    sign = 1 if np.linalg.det(Q) > 0.0 else -1
+def _correct_wrench_sign_and_frame(fields: DescriptionFields, axes: Array) -> None:
+    sign = 1 if np.linalg.det(axes) > 0.0 else -1
     base = isinstance(fields["wrench.frame"], str)
-    if base and not (sign * np.eye(3) == Q).all():
+    if base and not (sign * np.eye(3) == axes).all():
         return
     fields["wrench.sign"] = sign * fields["wrench.sign"]
     if not base:
-        fields["wrench.frame"] = sign * Q.T @ fields["wrench.frame"]
+        fields["wrench.frame"] = sign * axes.T @ fields["wrench.frame"]
 
 
 def _correct_wrench_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
@@ -325,7 +325,7 @@ def _replace_load_by_fit_of_causes(load: Identification, why: MisfitExplanation)
 
 
 def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
-    """Return the causes; `finding` replaces frame causes if these are the only extensions."""
+    """Return the causes; `finding` replaces frame and rotation if only these are extensions."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (finding, *kept)

@@ -57,6 +57,7 @@ class RecordPartWithLoad:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
+        """Flags (16,): True for sufficiently precise parameters of [offsets; phi]."""
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
@@ -95,12 +96,12 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
     return f"[{', '.join(format(float(v), digits) for v in x)}] {unit}"
 
 
-def _wrong_axes_cause(Q: Array) -> Finding:
-    rows = axis_names_of_rows(Q)
+def _wrong_axes_cause(axes: Array) -> Finding:
+    rows = axis_names_of_rows(axes)
     what = f"the axes x, y, z of the wrench are {', '.join(rows)} of the motion"
-    if (-np.eye(3) == Q).all():
+    if (-np.eye(3) == axes).all():
         what = "the wrench has the opposite sign"
-    return Finding("axes", what, values={"axes": rows, "matrix": Q.tolist()})
+    return Finding("axes", what, values={"axes": rows, "matrix": axes.tolist()})
 
 
 def _cause_of_extension(state: FittedModel, extension: str) -> Finding:

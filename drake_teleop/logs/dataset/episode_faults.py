@@ -93,7 +93,7 @@ def saturation_faults(wrench: Array) -> list[EpisodeFault]:
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():
-            return [EpisodeFault("dead channel", f"{name} is constant, {x[0]:.4g}", name)]
+            return [EpisodeFault("dead channel", f"{name} is constant at {x[0]:.4g}", name)]
         starts = np.flatnonzero(np.diff(x, prepend=np.nan))
         lengths, values = np.diff(starts, append=len(x)), x[starts]
         ends = (values == x.max()) | (values == x.min())

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion import linear_model, rigid, spectra
-from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
+from drake_teleop.logs.pose_motion.imu_correction import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import find_disturbances
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rigid import RigidFit, RigidParameters, UnitsAndAxes
