@@ -182,7 +182,7 @@ def _start_parameters_of_clock_rate_fit(state: FittedModel, model: LoadModel, na
 
 
 def clock_rate_ratio_and_std(state: FittedModel, name: str) -> tuple[float, float]:
-    """Return described over true time step, and standard deviation; (0, inf) if undefined."""
+    """Return described / true time step and its standard deviation; (0, inf) if undefined."""
     x, covariance = state.parameters_of_extension(name)
     power, factor = CLOCK_RATE_POWER[name], 1.0 + float(x[0])
     if factor <= 0.0:
