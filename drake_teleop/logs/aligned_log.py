@@ -103,10 +103,10 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: if the robot has removed the weight, `specific_force` is the acceleration, `gravity` 0.
+        log: `specific_force` is the acceleration, `gravity` 0, if the robot removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
-        log_with_differentiated_motion: the same with differentiated motion, if requested.
+        log_with_differentiated_motion: log with numerically differentiated motion, if requested.
         edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
         clock_notes: note on the clock rate of the poses, if it was corrected.
     """
@@ -210,8 +210,8 @@ def fit_load_to_posed_log(
 ) -> tuple[LoadFitOfLog | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and any finding on unit or frame of poses.
 
-    The load is None for a method without splines, a log without poses over 4 s, or an IMU that
-    contradicts the poses.
+    The load is None for a method without splines, a log at rest, a log without poses over 4 s, or
+    an IMU that contradicts the poses.
     """
     is_long = log.t[-1] - log.t[0] >= MIN_SPLINE_RECORD_DURATION_S
     if log.posed is None or log.static or method not in METHODS_WITH_SPLINES or not is_long:
@@ -287,9 +287,9 @@ def _batch_result_of_pose_estimate(
         verb, beyond = ("increase", " beyond the stated") if gain_std else ("state", "")
         notes.append(
             "the wrench is not that of a rigid load alone, which increases all standard deviations"
-            f" {found.fit.std_inflation_by_misfit:.2g} times (possible causes: gain errors{beyond},"
-            f" bending, or a pose frame that is not S); {verb} wrench.gain_std, or correct the"
-            " frame of the pose"
+            f" by a factor of {found.fit.std_inflation_by_misfit:.2g} (possible causes: gain"
+            f" errors{beyond}, bending, or a pose frame that is not S); {verb} wrench.gain_std, or"
+            " correct the frame of the pose"
         )
     return BatchResult(load, noise, rejected, "; ".join(notes), equations)
 

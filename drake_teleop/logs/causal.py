@@ -36,7 +36,7 @@ class CausalContactAndScaledWrench:
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
     """Filter samples x (N, ...) by a causal second-order Butterworth low-pass, Eq. (T11).
 
-    Extrapolate the output over `ahead_s` [s] by its slope. A cut-off of None returns x.
+    Extrapolate the output over `ahead_s` [s] by its slope. Return x without cut-off below Nyquist.
     """
     low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead_s)
     if not len(low_pass):
@@ -49,7 +49,7 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
 
 
 def low_pass_and_settled_state(dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
-    """Return the low-pass (7,); (0,) without cut-off below half the rate."""
+    """Return the result (7,) of `design_low_pass`; (0,) without cut-off below half the rate."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
             what = f"{cutoff_hz} is not below {0.5 / dt:g} Hz, half the rate, for a prediction"

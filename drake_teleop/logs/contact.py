@@ -22,7 +22,7 @@ from drake_teleop.load.contact.noise_floor import (
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
-_MAX_RATE_RATIO_OF_SUMS = 1.25  # of log and free motion, for statistics of several samples
+_MAX_RATE_RATIO_TO_FREE_MOTION = 1.25  # of log and free motion, for statistics of several samples
 # Without orientation, gravity is the specific force below this frequency.
 _GRAVITY_LOW_PASS_CUTOFF_HZ = 0.5
 _MAX_QUIET_WRENCH_OVER_NOISE = 4.0
@@ -105,7 +105,7 @@ def detect_contact(
         )
     else:
         ratio = max(dt, free[1]) / min(dt, free[1])
-        if column > 0 and ratio > _MAX_RATE_RATIO_OF_SUMS:
+        if column > 0 and ratio > _MAX_RATE_RATIO_TO_FREE_MOTION:
             what = f"{1.0 / free[1]:.4g} Hz is not the rate of the log, {1.0 / dt:.4g} Hz, as the"
             what += f" sums of statistic {statistic!r} require"
             remedy = "use statistic `level`, or free motion with the rate of the log"

@@ -21,7 +21,7 @@ from drake_teleop.logs.causes.explain import (
     explain_misfit,
     fit_with_missing_acceleration,
 )
-from drake_teleop.logs.causes.instants import MAX_NOISE_LAG, BlockMeans, block_means_of_record
+from drake_teleop.logs.causes.instants import AR_ORDER, BlockMeans, block_means_of_record
 from drake_teleop.logs.causes.intervals import bias_of_load_by_alpha_noise
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
@@ -51,7 +51,7 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 def add_description_lines(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
-    """Return the causes with corrected lines of the log description in messages and fields."""
+    """Return the causes with corrected description lines; `by_pose`: poses determine the motion."""
     fields, changed_names = _corrected_fields_and_names_by_cause(causes, log, by_pose)
     note, out = note_that_table_needs_description(log.source), []
     for cause, names in zip(causes, changed_names, strict=True):
@@ -65,10 +65,7 @@ def add_description_lines(
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
-    """Return a message on wrong units for a mass of at least 1000 kg.
-
-    Return None for a smaller one, or for a log without a description of its wrench.
-    """
+    """Return a message on units for a mass of 1000 kg or more and a described wrench, else None."""
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected_fields_and_names_by_cause(causes, log, by_pose=True)[0]
@@ -89,7 +86,7 @@ def _corrected_fields_and_names_by_cause(
 ) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
-    column = _column_of_each_axis(fields["wrench.frame"])
+    column = _wrench_column_of_each_axis(fields["wrench.frame"])
     changed_names: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
@@ -130,7 +127,7 @@ def _correctable_fields(description: Description, by_pose: bool) -> DescriptionF
     return out
 
 
-def _column_of_each_axis(frame: Any) -> list[int] | None:
+def _wrench_column_of_each_axis(frame: Any) -> list[int] | None:
     if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
         return None
     return [int(j) for j in np.abs(frame).argmax(axis=1)]
@@ -178,14 +175,14 @@ def _correct_fields_by_cause(
             fields[name][column[c % 3]] /= values["gain"]
 
 
-def _correct_wrench_sign_and_frame(fields: DescriptionFields, Q: Array) -> None:
-    sign = 1 if np.linalg.det(Q) > 0.0 else -1
+def _correct_wrench_sign_and_frame(fields: DescriptionFields, axes: Array) -> None:
+    sign = 1 if np.linalg.det(axes) > 0.0 else -1
     base = isinstance(fields["wrench.frame"], str)
-    if base and not (sign * np.eye(3) == Q).all():
+    if base and not (sign * np.eye(3) == axes).all():
         return
     fields["wrench.sign"] = sign * fields["wrench.sign"]
     if not base:
-        fields["wrench.frame"] = sign * Q.T @ fields["wrench.frame"]
+        fields["wrench.frame"] = sign * axes.T @ fields["wrench.frame"]
 
 
 def _correct_wrench_unit_or_torque_scale(fields: DescriptionFields, torque_factor: float) -> None:
@@ -209,12 +206,12 @@ _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
     """Return causes why a rigid load does not explain the wrench of a log; None for a short log.
 
-    `delay_s` [s] is that of the motion. The motion is from the splines of `found`, or from the log
-    if None.
+    The motion, with its known delay `delay_s` [s] removed, is from the splines of `found`, or from
+    the log if None.
     """
 
     clock_rate: str | None = "clock rate of poses"
-    if log.has_calendar_time or (found and _has_gyroscope_the_speed_of_poses(log, found.splines)):
+    if log.has_calendar_time or (found and _does_gyroscope_agree_with_poses(log, found.splines)):
         clock_rate = None
 
     def means_at_additional_delay(more_s: float) -> BlockMeans:
@@ -224,7 +221,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitE
         return block_means_of_log(remove_delay(log, delay_s + more_s))
 
     data = means_at_additional_delay(0.0)
-    lengths = np.diff(find_runs_of_true(data.used)) - MAX_NOISE_LAG  # rows with predecessors
+    lengths = np.diff(find_runs_of_true(data.used)) - AR_ORDER  # rows with predecessors
     if lengths[lengths > 0].sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
         return None
     why = explain_misfit(data, means_at_additional_delay, log.estimated)
@@ -255,7 +252,7 @@ def _block_means_of_splines(log: Log, found: PoseEstimate, delay_s: float) -> Bl
     return block_means_of_record(log.t, log.wrench, motion_at, gravity, lost, noise)
 
 
-def _has_gyroscope_the_speed_of_poses(log: Log, splines: PoseSplines) -> bool:
+def _does_gyroscope_agree_with_poses(log: Log, splines: PoseSplines) -> bool:
     imu = None if log.posed is None else log.posed.imu
     if imu is None or imu.angular_velocity is None:
         return False
@@ -293,7 +290,7 @@ def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> I
 
 
 def add_errors_of_load(load: Identification, errors: Array) -> Identification:
-    """Return `load` with intervals widened by `errors` (10,) of phi."""
+    """Return `load` with the squares of `errors` (10,) added to the variances of phi."""
     variances = np.append(np.zeros(6), errors**2)
     return _replace_covariance_of_load(load, load.covariance + np.diag(variances))
 
@@ -328,7 +325,7 @@ def _replace_load_by_fit_of_causes(load: Identification, why: MisfitExplanation)
 
 
 def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
-    """Return the causes; `finding` replaces those about frames if no other extension is fitted."""
+    """Return the causes; `finding` replaces frame and rotation if only these are extensions."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (finding, *kept)
@@ -341,12 +338,12 @@ def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Fi
     text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"
     if corrections:
-        return Finding("misfit", f"{text}, and {ask_about_correction(corrections[0])}; or {remedy}")
+        return Finding("misfit", f"{text}, and {correction_question(corrections[0])}; or {remedy}")
     return Finding("misfit", f"{text}, and no known cause explains it; {remedy}")
 
 
-def ask_about_correction(correction: Finding) -> str:
-    """Return a text that asks to check the likeliest correction of an unexplained record."""
+def correction_question(correction: Finding) -> str:
+    """Return the request to check the likeliest correction of an unexplained record."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
     return f"no single correction explains the record; check whether {text}"
 

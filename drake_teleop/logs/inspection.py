@@ -17,7 +17,7 @@ from drake_teleop.common.numeric import Array, find_runs_of_true, white_noise_de
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
-from drake_teleop.logs.explained_log import ask_about_correction
+from drake_teleop.logs.explained_log import correction_question
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read import clocks
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_bag_topic_or_table
@@ -170,7 +170,7 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
         write_text(path, _append_checksum(corrected.text()))
     if first is not None and any(finding.name == "misfit" for finding in found):
         write_text(path, _append_checksum(draft.text()))
-        question = {"name": "misfit", "message": ask_about_correction(first)}
+        question = {"name": "misfit", "message": correction_question(first)}
         others = [x for x in given["findings"] if x["message"] != first.message]
         summary |= given | {"findings": [*others, question]}
 

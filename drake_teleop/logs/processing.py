@@ -33,7 +33,7 @@ from drake_teleop.logs import contact as contacts
 from drake_teleop.logs.aligned_log import METHODS_WITH_SPLINES, LoadFitOfLog, read_aligned_log
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import (
-    CAUSES_AT_REST,
+    CAUSES_DETERMINED_AT_REST,
     CAUSES_WITHOUT_CORRECTION,
     Finding,
     RecordPartWithLoad,
@@ -53,7 +53,7 @@ from drake_teleop.logs.read.reading import check_path_and_cutoff, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_CAUSES_LIKE_NONLINEAR_SENSOR = (*CAUSES_AT_REST, "load change", "gain")
+_CAUSES_LIKE_NONLINEAR_SENSOR = (*CAUSES_DETERMINED_AT_REST, "load change", "gain")
 _FINDINGS_PREVENTING_IDENTIFICATION = (
     *("left-handed", "high-pass", "low-pass", "clock rate", "channel sign", "mixed axes"),
     *("dead band", "curvature", "hysteresis"),
@@ -264,7 +264,7 @@ def _explain_residual(
     if contradicts and not _clock_rate_causes(why):
         why = _misfit_of_imu_motion(log, fitted.delay_s)  # the load is that of the IMU
     causes = () if why is None else why.causes
-    need_motion = any(x.name not in CAUSES_AT_REST for x in (*frame_findings, *causes))
+    need_motion = any(x.name not in CAUSES_DETERMINED_AT_REST for x in (*frame_findings, *causes))
     if need_motion and (too_still := too_little_motion(log)) is not None:
         return None, too_still
     by_gains = log.gain_std > 0.0 and {x.name for x in causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS

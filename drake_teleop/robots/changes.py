@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.cause import SUDDEN_CHANGES, Finding, name_misfit_causes
+from drake_teleop.logs.causes.cause import STEP_CHANGES, Finding, name_misfit_causes
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
@@ -119,7 +119,7 @@ def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     return [
         (cause.start_s, _text_of_zero_or_load_change(cause))
         for cause in name_misfit_causes(state)
-        if cause.name in SUDDEN_CHANGES
+        if cause.name in STEP_CHANGES
         and cause.start_s is not None
         and _is_change_kind_certain(state, cause.start_s)
     ]
@@ -136,7 +136,8 @@ def _is_change_kind_certain(state: FittedModel, time: float) -> bool:
     model = replace(state.model, steps=(*(step for step in steps if step != own), other))
     start = np.zeros(model.size)
     start[:17] = state.x[:17]
-    return 2.0 * (state.likelihood - state.refit(model, start).likelihood) > _KIND_LIKELIHOOD_RATIO
+    gain = state.log_likelihood - state.refit(model, start).log_likelihood
+    return 2.0 * gain > _KIND_LIKELIHOOD_RATIO
 
 
 def _text_of_zero_or_load_change(cause: Finding) -> str:

@@ -19,7 +19,7 @@ from drake_teleop.logs.causes.changes import (
     fit_steps_at_middle_of_ramps,
     replace_steps_by_contact,
 )
-from drake_teleop.logs.causes.explain import _refit_with_delay_removed
+from drake_teleop.logs.causes.explain import _refit_with_shifted_motion
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
 from drake_teleop.logs.causes.state import FittedModel, score_statistic
@@ -128,10 +128,10 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
 
     state = FittedModel.fit_record(with_delay(before), LoadModel())
     assert state.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
-    after, delay = _refit_with_delay_removed(state, before, with_delay)
+    after, delay = _refit_with_shifted_motion(state, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
     assert (abs(after.x[DELAY_INDEX]) < 5e-4) == moves
-    assert _refit_with_delay_removed(state, before, None) == (state, before)
+    assert _refit_with_shifted_motion(state, before, None) == (state, before)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e2])
@@ -194,7 +194,7 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_CHANNEL_GAIN_ERROR", 1.0)
     (contact,) = fit_candidates(state, True)
     price = (6 + 2 * ends) * np.log(state.data.used.sum())
-    gain = 2.0 * (contact.state.likelihood - state.likelihood)
+    gain = 2.0 * (contact.state.log_likelihood - state.log_likelihood)
     assert contact.name == "contact" and contact.state.contact_spans == ((found_start, found_stop),)
     assert contact.score == pytest.approx(gain - price)
 

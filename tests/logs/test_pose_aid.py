@@ -13,7 +13,7 @@ from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, 
 from scipy.interpolate import BSpline
 
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.imu_rows import (
+from drake_teleop.logs.pose_motion.imu_correction import (
     _fit_imu_gain_errors_bias_and_shift,
     correct_imu_data,
 )

@@ -192,8 +192,8 @@ def test_kind_of_a_change_needs_rotations_after_it(
             model=LoadModel(steps=(StepChange("load", 5.0),)),
             data=SimpleNamespace(t=t, y=y, used=np.ones(len(t), bool)),
             x=np.zeros(27),
-            likelihood=0.0,
-            refit=lambda model, start, other=other: SimpleNamespace(likelihood=other),
+            log_likelihood=0.0,
+            refit=lambda model, start, other=other: SimpleNamespace(log_likelihood=other),
         )
         assert changes._is_change_kind_certain(state, 5.0) == expected
 

@@ -52,9 +52,9 @@ _MAX_CABLE_STIFFNESS_N_M, _MIN_DRIFT_OVER_NOISE = 1000.0, 3.0
 _NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
 _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERROR = 0.02, 0.06, 0.2
 _MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
-_MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD = 0.2
-_MAX_LOG_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
-_SCORE_CAP_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
+_DECISIVE_RESIDUAL_SHARE = 0.2  # for which the residual selects the factor, not the likelihood
+_MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
+_MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def _scored_candidate(
 ) -> Candidate:
     rows = float(state.data.used.sum())
     cost = larger.model.size - state.model.size + num_extra_parameters
-    score = 2.0 * (larger.likelihood - state.likelihood) - cost * np.log(rows)
+    score = 2.0 * (larger.log_likelihood - state.log_likelihood) - cost * np.log(rows)
     if num_step_times:
         score += (0.5 * cost - 2.0 * num_step_times) * np.log(rows)
     return Candidate(name, larger, float(score))
@@ -129,7 +129,7 @@ def _fit_extension(state: FittedModel, name: str) -> Iterator[Candidate]:
         starts = [start_parameters_of_tilt_fit(state), None]
     if name in CLOCK_RATE_POWER:
         starts = [_start_parameters_of_clock_rate_fit(state, model, name)]
-    best = max((state.refit(model, start) for start in starts), key=lambda x: x.likelihood)
+    best = max((state.refit(model, start) for start in starts), key=lambda x: x.log_likelihood)
     if _is_extension_effect_large(best, name):
         yield _scored_candidate(name, state, best)
 
@@ -138,7 +138,7 @@ def _is_extension_effect_large(state: FittedModel, name: str) -> bool:
     x, _ = state.parameters_of_extension(name)
     match name:
         case "gravity":
-            _, angle, ratio = estimated_gravity_tilt_deg_and_size_ratio(state)
+            _, angle, ratio = compare_gravity_with_description(state)
             error = abs(ratio - 1.0)
             # Noise of the accelerations changes only the magnitude.
             turned = np.radians(angle) > error
@@ -182,7 +182,7 @@ def _start_parameters_of_clock_rate_fit(state: FittedModel, model: LoadModel, na
 
 
 def clock_rate_ratio_and_std(state: FittedModel, name: str) -> tuple[float, float]:
-    """Return described over true time step and its deviation; (0, inf) for a factor <= 0."""
+    """Return described / true time step and its standard deviation; (0, inf) if undefined."""
     x, covariance = state.parameters_of_extension(name)
     power, factor = CLOCK_RATE_POWER[name], 1.0 + float(x[0])
     if factor <= 0.0:
@@ -196,7 +196,7 @@ def has_negative_mass(state: FittedModel) -> bool:
 
 
 def has_negative_inertia(state: FittedModel) -> bool:
-    """Return True if mass, or inertia about So of a well determined mass, is clearly negative."""
+    """Return True if the mass, or for a precise mass the inertia about So, is clearly negative."""
     if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
@@ -233,8 +233,8 @@ def fitted_max_cable_stiffness_n_m(state: FittedModel) -> float:
     return float(np.abs(np.linalg.eigvalsh(K)).max())
 
 
-def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array, float, float]:
-    """Return estimated gravity_W (3,), its angle [deg] and size ratio to the described gravity."""
+def compare_gravity_with_description(state: FittedModel) -> tuple[Array, float, float]:
+    """Return estimated gravity_W (3,), its angle [deg] and length ratio to the described one."""
     given = state.data.gravity_W
     assert given is not None
     true = given - state.parameters_of_extension("gravity")[0]
@@ -244,7 +244,7 @@ def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array
 
 
 def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
-    """Return start parameters with a linear estimate of the gravity direction; None if zero."""
+    """Return start parameters with a linear estimate of gravity; None if no weight is measured."""
     y = state.data.with_other_rows_zeroed(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -280,19 +280,20 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     for factor in (1.0, *TORQUE_UNIT_FACTORS):
         model = replace(state.model, torque_factor=factor)
         fits.append(state.refit(model, state.x, iterations=_TORQUE_FACTOR_ITERATIONS))
-    most = max(x.likelihood for x in fits)
-    best = next(x for x in fits if x.likelihood > most - _EQUAL_LIKELIHOOD_TOLERANCE)
+    most = max(x.log_likelihood for x in fits)
+    best = next(x for x in fits if x.log_likelihood > most - _EQUAL_LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
     usual = min(best.residual_ratio, state.residual_ratio)
-    by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * usual
+    by_residual = least < _DECISIVE_RESIDUAL_SHARE * usual
     if by_residual:
-        best = max((x for x in fits if x.residual_ratio < 2.0 * least), key=lambda x: x.likelihood)
+        small = (x for x in fits if x.residual_ratio < 2.0 * least)
+        best = max(small, key=lambda x: x.log_likelihood)
     if best is fits[0]:
         return
     options = {"iterations": _TORQUE_FACTOR_ITERATIONS} if by_residual else {}
     best = state.refit(best.model, best.x, **options)
-    if 2.0 * (best.likelihood - state.likelihood) < 20.0:
+    if 2.0 * (best.log_likelihood - state.log_likelihood) < 20.0:
         return
     free = best.refit(best.model.with_extension("torque factor"))
     value, covariance = free.parameters_of_extension("torque factor")
@@ -302,17 +303,17 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, num_extra_parameters=1)
     if not abs(value[0]) < limit:  # a factor beside the known ratios is not a cause
-        found = replace(found, score=min(found.score, _SCORE_CAP_OF_UNKNOWN_TORQUE_FACTOR))
+        found = replace(found, score=min(found.score, _MAX_SCORE_OF_UNKNOWN_TORQUE_FACTOR))
     yield found
 
 
 def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
-    """Return nearly as likely fits with other unit factors, 0.5 to 2 times the torque factor."""
+    """Return fits, if nearly as likely, with unit factors of half to twice the torque factor."""
     factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
             fitted = state.refit(replace(state.model, torque_factor=other), state.x)
-            if fitted.likelihood > state.likelihood - _MAX_LOG_LIKELIHOOD_LOSS_OF_OTHER_UNIT:
+            if state.log_likelihood - fitted.log_likelihood < _MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT:
                 found.append(fitted)
     return found
 

@@ -20,10 +20,10 @@ from drake_teleop.logs.causes.model import CLOCK_RATE_POWER
 from drake_teleop.logs.causes.state import FittedModel
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
-SUDDEN_CHANGES = ("zero change", "load change")  # they divide a record into parts
-CAUSES_WITHOUT_CORRECTION = (*SUDDEN_CHANGES, "drift", "contact", "cable", "no load")
+STEP_CHANGES = ("zero change", "load change")  # they divide a record into parts
+CAUSES_WITHOUT_CORRECTION = (*STEP_CHANGES, "drift", "contact", "cable", "no load")
 """Causes that no line of a description corrects."""
-CAUSES_AT_REST = ("zero change", "drift", "contact")  # that a record at rest determines
+CAUSES_DETERMINED_AT_REST = ("zero change", "drift", "contact")  # that a record at rest determines
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class RecordPartWithLoad:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
+        """Flags (16,): True for sufficiently precise parameters of [offsets; phi]."""
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
@@ -95,12 +96,12 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
     return f"[{', '.join(format(float(v), digits) for v in x)}] {unit}"
 
 
-def _wrong_axes_cause(Q: Array) -> Finding:
-    rows = axis_names_of_rows(Q)
+def _wrong_axes_cause(axes: Array) -> Finding:
+    rows = axis_names_of_rows(axes)
     what = f"the axes x, y, z of the wrench are {', '.join(rows)} of the motion"
-    if (-np.eye(3) == Q).all():
+    if (-np.eye(3) == axes).all():
         what = "the wrench has the opposite sign"
-    return Finding("axes", what, values={"axes": rows, "matrix": Q.tolist()})
+    return Finding("axes", what, values={"axes": rows, "matrix": axes.tolist()})
 
 
 def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
@@ -109,7 +110,7 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
     values: dict[str, object]
     match extension:
         case "gravity":
-            true, angle, _ = candidates.estimated_gravity_tilt_deg_and_size_ratio(state)
+            true, angle, _ = candidates.compare_gravity_with_description(state)
             name, values = "gravity direction", {"angle_deg": angle, "gravity": true.tolist()}
             text = (
                 f"gravity is {angle:.2f} deg (+- {1.96 * direction_std_deg(true, covariance):.2g})"
@@ -151,7 +152,7 @@ def _cause_of_extension(state: FittedModel, extension: str) -> Finding:
 
 
 def direction_std_deg(x: Array, covariance: Array) -> float:
-    """Return the standard deviation of x's direction about the least certain axis [deg]."""
+    """Return the largest standard deviation of the direction of a vector x (3,) [deg]."""
     size = float(np.linalg.norm(x))
     across = np.eye(3) - np.outer(x, x) / size**2
     spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
@@ -204,7 +205,7 @@ def _torque_factor_cause(state: FittedModel) -> Finding:
         if others := [other.model.torque_factor for other in fits_with_other_torque_units(state)]:
             listed = " or ".join(f"{x:.6g}" for x in others)
             what += f" (or {listed} times, which the record does not exclude)"
-    return Finding("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
+    return Finding("torque factor", f"{what}: a unit or sign is wrong", values={"factor": factor})
 
 
 def _gain_error_cause(state: FittedModel, c: int) -> Finding:

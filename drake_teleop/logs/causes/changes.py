@@ -24,23 +24,20 @@ from drake_teleop.logs.causes.state import (
 _MIN_SCORE_STATISTIC_OF_STEP = 60.0
 _STEP_TIME_REFINEMENT_ROWS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_TIME_TO_END_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 0.2, 80.0
-MIN_OMITTED_RAMP_SPAN_S = 0.5  # around a gradual step
+OMITTED_SPAN_AROUND_RAMP_S = 0.5
 _NUM_TRIED_STEP_TIMES, _MIN_STEP_OVER_DEVIATION, _MIN_OFFSET_STEP_OVER_NOISE = 2, 5.0, 2.0
 _MIN_MASS_STEP_OVER_MASS, _MIN_MOMENT_STEP_OVER_MASS_M = 0.01, 0.002
 
 
 def add_step_change(state: FittedModel, kind: str) -> FittedModel | None:
-    """Return a fit with one more change of "offsets" or "load" (`kind`), at the likeliest time.
-
-    Return None if no change is significant.
-    """
+    """Return a fit with the likeliest change of "offsets" or "load"; None if insignificant."""
     best: FittedModel | None = None
     for time in _likely_step_times(state, kind):
         found = _fit_with_refined_step_time(state, kind, time)
         ramp = fit_steps_at_middle_of_ramps(state, [[kind]], [time], state.contact_spans)
-        if 2.0 * (ramp.likelihood - found.likelihood) > _MIN_LIKELIHOOD_GAIN_OF_RAMP:
+        if 2.0 * (ramp.log_likelihood - found.log_likelihood) > _MIN_LIKELIHOOD_GAIN_OF_RAMP:
             found = ramp
-        if best is None or found.likelihood > best.likelihood:
+        if best is None or found.log_likelihood > best.log_likelihood:
             best = found
     return best if best and _is_step_significant(best, len(state.model.steps)) else None
 
@@ -103,22 +100,22 @@ def fit_steps_at_middle_of_ramps(
     state: FittedModel,
     kinds: Sequence[Sequence[str]],
     times: Sequence[float],
-    spans: TimeSpans,
+    contact_spans: TimeSpans,
     widths: Sequence[float] | None = None,
 ) -> FittedModel:
     """Return a fit with more changes of "offsets" or "load", in the middle of gradual transitions.
 
-    `kinds` lists the changes at each of `times` [s]. Rows within the transitions, which take
-    `widths` [s], are not used.
+    `kinds` lists the changes at each of `times` [s]. Rows in the transitions, which take `widths`
+    [s], and in `contact_spans` are not used.
     """
-    least = MIN_OMITTED_RAMP_SPAN_S
+    least = OMITTED_SPAN_AROUND_RAMP_S
     widths = [max(least, w + least) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
     model = replace(state.model, steps=(*state.model.steps, *steps))
     start = model.start_parameters(state.x, state.model)
-    found = FittedModel.fit_record(state.data, model, start, (*spans, *around))
+    found = FittedModel.fit_record(state.data, model, start, (*contact_spans, *around))
     steps = []
     for both, span in zip(kinds, around, strict=True):
         added = range(first + len(steps), first + len(steps) + len(both))
@@ -180,8 +177,8 @@ def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> F
             now = best.model.steps[-1].time
             move = share * state.data.dt
             tried = [fit_with_step_at(now + x, best.x) for x in (-move, move)]
-            better = max(tried, key=lambda x: x.likelihood)
-            if not better.likelihood > best.likelihood + 1e-3:
+            better = max(tried, key=lambda x: x.log_likelihood)
+            if not better.log_likelihood > best.log_likelihood + 1e-3:
                 break
             best = better
     return best
@@ -205,7 +202,7 @@ def _is_step_significant(state: FittedModel, i: int) -> bool:
 
 _TRIED_SHARES_OF_KEPT_BLOCKS = (0.12, 0.3, 0.55)
 _MAX_TRIMMED_FIT_ITERATIONS, _MIN_TRIMMED_FIT_BLOCKS = 15, 8
-_KEPT_BLOCKS_GROWTH = 1.3
+_KEPT_BLOCKS_GROWTH = 1.3  # largest growth of their number in one iteration
 _TRIED_START_RUN_LENGTHS_BLOCKS, _TRIED_END_RUN_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
 _CONTACT_RMS_OVER_NOISE, _CONTACT_RMS_OVER_CALM, _CALM_RMS_MARGIN = 8.0, 5.0, 1.3
 _MAX_NUM_LOADS, _MAX_LOAD_STEPS, _MIN_CALM_RUN_BLOCKS, _MAX_UNFITTED_BLOCK_SHARE = 4, 4, 4, 0.12
@@ -278,7 +275,7 @@ class _NormalEquationsOfBlocks:
         self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks `among` with residuals above noise and motion errors, or None."""
+        """Flag blocks `among` with residuals above noise and motion errors; None for too few."""
         found = self._fit_calmest_blocks(np.flatnonzero(among))
         if found is None:
             return None
@@ -307,7 +304,7 @@ class _NormalEquationsOfBlocks:
             ends = np.r_[blocks[:length], blocks[-length:]]
             level, move, last = self._trimmed_fit_of_blocks(blocks, ends, 0.0)
             calm = float(np.median(level[last]))
-            if self._is_residual_large_elsewhere(level, last, np.setdiff1d(blocks, last), calm):
+            if self._is_residual_large_in_others(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
         limit = max(_CONTACT_RMS_OVER_NOISE**2, (_CONTACT_RMS_OVER_CALM**2) * usual)
@@ -315,7 +312,7 @@ class _NormalEquationsOfBlocks:
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
 
-    def _is_residual_large_elsewhere(
+    def _is_residual_large_in_others(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))

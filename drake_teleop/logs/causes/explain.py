@@ -40,7 +40,7 @@ _MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S = 5e-4, 0.3
 _EQUAL_DELAY_TOLERANCE_S, _MAX_DELAY_ITERATIONS = 0.004, 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
-_MAX_UNPERMUTED_AXES_RESIDUAL_RATIO = 2.0
+_MAX_RESIDUAL_OVER_PERMUTED_AXES = 2.0
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL, _MAX_CONTACT_RESIDUAL_SHARE = 0.2, 1.1, 0.5
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO, _MAX_EFFECTIVE_MISFIT_SHARE = 15.0, 0.9
@@ -94,7 +94,7 @@ def search_causes(
     if abs(delay_s - found[1]) < _EQUAL_DELAY_TOLERANCE_S:
         return found
     repeated = _search_causes_from(_fit_initial_model(means_at(delay_s), plain), delay_s, means_at)
-    likelier = repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
+    likelier = repeated[0].log_likelihood > found[0].log_likelihood + _MIN_CAUSE_SCORE
     better = likelier or _has_much_smaller_residual_than(repeated[0], found[0])
     return repeated if better or residual_is_noise(repeated[0]) else found
 
@@ -118,7 +118,7 @@ def _fit_initial_model(data: BlockMeans, model: LoadModel) -> FittedModel:
 def _search_causes_from(
     state: FittedModel, delay_s: float, means_at: MeansAtDelay | None
 ) -> SearchResult:
-    state, delay_s = _refit_with_delay_removed(state, delay_s, means_at)
+    state, delay_s = _refit_with_shifted_motion(state, delay_s, means_at)
     rejected: list[Candidate] = []
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
@@ -139,7 +139,7 @@ def _search_causes_from(
             explained = None if touched is None else changes.replace_contacts_by_steps(touched)
             if explained is None:
                 break
-            state, delay_s = _refit_with_delay_removed(explained, delay_s, means_at)
+            state, delay_s = _refit_with_shifted_motion(explained, delay_s, means_at)
             continue
         larger = changes.replace_steps_by_contact(winner.state)
         if winner.name == "contact":
@@ -147,7 +147,7 @@ def _search_causes_from(
         elif larger.contact_spans != winner.state.contact_spans:
             larger = changes.replace_contacts_by_steps(larger) or larger
         # A contact can take all the samples before or after an earlier step.
-        state, delay_s = _refit_with_delay_removed(remove_small_steps(larger), delay_s, means_at)
+        state, delay_s = _refit_with_shifted_motion(remove_small_steps(larger), delay_s, means_at)
         rejected = [x for x in rejected if x is not winner]
         if winner.name == "cable":
             return state, delay_s, []
@@ -160,7 +160,7 @@ def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Can
     return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
-def _refit_with_delay_removed(
+def _refit_with_shifted_motion(
     state: FittedModel, delay_s: float, means_at: MeansAtDelay | None
 ) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
@@ -255,7 +255,7 @@ class MisfitExplanation:
 
     @property
     def needs_full_gain_matrix(self) -> bool:
-        """True for several gain errors, or one with rotation or cable, as of a full gain matrix."""
+        """True if crosstalk is likely: several gain errors, or one with rotation or cable."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.extensions)
         return len(model.gain_channels) > 1 or bool(model.gain_channels and others)
@@ -294,8 +294,8 @@ def explain_misfit(
 def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
     """Return the unweighted fit of a record without acceleration, with a pessimistic covariance.
 
-    The missing acceleration depends on the orientation, so that all residuals count as one common
-    error. The inertia is undetermined, because S may rotate about any point.
+    All residuals count as one common error, because the missing acceleration depends on the
+    orientation. The centre of rotation is unknown, hence the inertia is undetermined.
     """
     data, axes = why.state.data, why.state.model.axes
     fits = []
@@ -307,7 +307,7 @@ def fit_with_missing_acceleration(why: MisfitExplanation) -> MisfitExplanation:
             state = fit_model(model, state.rows, state.x, iterations=2)
         fits.append(state)
     # A rotation that is not right-angled resembles several permutations of axes.
-    limit = _MAX_UNPERMUTED_AXES_RESIDUAL_RATIO * fits[0].residual_ratio
+    limit = _MAX_RESIDUAL_OVER_PERMUTED_AXES * fits[0].residual_ratio
     simple = (x for x in fits[1:] if x.x[6] > 0.0 and x.residual_ratio < limit)
     state = next(simple, fits[0])
     covariance = float(data.used.sum()) * state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD]

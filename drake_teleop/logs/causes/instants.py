@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from drake_teleop.common.numeric import Array, search_minimum, white_noise_deviations
 
-MAX_NOISE_LAG = 4  # order of the autoregressive noise
+AR_ORDER = 4  # of the autoregressive noise [rows]
 CONSTANT_COLUMN, SPECIFIC_FORCE_SIGNALS, GRAVITY_SIGNALS = 0, slice(1, 4), slice(4, 7)
 ALPHA_SIGNALS, OMEGA_PRODUCTS = slice(7, 10), slice(10, 16)
 WRENCH_SIGNALS, WRENCH_RATE_SIGNALS = slice(16, 22), slice(22, 28)
@@ -35,7 +35,7 @@ _ALPHA_SMOOTHING_WIDTHS_ROWS = (5, 9, 15, 25)  # windows for a noisy angular acc
 _MIN_WRENCH_NOISE_OVER_SIGNAL_STD = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _MAX_TRIED_DELAY_S, _DELAY_STEP_S = 0.25, 0.01
 _CONSTANT_AND_MOTION_COLUMNS = slice(0, 16)
-SYMMETRIC_MATRIX_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_OMEGA_PRODUCT_AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 MotionAtTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
@@ -92,8 +92,8 @@ class BlockMeans:
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
         """Return y (M, 67) with 25 columns appended for each step time [s].
 
-        These are the columns of y in the load's wrench and offsets, times 0 before and 1 after the
-        step.
+        These are the columns of the load's wrench and offsets, multiplied by 0 before and 1 after
+        the step.
         """
         parts = [self.y]
         for time in times:
@@ -101,8 +101,8 @@ class BlockMeans:
             parts.append(self.y[:, COLUMNS_REPEATED_BY_STEP] * share[:, None])
         return np.hstack(parts)
 
-    def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
-        """Return (blocks, lags, W, W): sums of rows y_i y_(i-d)^T, plus transpose if lag d > 0."""
+    def lagged_block_sums(self, y: Array, *, rows: int, lags: int = AR_ORDER + 1) -> Array:
+        """Return block sums (blocks, lags, W, W) of y_i y_(i-d)^T, plus transpose if lag d > 0."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -162,16 +162,16 @@ def _smooth_noisy_alpha_and_get_noise_share(y: Array, used: NDArray[np.bool_]) -
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
     alpha = y[used][:, ALPHA_SIGNALS]
-    share = _min_noise_variance_share(alpha)
+    share = _min_noise_share_of_channels(alpha)
     for width in _ALPHA_SMOOTHING_WIDTHS_ROWS:
-        if _min_noise_variance_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
+        if _min_noise_share_of_channels(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
             break
         alpha = savgol_filter(y[used][:, ALPHA_SIGNALS], width, 2, axis=0)
     y[np.flatnonzero(used)[:, None], np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop)] = alpha
     return share
 
 
-def _min_noise_variance_share(x: Array) -> float:
+def _min_noise_share_of_channels(x: Array) -> float:
     return float((white_noise_deviations(x) ** 2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
@@ -196,7 +196,7 @@ def _write_motion_and_get_has_positions(
 
 def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     s, omega, alpha = motion[:3]
-    products = np.stack([omega[:, i] * omega[:, k] for i, k in SYMMETRIC_MATRIX_ENTRIES], axis=1)
+    products = np.stack([omega[:, i] * omega[:, k] for i, k in _OMEGA_PRODUCT_AXIS_PAIRS], axis=1)
     if len(motion) == 3 or gravity_W is None:
         return np.hstack([s, np.zeros_like(s), alpha, products])
     R_SW = np.swapaxes(motion[3], 1, 2)
@@ -207,10 +207,10 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
 
 
 def delay_of_linear_fit(data: BlockMeans) -> float:
-    """Return the motion delay behind the wrench [s], within +-0.25 s, with the best linear fit.
+    """Return the motion delay behind the wrench [s] with the best linear fit.
 
-    The fit combines 16 motion signals freely, without a rigid load. Return 0 if the best delay is
-    at an end of the range.
+    The fit combines 16 motion signals freely, without a rigid load. The delay is within 0.25 s and
+    a tenth of the record; return 0 if it is at an end of this range.
     """
     reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

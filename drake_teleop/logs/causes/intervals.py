@@ -68,7 +68,7 @@ def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Ca
 
 
 def covariance_of_load_by_gain_errors(state: FittedModel) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] due to likely gain errors, else 0."""
+    """Return the covariance (16, 16) of [offsets; phi] by gain errors; 0 if they are unlikely."""
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
     unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)

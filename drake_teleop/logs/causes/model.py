@@ -122,7 +122,7 @@ class LoadModel:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return coefficients (B, 6, W) for x (B, size), which times W signals are the wrench."""
+        """Return C (B, 6, W) for B parameters x (B, size): C times W signals is the wrench."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, _step_change_columns(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _wrench_coefficients_of_load(x[:, 6:16]) @ motion
@@ -182,7 +182,7 @@ class LoadModel:
         return M
 
     def wrench_derivative(self, x: Array) -> Array:
-        """Return derivatives (size, 6, k) by x of `wrench_coefficients` of the k used signals."""
+        """Return derivatives (size, 6, k) of `wrench_coefficients` of used signals by x (size,)."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
             steps[self.parameter_slices["rotation"]] = _FINITE_DIFFERENCE_ROTATION_RAD
@@ -192,7 +192,7 @@ class LoadModel:
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual_coefficients(self, x: Array) -> Array:
-        """Return coefficients (6, k) that times k used signals are measured minus model wrench."""
+        """Return C (6, k): C times k used signals is the measured minus the model's wrench."""
         out = -self.wrench_coefficients(x[None])[0]
         out[np.arange(6), instants.WRENCH_SIGNALS.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])

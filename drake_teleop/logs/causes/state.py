@@ -34,22 +34,22 @@ class UsedRows:
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of y_i y_(i-d)^T, plus transpose if d > 0, for lags d of 0 to 4 rows."""
+        """Sums (5, W, W) of y_i y_(i-d)^T for lags d of 0 to 4 rows, plus transpose if d > 0."""
         return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
     def rows_with_four_predecessors(self) -> NDArray[np.intp]:
         """Indices of used rows whose four predecessors are used, too."""
-        padded = np.pad(self.used, (instants.MAX_NOISE_LAG, 0))
-        return np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).all(axis=1))
+        padded = np.pad(self.used, (instants.AR_ORDER, 0))
+        return np.flatnonzero(sliding_window_view(padded, instants.AR_ORDER + 1).all(axis=1))
 
     @cached_property
     def _lagged_signals_near_gaps(self) -> Array:
-        padded = np.pad(self.used, instants.MAX_NOISE_LAG)
-        near = np.flatnonzero(sliding_window_view(padded, instants.MAX_NOISE_LAG + 1).any(axis=1))
+        padded = np.pad(self.used, instants.AR_ORDER)
+        near = np.flatnonzero(sliding_window_view(padded, instants.AR_ORDER + 1).any(axis=1))
         edge = np.setdiff1d(near, self.rows_with_four_predecessors)
-        at = edge[:, None] - np.arange(instants.MAX_NOISE_LAG + 1)
-        y = np.vstack([self.y, np.zeros((2 * instants.MAX_NOISE_LAG, self.y.shape[1]))])
+        at = edge[:, None] - np.arange(instants.AR_ORDER + 1)
+        y = np.vstack([self.y, np.zeros((2 * instants.AR_ORDER, self.y.shape[1]))])
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
@@ -66,15 +66,15 @@ class UsedRows:
     ) -> tuple[Array, Array]:
         """Return the residual's whitening filters (6, 5) and noise power (6,), at least `floor`."""
         e = self.y @ residual_coefficients.T
-        filters = np.eye(1, instants.MAX_NOISE_LAG + 1).repeat(6, axis=0)
+        filters = np.eye(1, instants.AR_ORDER + 1).repeat(6, axis=0)
         now = self.rows_with_four_predecessors
-        history = np.stack([e[now - d] for d in range(instants.MAX_NOISE_LAG + 1)], axis=2)
+        history = np.stack([e[now - d] for d in range(instants.AR_ORDER + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(now), 1)
         if is_white or len(now) < MIN_ROWS_FOR_AUTOREGRESSION:
             return filters, np.maximum(products[:, 0, 0], floor)
-        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(instants.MAX_NOISE_LAG)
-        inner += 1e-300 * np.eye(instants.MAX_NOISE_LAG)
+        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(instants.AR_ORDER)
+        inner += 1e-300 * np.eye(instants.AR_ORDER)
         filters[:, 1:] = -np.linalg.solve(inner, products[:, 1:, :1])[..., 0]
         power = products[:, 0, 0] + (filters[:, 1:] * products[:, 0, 1:]).sum(axis=1)
         return filters, np.maximum(power, floor)
@@ -103,7 +103,7 @@ class FittedModel:
 
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
-        residual: (6, k) coefficients, which times a row of `rows.y` are the residual wrench.
+        residual: (6, k) coefficients; their product with a row of `rows.y` is the residual wrench.
         noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
         noise_power: (6,) variance of the whitened residual.
         contact_spans: (start, stop) of contacts, whose rows are not used [s].
@@ -156,7 +156,7 @@ class FittedModel:
         return 0.5 * (gram + gram.T), right
 
     @cached_property
-    def likelihood(self) -> float:
+    def log_likelihood(self) -> float:
         """Log likelihood of all rows; rows in contact have a separate noise power."""
         count = len(self.rows.rows_with_four_predecessors)
         own = -0.5 * count * float(np.log(self.noise_power).sum())
@@ -196,7 +196,7 @@ class FittedModel:
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_four_predecessors, self.noise_filters
         gain, freedom = 0.0, 0
-        late = [columns[whole - d] for d in range(instants.MAX_NOISE_LAG + 1)]
+        late = [columns[whole - d] for d in range(instants.AR_ORDER + 1)]
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
@@ -226,7 +226,7 @@ def fit_model(
     total = (rows.data.y[rows.used][:, instants.WRENCH_SIGNALS] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
     floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
-    white = np.eye(1, instants.MAX_NOISE_LAG + 1).repeat(6, axis=0)
+    white = np.eye(1, instants.AR_ORDER + 1).repeat(6, axis=0)
     residual, power = model.residual_coefficients(x), np.maximum(both, floor)
     found = FittedModel(model, rows, x, np.zeros(0), residual, white, power, spans)
     for iteration in range(iterations):

@@ -1,6 +1,6 @@
 """Files of robot-learning datasets: episodes of LeRobot, robomimic, Zarr and folders of tables.
 
-The copy has two more columns; other values are unchanged, and other files are hard links.
+The copy has two more columns; other values are unchanged. Other files are hard links if possible.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class EpisodeFault(NamedTuple):
 def list_faults(
     x: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
-    """Return the faults of an episode, in words, from the hypothesis x about its wrench.
+    """Return the faults of an episode that the hypothesis x about its wrench implies.
 
     `usual_lag` [frames] is that of other episodes, `usual_phi` (10,) the usual load.
     """
@@ -93,7 +93,7 @@ def saturation_faults(wrench: Array) -> list[EpisodeFault]:
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():
-            return [EpisodeFault("dead channel", f"{name} is {x[0]:.4g} in all frames", name)]
+            return [EpisodeFault("dead channel", f"{name} is constant at {x[0]:.4g}", name)]
         starts = np.flatnonzero(np.diff(x, prepend=np.nan))
         lengths, values = np.diff(starts, append=len(x)), x[starts]
         ends = (values == x.max()) | (values == x.min())

@@ -35,10 +35,10 @@ _FORCE_AND_TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
 _REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
 # Required reduction of the log spread, for each deviation.
 _SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
-_NUM_START_FIT_PARTS, _MIN_HALF_WIDTH_OVER_TYPICAL = 4, 0.3
+_NUM_START_FIT_PARTS, _MIN_HALF_WIDTH_OVER_USUAL = 4, 0.3
 _MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
-_STD_CAP_OVER_FRAME_DIFFERENCE_NOISE = 1.5
+_MAX_STD_OVER_DIFFERENCE_NOISE = 1.5  # noise by differences of frames
 
 
 @dataclass(frozen=True)
@@ -87,16 +87,17 @@ def ln_half_width_and_centre_of_calm_half(residual: Array, floor: Array) -> tupl
 
 
 def find_simplest_hypothesis_and_residual(
-    signals: EpisodeSignals, phi: Array, usual_lag: float, typical: Array
+    signals: EpisodeSignals, phi: Array, usual_lag: float, usual_half_widths: Array
 ) -> tuple[WrenchHypothesis, Array]:
     """Return the simplest hypothesis that explains the wrench of an episode, and its residual.
 
-    The residual (N, 6) is the reading without the wrench of load phi (10,); offsets remain. Other
-    episodes have the lag `usual_lag` [frames] and residuals of half widths `typical` (6,) [N, N m].
+    The residual (N, 6) is the reading without the wrench of load phi (10,); offsets remain.
+    `usual_lag` [frames] and `usual_half_widths` (6,) [N, N m] are those of other episodes.
     """
-    search = HypothesisSearch(signals, phi, usual_lag, _MIN_HALF_WIDTH_OVER_TYPICAL * typical)
+    floor = _MIN_HALF_WIDTH_OVER_USUAL * usual_half_widths
+    search = HypothesisSearch(signals, phi, usual_lag, floor)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
-    if usual.spread.sum() - np.log(typical).sum() < search.price:
+    if usual.spread.sum() - np.log(usual_half_widths).sum() < search.price:
         return usual, search.unexplained_reading(usual)
     found = [usual]
     for kind in TRIED_WRENCH_CONVENTIONS:
@@ -284,14 +285,14 @@ def _fault_weight_of_rotation(M: Array) -> float:
 def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
     """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
 
-    Frames beside the jump fit to one of two constant offsets; contact begins gradually.
+    Frames next to the jump already have constant offsets; contact begins gradually.
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * STANDARD_NORMAL_QUARTILE)
     by_spread = np.exp(spread) / STANDARD_NORMAL_QUARTILE
-    deviation = np.minimum(by_spread, _STD_CAP_OVER_FRAME_DIFFERENCE_NOISE * noise)
+    deviation = np.minimum(by_spread, _MAX_STD_OVER_DIFFERENCE_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(frames: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -33,7 +33,7 @@ _THRESHOLD_OVER_MAX_CONTACT_FREE_LEVEL = 1.1
 
 @dataclass(frozen=True)
 class SharedLoad:
-    """Load of a dataset and what its episodes have in common.
+    """Load that most episodes of a dataset share, with their usual delay and noise.
 
     Attributes:
         phi: (10,) load that is removed.

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion import linear_model, rigid, spectra
-from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
+from drake_teleop.logs.pose_motion.imu_correction import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import find_disturbances
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rigid import RigidFit, RigidParameters, UnitsAndAxes
@@ -29,7 +29,7 @@ _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_MAX_JACOBIAN_OF_DETERMINED_ORIGIN = 1e-3
+_MAX_JACOBIAN_OF_DETERMINED_ORIGIN = 1e-3  # by undetermined parameters
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -42,7 +42,7 @@ class PoseFrame:
         R_SP: (3, 3) rotation from axes of P to those of S.
         position_stds_m: (3,) standard deviations of `p_SoPo_S` [m]; inf if undetermined.
         rotation_stds_deg: (3,) standard deviations of R_SP about the axes of S [deg].
-        is_shifted, is_rotated: whether origin, axes differ significantly from the given ones.
+        is_shifted, is_rotated: True if the origin, or the axes, differ clearly from the given ones.
     """
 
     p_SoPo_S: Array
@@ -54,12 +54,12 @@ class PoseFrame:
 
     @property
     def is_position_known(self) -> NDArray[np.bool_]:
-        """Whether the standard deviations (3,) of `p_SoPo_S` are below 2 cm."""
+        """Flags (3,): True if the standard deviation in `p_SoPo_S` is below 2 cm."""
         return np.asarray(self.position_stds_m < MAX_KNOWN_FRAME_SHIFT_STD_M)
 
     @property
     def is_rotation_known(self) -> NDArray[np.bool_]:
-        """Whether the standard deviations (3,) of `R_SP` are below 1 degree."""
+        """Flags (3,): True if the standard deviation in `R_SP` is below 1 degree."""
         return np.asarray(self.rotation_stds_deg < MAX_KNOWN_FRAME_ROTATION_STD_DEG)
 
 
@@ -90,7 +90,7 @@ class PoseEstimate(PoseMotion):
         fit: fit with the given origin and axes of the pose frame, if given.
         free_frame_fit: fit with an estimated pose frame, `frame`.
         units_and_axes: unit of positions, axes and masses from the linear model's fit.
-        t, rejected: (M,) instants [s], and True for disturbed ones.
+        t, rejected: (M,) instants [s], and flags, True at disturbances.
         note: text if disturbances could not be rejected.
     """
 
@@ -216,9 +216,9 @@ def _fit_pose_splines_and_delay(
     fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
     if usable < fewest:
         what = f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart"
-        what = f"{what} ({fewest} required; poses more than {_MIN_EXCLUDED_POSE_GAP_S} s apart"
+        what += f" ({fewest} required; gaps of the poses above {_MIN_EXCLUDED_POSE_GAP_S} s and"
         remedy = "record both at the same time, longer, without interruptions, above 10 Hz"
-        raise DrakeTeleopError(f"{what} do not count)", remedy=remedy)
+        raise DrakeTeleopError(f"{what} {_GAP_MARGIN_S} s beside them are excluded)", remedy=remedy)
     slower = min(poses.rate, grid.stride / grid.dt)
     top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)

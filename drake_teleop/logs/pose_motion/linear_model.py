@@ -32,7 +32,7 @@ from drake_teleop.logs.pose_motion.splines import (
 )
 
 TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
-"""Knot distances that are tried first; then two between the best and its neighbours [s]."""
+"""Knot spacings that are tried first; then two between the best and its neighbours [s]."""
 MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-7
 """Least noise of a channel relative to the wrench, for rounded numbers."""
 _COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
@@ -49,7 +49,7 @@ class LinearFit:
     """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16), which times the signals are the wrench; 0 for signals that are 0.
+        coefficients: (6, 16); their product with the signals is the wrench; 0 for zero signals.
         covariance: (6, 16, 16) of the rows of coefficients.
         noise_power: (bands, 6) mean noise power.
         channel_costs: (6,) negative log likelihood of each channel.
@@ -67,7 +67,7 @@ class LinearFit:
 
 
 def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -> LinearFit:
-    """Fit the wrench by 16 signals, from second moments Z (..., bands, n, n); n is 22 or 38.
+    """Fit the wrench by 16 signals, from second moments Z (..., bands, n, n) of `Spectra`.
 
     With the coefficients `load` (6, 16) only the offsets are fitted.
     """
@@ -120,14 +120,14 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 
 def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
-    """Return a lower limit (..., 1, 6) of noise power: rounding of the wrench's numbers."""
+    """Return a lower limit (..., 1, 6) of noise power, due to rounded numbers of the wrench."""
     power = _wrench_channel_powers(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
     both = power.reshape(*power.shape[:-1], 2, 3).sum(axis=-1).repeat(3, axis=-1)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
-    """Return noise levels; each channel has white noise, or the likelier random walk (T74)."""
+    """Return noise levels; a channel's noise is white, plus a random walk if likelier (T74)."""
     levels = NoiseLevels.white_within_groups(bands)
     least = fit_linear_model(Z, levels).channel_costs - _MIN_LOG_LIKELIHOOD_GAIN_BY_DRIFT
     shape = levels.relative_power.copy()
@@ -154,13 +154,14 @@ def _costs_at_delays(spectra: Spectra, delays: Array) -> Array:
 
 
 def find_best_delay_and_cost(
-    spectra: Spectra, reach: float, finest: float = _FINEST_DELAY_STEP_S
+    spectra: Spectra, half_range_s: float, finest_step_s: float = _FINEST_DELAY_STEP_S
 ) -> tuple[float, float]:
-    """Return the likeliest delay [s] within +-`reach` of the present one, and its cost (T75)."""
-    step = min(_COARSE_DELAY_STEP_S, reach / 2)
-    at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
+    """Return the likeliest delay [s] within `half_range_s` of the present one, and cost (T75)."""
+    step = min(_COARSE_DELAY_STEP_S, half_range_s / 2)
+    count = round(half_range_s / step)
+    at: Array = spectra.delay + step * np.arange(-count, count + 1.0)
     costs = _costs_at_delays(spectra, at)
-    while step > finest:
+    while step > finest_step_s:
         best = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
         centre = float(at[best] + step * position_of_parabola_minimum(*costs[best - 1 : best + 2]))
         step /= 8.0
@@ -185,7 +186,7 @@ def delay_std(spectra: Spectra) -> float:
 def guess_knot_spacing_and_delay(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return likeliest knot distance and delay [s] on a coarse grid; a `known` delay is kept."""
+    """Return likeliest knot spacing and delay [s] on a coarse grid; a `known` delay is kept."""
     found, reach = [], window.delay_search_half_range_s
     for h in _knot_spacings_allowed_by_pose_rate(cache)[::2]:
         spectra, late = window.spectra_at_delay(cache.splines_with_spacing(h), delay), delay
@@ -200,7 +201,7 @@ def guess_knot_spacing_and_delay(
 def choose_knot_spacing_and_delay(
     window: FitWindow, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return splines, knot distance [s] and delay [s] of about the highest likelihood.
+    """Return splines, knot spacing [s] and delay [s] of about the highest likelihood.
 
     Knots are closer than at the highest likelihood: by 8 % with a known load, else by 16 %. The
     delay is not changed if `known`.
@@ -305,7 +306,7 @@ _MIN_REJECTION_MARGIN_S = 0.1  # least margin on both sides of a rejected time s
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
     """Return flags (M,) of instants to reject (contact, impact, saturation), and a note.
 
-    `spacing`: of the knots [s]. If too little motion would remain, none is flagged, with a note.
+    `spacing` [s] is that of knots. If too little motion would remain, only a note is returned.
     """
     # A Gaussian gain, one half at `_RESIDUAL_FILTER_CUTOFF_OVER_KNOT_RATE` / h, does not ring.
     window, grid = spectra.window, spectra.window.grid

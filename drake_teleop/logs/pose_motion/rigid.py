@@ -24,7 +24,7 @@ OFFSET_AND_LOAD_PARAMETERS, DELAY_PARAMETER = slice(0, 16), slice(16, 17)
 LEVER_PARAMETERS, ROTATION_PARAMETERS = slice(17, 20), slice(20, 23)
 _MAX_RIGID_FIT_STEPS, _MAX_CONVERGED_STEP_OVER_STD = 40, 1e-4
 _MAX_RIGID_MISFIT_OVER_DOF, _MAX_GAIN_MISFIT_OVER_EXPECTED, _NOISE_MISFIT_OVER_DOF = 4.0, 1.5, 1.5
-_MAX_GAUSS_NEWTON_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_MAX_GAUSS_NEWTON_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])  # [s, m, rad]
 _MIN_WRENCH_NOISE_OVER_RESIDUAL, _ROTATION_DIFFERENCE_STEP_RAD = 0.1, 1e-4
 _MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
 _OMEGA_PRODUCT_AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -61,6 +61,7 @@ class RigidFit:
 
     @property
     def is_rigid(self) -> bool:
+        """Whether a rigid load without gain errors explains the wrench."""
         return self.misfit < _MAX_RIGID_MISFIT_OVER_DOF * self.degrees_of_freedom
 
     @property
@@ -77,7 +78,7 @@ class RigidFit:
 
 
 def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
-    """Return M (19, 22), (T79): M [`PoseSplines.signals`; wrench] = [1; wrench; motion of S]."""
+    """Return M (19, 22), (T79), from [16 signals of P; wrench] to [1; wrench; motion of S]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
@@ -93,7 +94,7 @@ def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
 def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return C (6, 16), Eq. (T73): C times the 16 motion signals is the wrench of load phi (10,).
 
-    It excludes the force of gravity on `removed_weight` [m, m c] (4,).
+    It excludes the wrench of gravity on `removed_weight` [m, m c] (4,).
     """
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
@@ -137,7 +138,7 @@ def fit_rigid(
         expected_misfit_by_gains=_expected_misfit_by_gain_errors(record, plain, gain_std),
     )
     if not fit.is_rigid:
-        solution = _solve_rigid_fit(record, solution.parameters, one_weight=True)
+        solution = _solve_rigid_fit(record, solution.parameters, equal_band_weights=True)
         fit = replace(fit, parameters=solution.parameters)
     covariance = _parameter_covariance(record, solution, fit.std_inflation_by_misfit, gain_std)
     return replace(fit, covariance=covariance)
@@ -163,13 +164,13 @@ class _RigidSolution:
 
 
 def _solve_rigid_fit(
-    record: _RigidFitData, state: RigidParameters, *, one_weight: bool = False
+    record: _RigidFitData, state: RigidParameters, *, equal_band_weights: bool = False
 ) -> _RigidSolution:
     sizes, clean = record.noise_levels.half_dof_of_bands, record.moments - record.noise_moments
     R = _residual_covariances(record, state, record.linear_noise_power * sizes[:, None])
     for _ in range(_MAX_RIGID_FIT_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
-        if one_weight:
+        if equal_band_weights:
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
         B, Le = _residual_and_derivative(state)
         gram, right = _normal_equations(B, Le, clean, W)
@@ -334,7 +335,7 @@ class UnitsAndAxes:
     Attributes:
         position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
         position_unit_ratio_std: its standard deviation; inf if undetermined.
-        max_mass_std_kg: largest standard deviation of M_g (3, 3), with force M_g (-gravity).
+        max_mass_std_kg: largest standard deviation in M_g (3, 3); the weight is M_g (-gravity).
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         axis_masses_kg: (3,) singular values of M_g [kg].
     """

@@ -40,7 +40,7 @@ SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
 
 @dataclass(frozen=True, eq=False)
 class WrenchGrid:
-    """Instants t (M,) of the motion signals [s], below 200 Hz, and samples of the wrench.
+    """Grid t (M,) of the motion signals [s] at a rate below 200 Hz, and samples of the wrench.
 
     `wrench` (N, 6) has `stride` samples for each instant. `known_load` (6, 16) are the
     coefficients of a known load, Eq. (T73).
@@ -119,7 +119,7 @@ def end_taper(t: Array, start: float, stop: float) -> Array:
 def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
-    """Return the taper (M,) with zeros within `margin` [s] of `lost`, and cosine edges."""
+    """Return the taper (M,) with zeros within `margin` [s] of `lost` instants, and cosine edges."""
     edge = np.clip((samples_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
@@ -172,7 +172,7 @@ class FitWindow:
 
     @cached_property
     def is_taper_fixed(self) -> bool:
-        """Whether the taper keeps its place over the wrench when the signals are delayed."""
+        """Whether a delay shifts only the signals, not the taper: for gaps, or a known load."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.known_load is not None)
@@ -186,7 +186,7 @@ class FitWindow:
         return out
 
     def filtered_taper(self, response: NDArray[np.complexfloating]) -> Array:
-        """Return the taper (M,), padded and filtered by a response at each grid frequency."""
+        """Return the zero-padded taper (M,), filtered by a `response` at each grid frequency."""
         n = self.grid.transform_length
         return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
 
@@ -241,7 +241,7 @@ class Spectra:
         return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
 
     def second_moments_at_delays(self, delays: Array) -> Array:
-        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows 0 to 15."""
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows of signals."""
         bands, wrench = self.window.bands, self.window.wrench_spectrum
         if self.window.is_taper_fixed:
             return np.array([self.with_delay(delay).second_moments() for delay in delays])
@@ -293,7 +293,7 @@ class NoiseLevels:
         return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
-        """Return the noise power (..., bands, 6) of residuals, from their `sums` over bands.
+        """Return the noise power (..., bands, 6) of residuals, from `sums` of squares in bands.
 
         `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """

@@ -51,7 +51,7 @@ class ImuSplineRows:
     def with_data_in_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
-        """Return the rows with acceleration, quaternion rate from data s, omega (K, 3) in S."""
+        """Return the rows with acceleration and quaternion rate from s and omega (K, 3) in S."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -132,9 +132,9 @@ class PoseSplines:
         coefficients = np.empty_like(right)
         for part in (slice(0, 3), slice(3, 7)):
 
-            def penalized(log_frequency: float, part: slice = part) -> tuple[Array, float, float]:
-                """Return normal matrix, noise variance, -2 log likelihood; `part`: pose columns."""
-                weight = self.rate / (2 * np.pi * np.exp(log_frequency)) ** (2 * SPLINE_DEGREE)
+            def fit_part(ln_cutoff_hz: float, part: slice = part) -> tuple[Array, float, float]:
+                """Fit pose columns; return normal matrix, noise variance and -2 log likelihood."""
+                weight = self.rate / (2 * np.pi * np.exp(ln_cutoff_hz)) ** (2 * SPLINE_DEGREE)
                 band = gram + weight * penalty
                 factor = cholesky_banded(band)
                 c = cho_solve_banded((factor, False), right[:, part])
@@ -146,9 +146,9 @@ class PoseSplines:
 
             bounds = np.log([min(lowest, 0.5 * self.rate), self.rate])
             best = minimize_scalar(
-                lambda x: penalized(x)[2], bounds=bounds, method="bounded", options={"xatol": 0.05}
+                lambda x: fit_part(x)[2], bounds=bounds, method="bounded", options={"xatol": 0.05}
             )
-            band, noise, _ = penalized(best.x)
+            band, noise, _ = fit_part(best.x)
             spline = BSpline(knots, solveh_banded(band, right[:, part]), SPLINE_DEGREE)
             self._add_end_derivative_penalties(band, spline, t, noise, largest)
             coefficients[:, part] = solveh_banded(band, right[:, part])
@@ -236,7 +236,7 @@ class PoseSplines:
 
 
 class SplineCache:
-    """Splines of the same poses by knot distance, each fitted once."""
+    """Splines of the same poses by knot spacing, each fitted once."""
 
     def __init__(self, poses: Poses, imu_rows: ImuSplineRows | None = None) -> None:
         self.poses, self.imu_rows = poses, imu_rows
