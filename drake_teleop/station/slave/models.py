@@ -194,7 +194,7 @@ def ParseTool(
 def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
     """Parse surroundings; return texts about data that are assumed or have no effect.
 
-    A DrakeTeleopError is raised for mimic joints, links that float on links.
+    A DrakeTeleopError is raised for mimic joints and for links that float on other links.
     """
     instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():
