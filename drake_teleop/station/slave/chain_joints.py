@@ -94,7 +94,7 @@ def weld_base_and_find_chain(
     return chain
 
 
-def move_welds_to_world(
+def move_bodies_welded_to_world(
     plant: MultibodyPlant, joints_before: set[tree.JointIndex], X_WFile: RigidTransform
 ) -> None:
     world = plant.world_body().index()
