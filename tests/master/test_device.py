@@ -47,15 +47,19 @@ def main_mass_matrix(q) -> np.ndarray:
 def main_gravity(q) -> np.ndarray:
     """Return the gravity torque (3,) of the main axes without wrist."""
     return np.array(
-        [0.0, phantom._GRAVITY_TORQUE_2 * np.cos(q[1]), phantom._GRAVITY_TORQUE_3 * np.sin(q[2])]
+        [
+            0.0,
+            phantom._GRAVITY_TORQUE_2_N_M * np.cos(q[1]),
+            phantom._GRAVITY_TORQUE_3_N_M * np.sin(q[2]),
+        ]
     )
 
 
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
     weight = phantom.WRIST_MASS_KG * phantom.GRAVITY_M_S2
-    height = (phantom._GRAVITY_TORQUE_2 + weight * phantom.L1) * np.sin(q[1])
-    return height - (phantom._GRAVITY_TORQUE_3 + weight * phantom.L2) * np.cos(q[2])
+    height = (phantom._GRAVITY_TORQUE_2_N_M + weight * phantom.L1) * np.sin(q[1])
+    return height - (phantom._GRAVITY_TORQUE_3_N_M + weight * phantom.L2) * np.cos(q[2])
 
 
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:

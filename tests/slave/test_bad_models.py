@@ -140,7 +140,7 @@ ERRORS = {
                "l2 is the child of two joints, j2 and j9"),
     "a circle": ("urdf", arm(j3=joint(3, parent="l5")), "joints form a loop through l"),
     "a joint on itself": ("urdf", arm(j3=joint(3, parent="l3")), "a loop through l3"),
-    "a bushing": ("urdf", arm(beyond="<drake:linear_bushing_rpy/>"), "form a loop, by drake:"),
+    "a bushing": ("urdf", arm(beyond="<drake:linear_bushing_rpy/>"), "drake:.* closes a loop"),
     "no parent": ("urdf", arm(j3=joint(3).replace('<parent link="l2"/>', "")),
                   "joint j3 has no parent link"),
     "no such parent": ("urdf", arm(j3=joint(3, parent="zz")),
@@ -183,7 +183,8 @@ ERRORS = {
     # MJCF, SDF, directives
     "MJCF without bodies": ("xml", mjcf(""), "no frames are named 'l6'; give a model"),
     "MJCF of a loop": ("xml", TWO.format("").replace(
-        "</mujoco>", "<equality><weld body1='l6'/></equality></mujoco>"), "form a loop, by weld"),
+        "</mujoco>", "<equality><weld body1='l6'/></equality></mujoco>"),
+        "weld equality closes a loop"),
     "MJCF of tied joints": ("xml", TWO.format("").replace(
         "</mujoco>", "<equality><joint joint1='a' joint2='c'/></equality></mujoco>"),
         "a moves with another joint .equality"),
@@ -277,7 +278,7 @@ ASSUMED = {
                            "welded to the world, where it may float: l0"),
     "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')),
                      "no dry friction, which the model has, of j3"),
-    "four joints": (arm(4).replace('"l4"', '"l6"'), "4 joints the tool follows part of the pose"),
+    "four joints": (arm(4).replace('"l4"', '"l6"'), "4 joints the tool follows only part of"),
     "nine joints": (arm(9).replace('"l6"', '"x"').replace('"l9"', '"l6"'), "acceleration limits"),
 }  # fmt: skip
 

@@ -26,7 +26,7 @@ from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, fill_missing_joint_limits
-from drake_teleop.station.slave.home import q_with_tool_down
+from drake_teleop.station.slave.home import solve_start_posture
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, InverseKinematics
 from drake_teleop.station.slave.joint_commands import JointRangeMonitor, LeaderJointFollower
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
@@ -239,7 +239,7 @@ def test_endless_joints_follow_a_leader_over_many_turns():
 @pytest.mark.parametrize("position", [[0.4, 0.1, 0.3], [0.3, -0.3, 0.5]])
 def test_tool_down_is_found_with_endless_joints(chain, position):
     arm = ARMS[chain]
-    q, status = q_with_tool_down(arm, np.array(position))
+    q, status = solve_start_posture(arm, np.array(position))
     assert status == IkStatus.OK
     assert pose_error(pose_of(arm, q), np.array([0, 1, 0, 0, *position])) < 1e-7
     assert np.all(np.abs(q) <= np.pi)

@@ -61,9 +61,7 @@ def test_lengths_are_those_of_the_model(plant):
 
 def all_ik_solutions(R, p):
     q = np.empty((8, 6))
-    assert (
-        ik._ik_status_and_all_solutions_into(np.ascontiguousarray(R), p, 0.0, 0.0, q) == IkStatus.OK
-    )
+    assert ik._solve_all_branches_into(np.ascontiguousarray(R), p, 0.0, 0.0, q) == IkStatus.OK
     return angle_difference(q)
 
 

@@ -15,7 +15,7 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import ArmModel, jacobian
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.home import q_with_tool_down
+from drake_teleop.station.slave.home import solve_start_posture
 from drake_teleop.station.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
@@ -422,7 +422,7 @@ def test_start_posture_is_within_ranges_that_exclude_zero(seed):
     sizes = np.concatenate([rng.uniform(0.22, 0.29, 4), rng.uniform(0.4, 0.9, 3)])
     pose = arm.pose(np.sign(ends[:, 0]) * rng.permutation(sizes))
     R_WS = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4])))
-    q, status = q_with_tool_down(limited, pose[4:], R_WS)
+    q, status = solve_start_posture(limited, pose[4:], R_WS)
     assert ((limited.lower <= q) & (q <= limited.upper)).all()
     reached = np.abs(arm.pose(q)[4:] - pose[4:]).max() < 1e-6
     assert reached == (status == IkStatus.OK)

@@ -39,7 +39,7 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
     holding_torque,
 )
-from drake_teleop.station.slave.home import R_WS_HOME, q_with_tool_down
+from drake_teleop.station.slave.home import R_WS_HOME, solve_start_posture
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_warnings
@@ -259,7 +259,7 @@ def _starts_at_rounded_position(
         R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
         pose = np.array([*R_WA.ToQuaternion().wxyz(), *position])
         if yaw_deg == 0.0 or has_closed_form(arm):
-            usual, status = q_with_tool_down(arm, position, R_WA)
+            usual, status = solve_start_posture(arm, position, R_WA)
             if status == IkStatus.OK:
                 yield usual, pose, yaw_deg == 0.0
         if not has_closed_form(arm):

@@ -16,7 +16,7 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.slave.arm import ArmModel, holding_torque
-from drake_teleop.station.slave.model.model_repair import SITE_ASSUMPTION
+from drake_teleop.station.slave.model.model_repair import FRAME_REPLACES_SITE_TEXT
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
 from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
@@ -98,7 +98,7 @@ def plan_station(
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, tool_axis)
     on_sensor = None if tool is not None else slave.tool
     is_along_tool = axis == tool_axis or on_sensor is not None
-    is_site = f"{SITE_ASSUMPTION} {sensor_frame}" in shapes.assumptions
+    is_site = f"{FRAME_REPLACES_SITE_TEXT} {sensor_frame}" in shapes.assumptions
     share = 1.0 if own_tool else start.MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
     model, weak_joints, texts = _without_weak_torque_limits(shapes.arm, place.q, share)
     if axis != tool_axis:

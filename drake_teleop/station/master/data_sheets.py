@@ -15,7 +15,7 @@ from drake_teleop.common.registry import Presets, Registry
 from drake_teleop.station.master.device_parameters import pack_device_parameters
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
-from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
+from drake_teleop.station.master.leader_model import LEADER_JOINT_MODE, Leader
 from drake_teleop.station.master.phantom import PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
 
 PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
@@ -49,7 +49,7 @@ class DeviceFigures:
     turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
     peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; any 0: no torque"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; one 0: no torque"
     )
     size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
@@ -60,13 +60,13 @@ class DeviceFigures:
     )
     resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
     turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
-    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0 or a larger one: rates.hand_hz")
+    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0 or over hand_hz: rates.hand_hz")
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
 _OMEGA_WORKSPACE_M = [0.11, 0.113, 0.113]  # workspace
 _OMEGA_MAX_TURN_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
-_OMEGA_ENCODER_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; rate [Hz]
+_OMEGA_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; rate [Hz]
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -74,29 +74,29 @@ _OMEGA_ENCODER_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; 
 # mass and friction of the Touch, turns and steps of the omegas, position steps of Touch and Falcon,
 # rates but the Inverse3's, and the Virtuose's torque. The rest are estimates.
 # Only the Virtuose displays torque; omega.3 and Falcon do not rotate.
-_DATA_SHEETS: dict[str, tuple[Any, ...]] = {
+_DATA_SHEET_ROWS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _WRIST_TURN_RAD, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_WORKSPACE_M, _NO_TURN_RAD, *_OMEGA_ENCODER_AND_RATE),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_ENCODER_AND_RATE),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_ENCODER_AND_RATE),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_WORKSPACE_M, _NO_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN_RAD, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_SHEET_ROW_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
-_sheets = {
-    name: DeviceFigures(**dict(zip(_SHEET_ROW_FIELDS.split(), row, strict=True)))
-    for name, row in _DATA_SHEETS.items()
+_SHEET_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
+_figures_by_name = {
+    name: DeviceFigures(**dict(zip(_SHEET_FIELDS.split(), row, strict=True)))
+    for name, row in _DATA_SHEET_ROWS.items()
 }
 
 
-class _DeviceRegistry(Presets[DeviceFigures], Registry[DeviceFigures]):
+class _DataSheetRegistry(Presets[DeviceFigures], Registry[DeviceFigures]):
     pass
 
 
 #: Data sheets by name, for `Master.figures`.
-FIGURES = _DeviceRegistry("device", _sheets, DeviceFigures)
+FIGURES = _DataSheetRegistry("device", _figures_by_name, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
@@ -109,14 +109,14 @@ class Master:
 
     model: str = choice(
         PHANTOM_NAME, (PHANTOM_NAME, "custom", LEADER_NAME),
-        "device; custom: `figures` only; leader: arm from a file", FIGURES,
+        "device; custom: defined by `figures`; leader: arm from a file", FIGURES,
     )  # fmt: skip
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )
     friction: PhantomJointFriction = field(default_factory=PhantomJointFriction)
     figures: DeviceFigures | None = plain(
-        None, "values in place of those of the device's data sheet; null: the data sheet's"
+        None, "values that replace values of the device's data sheet; null: none replaced"
     )
     leader: Leader | None = None
 
@@ -150,10 +150,10 @@ class Master:
 
     @property
     def is_joint_leader(self) -> bool:
-        return self.leader is not None and self.leader.leads == JOINT_MODE
+        return self.leader is not None and self.leader.leads == LEADER_JOINT_MODE
 
     def check_pose_mode(self, caller: str) -> None:
-        """Raise a DrakeTeleopError, which names the `caller`, if a leader arm commands joints."""
+        """Raise a DrakeTeleopError about `caller` if the leader arm is in joint mode (`leads`)."""
         if self.is_joint_leader:
             what = f"{caller} cannot use a leader arm that commands joints"
             remedy = "set it to pose; the rendered force is the same"

@@ -34,7 +34,7 @@ DEVICE_DTYPE = np.dtype(
 
 
 def pack_device_parameters(**values: ArrayLike) -> Records:
-    """Return the fields `values` in an array (1,) of `DEVICE_DTYPE`; omitted fields are zero."""
+    """Return keyword arguments as array (1,) of `DEVICE_DTYPE`; omitted fields are zero."""
     packed: Records = np.zeros(1, DEVICE_DTYPE)
     for name, value in values.items():
         packed[name] = value

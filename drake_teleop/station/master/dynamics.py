@@ -53,7 +53,7 @@ def twist_into(q, v, device, J, twist):
 
 @njit(cache=True)
 def add_runge_kutta_stage(i, period, slope, total, stage, state):
-    """Add the slope of stage i (0 to 3) to `total`; write the next `stage`, at last the `state`."""
+    """Add the slope of stage i (0 to 3) to `total`, write the next `stage`; 3 advances `state`."""
     weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
     ahead = 1.0 if i == 2 else 0.5
     for k in range(state.shape[0]):

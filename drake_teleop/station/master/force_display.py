@@ -128,18 +128,18 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    While inputs are invalid, the displayed wrench fades to zero in 50 ms; after that it ramps up.
-    A leader arm displays what its motor torques permit beside weight compensation.
+    While inputs are invalid, the displayed wrench fades to zero in 50 ms; valid again, it ramps up.
+    For a leader arm, it is scaled so that motors that also compensate weight stay within limits.
 
     .. pydrake_system::
 
         name: ForceDisplay
         input_ports:
         - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
-        - for_display: (27,) from the device: joint positions (6) [rad], this block's memory
+        - for_display: (27,) from the device: joint positions (6) [rad; m], this block's memory
         - state: (2 n,) [q; qdot] of the device (only of a leader arm)
         output_ports:
-        - drive: (27,) for the device: J^T F + gravity compensation (6) [N m] (leader: F), memory
+        - drive: (27,) for the device: J^T F + gravity compensation (6) [N m; N] (leader: F), memory
         - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
         - fault_at_hand: code of `blocks.Fault`
         - displayed_and_fault: (7,) the last two ports in one vector
@@ -150,7 +150,7 @@ class ForceDisplay(LeafSystem):
     def __init__(self, period: float, device: dynamics.HapticDevice | LeaderDevice) -> None:
         super().__init__()
         self._period, self._parameters = period, device.packed_parameters
-        self._jacobian, self._shortened = np.zeros((6, 6)), np.zeros(6)
+        self._jacobian, self._limited = np.zeros((6, 6)), np.zeros(6)
         self._num_joints = device.num_joints
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLOTS.stop)
@@ -175,10 +175,10 @@ class ForceDisplay(LeafSystem):
         if self._leader is not None:
             q = self._state.Eval(context)[: self._num_joints]
             if np.isfinite(wrench).all() and np.isfinite(q).all():
-                limits = self._parameters[0], self._jacobian, self._shortened
+                limits = self._parameters[0], self._jacobian, self._limited
                 limit_wrench_into(wrench, *limits)  # first: undisplayed torque needs no motor
-                limit_wrench_to_motor_torques(self._leader, q, self._shortened, self._shortened)
-                wrench = self._shortened
+                limit_wrench_to_motor_torques(self._leader, q, self._limited, self._limited)
+                wrench = self._limited
         constants = self._parameters, self._period, self._jacobian
         step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())
 

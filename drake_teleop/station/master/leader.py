@@ -131,8 +131,8 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
 
 
 @njit(cache=True)
-def limit_wrench_to_motor_torques(leader, q, wrench, shortened):
-    """Write `wrench` (6,) into `shortened`, scaled so that motors and weight stay within limits."""
+def limit_wrench_to_motor_torques(leader, q, wrench, limited):
+    """Write `wrench` (6,) to `limited`, scaled so that motors also carry weight within limits."""
     _, arm, joint_table = leader
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
@@ -146,7 +146,7 @@ def limit_wrench_to_motor_torques(leader, q, wrench, shortened):
         if abs(torque) * share > room:
             share = max(room, 0.0) / abs(torque)
     for k in range(6):
-        shortened[k] = share * wrench[k]
+        limited[k] = share * wrench[k]
 
 
 @njit(cache=True)
@@ -204,7 +204,7 @@ class LeaderDevice:
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the leader arm, without and with the mass of the user's hand; `joint_table`."""
+        """`ArmModel.table` without the hand and with the hand; `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:

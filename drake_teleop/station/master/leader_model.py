@@ -20,7 +20,7 @@ from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, values_per_joint
 from drake_teleop.station.slave.models import ParsedArm, ParseModel, translate_drake_errors
 
-JOINT_MODE = "joints"
+LEADER_JOINT_MODE = "joints"
 
 
 @settings
@@ -33,7 +33,7 @@ class Leader:
         [], "folders for package:// addresses in file, from the scenario's folder", is_path=True
     )
     hand_frame: str = plain("", "name of the frame or link at the grip")
-    home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start; default: 0 or middle of limits")
+    home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start posture; default: 0 or mid-range")
     base_rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"
     )
@@ -51,8 +51,8 @@ class Leader:
     peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "largest displayed torque about each axis")
     leads: str = choice(
         "pose",
-        ("pose", JOINT_MODE),
-        "pose: sets X_WS; joints: each joint commands that of an equal slave",
+        ("pose", LEADER_JOINT_MODE),
+        "pose: hand commands X_WS; joints: each joint commands the slave's same joint",
     )
 
     def check(self, where: str) -> None:

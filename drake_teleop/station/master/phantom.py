@@ -30,11 +30,11 @@ GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
 L1, L2, L3, L5, L6 = 0.215, 0.170, 0.0325, -0.0368, 0.0527  # m, P
 # Mass [kg] and inertia [kg m^2] of P's segments a, c, be, df about x (the pitch axis), y and z.
 MASS_A, MASS_C, MASS_BE, MASS_DF = 0.0202, 0.0249, 0.2359, 0.1906
-SEGMENT_A_INERTIA = (0.4864e-4, 0.001843e-4, 0.4864e-4)
-SEGMENT_C_INERTIA = (0.959e-4, 0.959e-4, 0.0051e-4)
-SEGMENT_BE_INERTIA = (11.09e-4, 10.06e-4, 0.591e-4)
-SEGMENT_DF_INERTIA = (7.11e-4, 0.629e-4, 6.246e-4)
-INERTIA_BASE_YY = 11.87e-4
+SEGMENT_A_INERTIA_KG_M2 = (0.4864e-4, 0.001843e-4, 0.4864e-4)
+SEGMENT_C_INERTIA_KG_M2 = (0.959e-4, 0.959e-4, 0.0051e-4)
+SEGMENT_BE_INERTIA_KG_M2 = (11.09e-4, 10.06e-4, 0.591e-4)
+SEGMENT_DF_INERTIA_KG_M2 = (7.11e-4, 0.629e-4, 6.246e-4)
+BASE_INERTIA_YY_KG_M2 = 11.87e-4
 GEAR_RATIOS = (13.3, 11.2, 11.2)  # P
 MOTOR_INERTIA_KG_M2 = 1.08e-6  # kg m^2, P
 WRIST_MASS_KG = 0.15  # kg, three links, each with its centre of mass at E, estimate
@@ -58,33 +58,33 @@ FRICTION_TANH_SPEED_RAD_S = 0.01  # rad/s, estimate
 _STOP_STIFFNESSES, _STOP_DAMPINGS = np.repeat([300.0, 5.0], 3), np.repeat([1.5, 0.01], 3)
 
 # Moments of inertia of the point masses of the links.
-_LINK_1_STEINER_TERM = L1**2 * (MASS_A + MASS_C / 4)
-_LINK_2_STEINER_TERM, _LINK_3_STEINER_TERM = L2**2 * MASS_A / 4, L3**2 * MASS_C
-# Terms of M11 [kg m^2]: constant, times cos 2 q2, times cos 2 q3, 2 _M23_MAX times cos q2 sin q3.
-_a, _be, _c, _df = SEGMENT_A_INERTIA, SEGMENT_BE_INERTIA, SEGMENT_C_INERTIA, SEGMENT_DF_INERTIA
-_inertia_sum = sum(sum(inertia[1:]) for inertia in (_a, _be, _c, _df))
-_constant_terms = _inertia_sum + _LINK_1_STEINER_TERM + _LINK_2_STEINER_TERM + _LINK_3_STEINER_TERM
-_M11_CONSTANT_TERM_KG_M2 = INERTIA_BASE_YY + 0.5 * _constant_terms
-_cosine_terms = _be[1] - _be[2] + _c[1] - _c[2] + _LINK_1_STEINER_TERM
-_M11_COS2Q2 = 0.5 * _cosine_terms
-_cosine_terms = _a[1] - _a[2] + _df[1] - _df[2]
-_M11_COS2Q3 = 0.5 * (_cosine_terms - _LINK_2_STEINER_TERM - _LINK_3_STEINER_TERM)
-_M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
-_M22_KG_M2 = _be[0] + _c[0] + _LINK_1_STEINER_TERM
-_M33_KG_M2 = _a[0] + _df[0] + _LINK_2_STEINER_TERM + _LINK_3_STEINER_TERM
+_LINK_1_STEINER_KG_M2 = L1**2 * (MASS_A + MASS_C / 4)
+_LINK_2_STEINER_KG_M2, _LINK_3_STEINER_KG_M2 = L2**2 * MASS_A / 4, L3**2 * MASS_C
+# Terms of M11: constant, times cos 2 q2, times cos 2 q3, 2 _M23_MAX_KG_M2 times cos q2 sin q3.
+_a, _be = SEGMENT_A_INERTIA_KG_M2, SEGMENT_BE_INERTIA_KG_M2
+_c, _df = SEGMENT_C_INERTIA_KG_M2, SEGMENT_DF_INERTIA_KG_M2
+_m11_constants = sum(sum(inertia[1:]) for inertia in (_a, _be, _c, _df)) + _LINK_1_STEINER_KG_M2
+_m11_constants = _m11_constants + _LINK_2_STEINER_KG_M2 + _LINK_3_STEINER_KG_M2
+_M11_CONSTANT_TERM_KG_M2 = BASE_INERTIA_YY_KG_M2 + 0.5 * _m11_constants
+_M11_COS_2Q2_KG_M2 = 0.5 * (_be[1] - _be[2] + _c[1] - _c[2] + _LINK_1_STEINER_KG_M2)
+_M11_COS_2Q3_KG_M2 = 0.5 * (_a[1] - _a[2] + _df[1] - _df[2] - _LINK_2_STEINER_KG_M2)
+_M11_COS_2Q3_KG_M2 -= 0.5 * _LINK_3_STEINER_KG_M2
+_M23_MAX_KG_M2 = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
+_M22_KG_M2 = _be[0] + _c[0] + _LINK_1_STEINER_KG_M2
+_M33_KG_M2 = _a[0] + _df[0] + _LINK_2_STEINER_KG_M2 + _LINK_3_STEINER_KG_M2
 _REFLECTED_MOTOR_INERTIAS_KG_M2 = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
-_GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
-_GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
+_GRAVITY_TORQUE_2_N_M = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
+_GRAVITY_TORQUE_3_N_M = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 
 @njit(cache=True)
 def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
-    M[0, 0] = _M11_CONSTANT_TERM_KG_M2 + _M11_COS2Q2 * math.cos(2.0 * q[1])
-    M[0, 0] += _M11_COS2Q3 * math.cos(2.0 * q[2])
-    M[0, 0] += 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
+    M[0, 0] = _M11_CONSTANT_TERM_KG_M2 + _M11_COS_2Q2_KG_M2 * math.cos(2.0 * q[1])
+    M[0, 0] += _M11_COS_2Q3_KG_M2 * math.cos(2.0 * q[2])
+    M[0, 0] += 2.0 * _M23_MAX_KG_M2 * math.cos(q[1]) * math.sin(q[2])
     M[1, 1], M[2, 2] = _M22_KG_M2, _M33_KG_M2
-    M[1, 2] = M[2, 1] = -_M23_MAX * math.sin(q[1] - q[2])
+    M[1, 2] = M[2, 1] = -_M23_MAX_KG_M2 * math.sin(q[1] - q[2])
 
 
 @njit(cache=True)
@@ -131,17 +131,19 @@ def joint_mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 def gravity_compensation_torque_into(q, out):
     weight = WRIST_MASS_KG * GRAVITY_M_S2
     out[0] = 0.0
-    out[1] = (_GRAVITY_TORQUE_2 + weight * L1) * math.cos(q[1])
-    out[2] = (_GRAVITY_TORQUE_3 + weight * L2) * math.sin(q[2])
+    out[1] = (_GRAVITY_TORQUE_2_N_M + weight * L1) * math.cos(q[1])
+    out[2] = (_GRAVITY_TORQUE_3_N_M + weight * L2) * math.sin(q[2])
     out[3:6] = 0.0
 
 
 @njit(cache=True)
 def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
     # Main axes: Christoffel symbols of their closed-form M.
-    coupling = _M23_MAX * math.cos(q[1] - q[2])
-    yaw_2 = -2.0 * (_M11_COS2Q2 * math.sin(2.0 * q[1]) + _M23_MAX * math.sin(q[1]) * math.sin(q[2]))
-    yaw_3 = -2.0 * (_M11_COS2Q3 * math.sin(2.0 * q[2]) - _M23_MAX * math.cos(q[1]) * math.cos(q[2]))
+    coupling = _M23_MAX_KG_M2 * math.cos(q[1] - q[2])
+    yaw_2 = _M23_MAX_KG_M2 * math.sin(q[1]) * math.sin(q[2])
+    yaw_2 = -2.0 * (_M11_COS_2Q2_KG_M2 * math.sin(2.0 * q[1]) + yaw_2)
+    yaw_3 = _M23_MAX_KG_M2 * math.cos(q[1]) * math.cos(q[2])
+    yaw_3 = -2.0 * (_M11_COS_2Q3_KG_M2 * math.sin(2.0 * q[2]) - yaw_3)
     torque[0] -= (yaw_2 * v[1] + yaw_3 * v[2]) * v[0]
     torque[1] -= coupling * v[2] * v[2] - 0.5 * yaw_2 * v[0] * v[0]
     torque[2] -= -coupling * v[1] * v[1] - 0.5 * yaw_3 * v[0] * v[0]

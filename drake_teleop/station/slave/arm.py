@@ -242,7 +242,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 @njit(cache=True, inline="always")
 def _write_joint_axis_and_inertial_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Write [z_L, p_WL, f, tau] in W to `link[row]`: wrench f, tau about Wo causes the motion x."""
+    """Write [z_L, p_WL, f, tau] in W to `link[row]`; link motion x requires f, and tau about Wo."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     s, omega = apply_matrix(R_LW, vector_at(x, 0)), apply_matrix(R_LW, vector_at(x, 3))
@@ -352,7 +352,7 @@ def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array)
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
-    """Return the torque [N m] of dry friction against a speed [rad/s]; its limit is `coulomb`."""
+    """Return the dry friction torque [N m], opposite to the speed [rad/s] and at most `coulomb`."""
     return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
 
 
@@ -435,6 +435,5 @@ class JointFriction(LeafSystem):
         self.DeclareVectorOutputPort("generalized_force", num_velocities, calc, inputs)
 
     def _calc_friction_force(self, context: Context, output: BasicVector) -> None:
-        _write_joint_friction_forces(
-            *self._constants, self._state.Eval(context), output.get_mutable_value()
-        )
+        state = self._state.Eval(context)
+        _write_joint_friction_forces(*self._constants, state, output.get_mutable_value())

@@ -43,7 +43,7 @@ def ArmModelFromPlant(
     """Return the arm between the world and the sensor frame of a finalized plant.
 
     A DrakeTeleopError is raised if a joint between them is not revolute, prismatic or a weld, or if
-    another joint moves a body on these links. Joints beyond S are at their default positions.
+    a further joint moves a body on their links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         what = f"{plant.GetModelInstanceName(model_instance)} has no frame {sensor_frame_name!r}"
@@ -141,7 +141,7 @@ def _bodies_moved_by_joints(
 def values_per_joint(
     arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
 ) -> Array:
-    """Return one value per joint (n,) from n values; a `default` also permits one value or none."""
+    """Return one value per joint (n,); with a `default`, `values` may be empty or one for all."""
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
@@ -156,8 +156,8 @@ def fill_missing_joint_limits(
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
 
-    `acceleration` has 1 or n limits [rad/s^2], which replace the model's; `hint` is appended to the
-    text about accelerations.
+    `acceleration` contains no, 1 or n limits [rad/s^2] that replace the model's; `hint` is appended
+    to the text about accelerations.
     """
     assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0

@@ -81,7 +81,7 @@ def weld_base_and_find_chain(
 ) -> list[Joint]:
     """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
-    A DrakeTeleopError is raised for another pose if the base moves on the world.
+    A DrakeTeleopError is raised if a joint moves the base on the world and X_WBase is not identity.
     """
     chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
@@ -94,7 +94,7 @@ def weld_base_and_find_chain(
     return chain
 
 
-def move_welds_to_world(
+def move_bodies_welded_to_world(
     plant: MultibodyPlant, joints_before: set[tree.JointIndex], X_WFile: RigidTransform
 ) -> None:
     world = plant.world_body().index()
@@ -186,7 +186,7 @@ def weld_joints_outside_chain(
 def weld_load_of_link_to_sensor_frame(
     plant: MultibodyPlant, frame: Frame, chain: list[Joint]
 ) -> list[str]:
-    """Weld the other bodies on the sensor's link to the sensor body, so that they become load.
+    """Weld bodies that share a link with the sensor body to that body, so that they become load.
 
     This applies if the sensor body is massless and welded to the link. If its origin is not that of
     the link, the bodies remain part of the robot; the returned list then has a note on them.
@@ -283,9 +283,9 @@ def set_torque_limits(
 def add_rotor_inertias(
     plant: MultibodyPlant, chain: list[Joint], frame: Frame, auxiliary_bodies: set[str]
 ) -> list[str]:
-    """Give a joint a rotor inertia if its links have no inertia; return notes.
+    """Add a rotor inertia to each joint of the chain that moves no inertia; return notes.
 
-    Its links extend to the next joint that is not on `auxiliary_bodies`, which the repair added.
+    A joint moves the bodies up to the next joint; joints on `auxiliary_bodies` are passed over.
     """
     inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(chain, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())

@@ -25,10 +25,10 @@ _SEARCHED_JOINT_RANGE_SHARES = (0.7, 0.9, 1.0)  # about the middles of the range
 _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
-def q_with_tool_down(
+def solve_start_posture(
     arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[Array, IkStatus]:
-    """Return q (n,) [rad, m] for p_WS = `position`, `R_WS` (default: tool down), and `IkStatus`."""
+    """Return q (n,) [rad, m] at p_WS = `position` and `R_WS` (tool down), and `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _ELBOW_UP_POSTURE_RAD, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
@@ -42,7 +42,7 @@ def q_with_tool_down(
 
 
 def home_posture(arm: ArmModel, position: list[float]) -> Array:
-    q, status = q_with_tool_down(arm, np.array(position))
+    q, status = solve_start_posture(arm, np.array(position))
     if status != IkStatus.OK:
         what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
         remedy = "change it, or give joint positions of a reachable posture in slave.home"

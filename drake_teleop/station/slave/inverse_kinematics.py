@@ -62,9 +62,7 @@ _JOINT_LIMIT, _BAD_POSE, _ = _others
 
 
 @njit(cache=True)
-def _ik_status_and_all_solutions_into(
-    R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array
-) -> int:
+def _solve_all_branches_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array) -> int:
     """Write all eight solutions for S at R, p to the rows of q (8, 6); return the `IkStatus`.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
@@ -152,7 +150,7 @@ def _nearest_branch_into(
     if not (np.isfinite(R.sum()) and are_valid_port_values(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _ik_status_and_all_solutions_into(R, p, reference[0], reference[3], branches)
+    status = _solve_all_branches_into(R, p, reference[0], reference[3], branches)
     best = -1
     best_distance = np.inf
     for row in range(8):

@@ -65,7 +65,7 @@ class PositionInterface:
             raise DrakeTeleopError(what, where=f"{where}.drive_bandwidth_hz", remedy=remedy)
 
 
-_presets = {
+_position_interfaces = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
         command_hz=1000.0,
@@ -78,7 +78,7 @@ _presets = {
     ),
 }
 #: Interfaces by name; docs/station.md lists the sources.
-POSITION_INTERFACE_PRESETS = Presets(_presets)
+POSITION_INTERFACE_PRESETS = Presets(_position_interfaces)
 
 
 @settings
@@ -91,8 +91,8 @@ class JointControlConfig:
     servo: str = choice(
         COMPUTED_TORQUE_SERVO_NAME,
         (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACE_PRESETS, "position"),
-        "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
-        " position for the fields of `interface`",
+        "computed_torque: uses the bandwidths above; position: interface with the fields of"
+        " `interface`; others: position interfaces of arms",
     )
     interface: PositionInterface | None = plain(
         None, "position interface that replaces that of the servo; null: the servo's"

@@ -152,7 +152,7 @@ def ParseModel(
         held += chain_joints.weld_joints_outside_chain(plant, before, chain)
         is_on_world = chain and chain[0].parent_body().index() == plant.world_body().index()
         if is_on_world and X_WBase is not None and not X_WBase.IsExactlyIdentity():
-            chain_joints.move_welds_to_world(plant, before, X_WBase)
+            chain_joints.move_bodies_welded_to_world(plant, before, X_WBase)
             chain = chain_joints.chain_to_body(plant, frame.body())
         held += chain_joints.weld_load_of_link_to_sensor_frame(plant, frame, chain)
         chain_joints.set_one_actuator_per_joint(plant, moving)
@@ -194,7 +194,7 @@ def ParseTool(
 def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
     """Parse surroundings; return texts about data that are assumed or have no effect.
 
-    A DrakeTeleopError is raised for mimic joints, links that float on links.
+    A DrakeTeleopError is raised for mimic joints and for links that float on other links.
     """
     instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():

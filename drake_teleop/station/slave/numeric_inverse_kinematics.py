@@ -119,7 +119,7 @@ def _is_joint_pushed_against_limit(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
-    """Write q plus a damped step to `trial` (n,); return the largest joint displacement."""
+    """Write q + (H + damping I)^-1 g, within limits, to `trial` (n,); return the largest step."""
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):

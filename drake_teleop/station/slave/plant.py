@@ -24,7 +24,7 @@ from drake_teleop.station.slave import arm_from_plant, home
 from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, JointFriction
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
-from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, end_of_tool_shapes
+from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, tip_of_tool_shapes
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
@@ -71,7 +71,7 @@ class SlavePlant:
 
         Its arrays are: `ArmModel.table` with dry friction; the load in this table, which a grasp
         changes; compiled pairs of shapes; parameters of the sheet spring's leaf; joints of moving
-        bodies; an empty array of given wrenches.
+        bodies; an empty array instead of given wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, DRY_FRICTION_COLUMN] = self.joint_friction
@@ -93,9 +93,8 @@ class SlavePlant:
 
     @property
     def joint_friction(self) -> Array:
-        return arm_from_plant.values_per_joint(
-            self.arm, self.config.friction, "slave.friction", 0.0
-        )
+        friction = self.config.friction
+        return arm_from_plant.values_per_joint(self.arm, friction, "slave.friction", 0.0)
 
     @property
     def can_touch(self) -> bool:
@@ -121,6 +120,7 @@ def start_pose(slave: Slave) -> Array:
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
+    """Return the slave's plant without environment, from a cache for equal settings."""
     return _cached_nominal_slave(HashableByValue(slave, slave.model_files()))
 
 
@@ -214,7 +214,7 @@ class ParsedSlave(NamedTuple):
         arm_from_plant.check_arm_lengths(arm, str(self.slave.path))
         arm, assumed = arm_from_plant.fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
-            assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
+            assumed.append(f"with {arm.num_joints} joints the tool follows only part of the pose")
         return arm, assumed
 
 
@@ -235,7 +235,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
         assumptions += assumed
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
-            assumptions.append(f"{names} of the model on the sensor beside the tool")
+            assumptions.append(f"bodies of the model on the sensor beside the tool: {names}")
         holder = on_sensor.body_frame()
     else:
         on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame
@@ -324,7 +324,7 @@ def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: A
             return tip.GetFixedPoseInBodyFrame().translation()
         return tip.CalcPose(plant.CreateDefaultContext(), parsed.sensor_frame).translation()
     if slave.tool is not None and slave.tool.mass > 0.0:
-        end = end_of_tool_shapes(slave.tool)
+        end = tip_of_tool_shapes(slave.tool)
         return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
     hulls = _hulls_of_carried_shapes_S(slave)
     if not hulls:

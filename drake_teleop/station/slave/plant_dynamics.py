@@ -181,7 +181,7 @@ def assemble_plant_state_into(state, surroundings, x):
 
 @njit(cache=True)
 def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot (2 n + 2,) of the state x, and the contact wrench about Wo.
+    """Write xdot (2 n + 2,), the derivative of arm and leaf in x, and the contact wrench about Wo.
 
     `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m], `applied_W` (6,)
     a wrench that is added, about So.

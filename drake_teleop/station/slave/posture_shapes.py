@@ -73,7 +73,7 @@ class PostureShapes:
         self.has_sticks = sticks and not any(find(link) for find in shapes for link in links)
         if self.has_sticks:
             AddSkeleton(self.plant, self._parsed.sensor_frame)
-        _complete_and_bound_shapes(self.plant, self._scene_graph)
+        _prepare_shapes_for_distances(self.plant, self._scene_graph)
         finalize_without_limit_warnings(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
@@ -119,7 +119,7 @@ class PostureShapes:
         return np.vstack([np.zeros((0, 3)), *hulls])
 
     def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return hull points (k, 3) in W [m] of each collision shape, or `visual` shape if any."""
+        """Return hull points (k, 3) in W [m] per shape: collision, or `visual` ones if any."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [hull_points_of(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -198,11 +198,11 @@ def start_overlap_texts(
     parts = [] if environment is None else list(environment.parts)
     scenes = [part.path for part in parts if isinstance(part, Scene)]
     files = [file for path in scenes for file in list_model_files(path, ())]
-    return _warnings_and_assumptions(HashableByValue((slave, parts), slave.model_files() + files))
+    return _cached_overlap_texts(HashableByValue((slave, parts), slave.model_files() + files))
 
 
 @lru_cache(maxsize=4)
-def _warnings_and_assumptions(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _cached_overlap_texts(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
@@ -226,8 +226,8 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
     return found
 
 
-def _complete_and_bound_shapes(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
-    """Add visual shapes as missing collision shapes of bodies; remove unbounded ones."""
+def _prepare_shapes_for_distances(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
+    """Turn visual shapes of bodies without collision shapes into such; remove unbounded shapes."""
     # Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     added = []  # afterwards, because Drake's lists move when shapes are added

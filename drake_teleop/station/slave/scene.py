@@ -12,7 +12,7 @@ from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, ToolShapes
-from drake_teleop.station.slave.chain_joints import move_welds_to_world
+from drake_teleop.station.slave.chain_joints import move_bodies_welded_to_world
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
@@ -77,7 +77,7 @@ class Scene(Environment):
                 what = f"position and rotation cannot move {rest[0]} on the world"
                 remedy = "attach it to a link that is fixed to the world, or leave both fields out"
                 raise DrakeTeleopError(what, where=str(path), remedy=remedy)
-            move_welds_to_world(plant, joints_before, X_WFile)
+            move_bodies_welded_to_world(plant, joints_before, X_WFile)
         name = "GetDefaultFloatingBaseBodyPose"  # older versions of Drake have the second name
         pose_in_file = getattr(plant, name, None) or plant.GetDefaultFreeBodyPose
         for body in map(plant.get_body, bases):

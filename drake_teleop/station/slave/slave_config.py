@@ -185,8 +185,8 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
     plant.AddJoint(weld)
 
 
-def end_of_tool_shapes(tool: Tool) -> list[float] | None:
-    """Return p_STip [m]: the centre of the shape farthest along z_S, raised to its end; or None."""
+def tip_of_tool_shapes(tool: Tool) -> list[float] | None:
+    """Return p_STip [m]: end of the farthest shape along z_S, at its centre's x and y; or None."""
     halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
     ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None

@@ -96,7 +96,8 @@ def MakeToolContactModel(
             bodies = {name: plant.get_body(k) for name, k in contact.moving_bodies.items()}
             names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
             what = f"the body {' or '.join(names or bodies)} can move, but has no mass or inertia"
-            raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
+            remedy = "give it mass and inertia, or weld it"
+            raise DrakeTeleopError(what, where="environment", remedy=remedy)
     for part in environment.parts:
         if part.moving_part is not None:
             gravity = plant.gravity_field().gravity_vector()[2]
@@ -104,7 +105,7 @@ def MakeToolContactModel(
     if environment.hydroelastic:
         return contact._replace(drake_contact_reason="contact is hydroelastic")
     if contact.leaf_instance is not None and len(environment.parts) > 1:
-        return contact._replace(drake_contact_reason="the sheet spring is not the only object")
+        return contact._replace(drake_contact_reason="the environment has more than a sheet spring")
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
         moving = contact.moving_bodies.values()

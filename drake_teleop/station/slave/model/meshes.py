@@ -19,7 +19,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import model_references, model_repair
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
 
-_NUM_VALUES_BY_SHAPE_AND_SIZE = {
+_SIZE_VALUE_COUNTS_BY_SHAPE = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
     "cylinder": {"radius": 1, "length": 1},
@@ -36,8 +36,8 @@ def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
     """Remove shapes that Drake cannot read, or all shapes if the plant has no SceneGraph.
 
     Relative mesh addresses become absolute. STL meshes are converted to convex hulls, because Drake
-    does not read STL. Removed shapes are reported for links without any remaining shape, removed
-    collision shapes also for tools, scenes, and links with other collision shapes.
+    does not read STL. Removed shapes of links that keep none are reported, removed collision shapes
+    also of tools, of scenes, and of links that keep other collision shapes.
     """
     lost, purpose = dict[str, list[str]](), model.purpose
     for link in model.root.iter("link"):
@@ -65,9 +65,9 @@ def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
 def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _NUM_VALUES_BY_SHAPE_AND_SIZE:
+    if inner is None or kind not in _SIZE_VALUE_COUNTS_BY_SHAPE:
         return f"{kind or 'empty'} shapes cannot be read"
-    sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_VALUES_BY_SHAPE_AND_SIZE[kind]
+    sizes = {"radii": 3} if inner.find("radii") is not None else _SIZE_VALUE_COUNTS_BY_SHAPE[kind]
     for name, count in sizes.items():
         values = parse_numbers(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):

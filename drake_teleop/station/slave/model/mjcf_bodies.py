@@ -134,7 +134,7 @@ class BodyReader:
         if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
             self._mjcf.model.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
-        limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
+        limits = given.read_range("range", "limited", autolimits=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
         if kind == "hinge":
             in_rad = self._mjcf.angle_in_rad
@@ -160,8 +160,8 @@ class BodyReader:
         if mesh is not None and kind != "mesh" and not fault:
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
-                X_GM, size = mjcf_meshes.fit_shape_to_mesh(mesh, kind, by_box=by_box)
-                X_FG, mesh = X_FG @ X_GM, None
+                X_GP, size = mjcf_meshes.fit_shape_to_mesh(mesh, kind, by_box=by_box)
+                X_FG, mesh = X_FG @ X_GP, None
             except ValueError as error:
                 fault = str(error)
         if fault:
@@ -276,7 +276,7 @@ class MjcfWriter:
             values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            self._model.add_assumption("no damping, instead of a negative one, of", joint.name)
+            self._model.add_assumption("damping 0 in place of a negative one for", joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)

@@ -22,7 +22,7 @@ MIN_DIRECTION_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list is completed by the last numbers of the default.
-_COMPLETED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
+_PADDED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
 _ACTUATOR_TAGS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
 _ACTUATOR_TAGS |= {"muscle", "adhesion", "dcmotor", "plugin"}
 _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
@@ -36,14 +36,14 @@ class Attributes(dict[str, str]):
         self.label, self._model = label, model
 
     def numbers(
-        self, name: str, default: tuple[float, ...], limit: float = math.inf
+        self, name: str, default: tuple[float, ...], max_magnitude: float = math.inf
     ) -> list[float]:
-        """Return the numbers in attribute `name`; the end of `default` supplies missing numbers."""
+        """Return the numbers in attribute `name`; last ones of `default` supply missing ones."""
         values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
             fault = "is not a list of numbers"
-        elif max(map(abs, values), default=0.0) > limit:
-            fault = f"exceeds {limit:g}"
+        elif max(map(abs, values), default=0.0) > max_magnitude:
+            fault = f"exceeds {max_magnitude:g}"
         if fault:
             self._model.add_fault(f"{self.label}: {name} {self[name]!r} {fault}")
             return list(default)
@@ -66,15 +66,15 @@ class Attributes(dict[str, str]):
     def has_contact(self) -> bool:
         return any(self.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
-    def read_range(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
+    def read_range(self, name: str, flag: str, *, autolimits: bool) -> tuple[float, float] | None:
         """Return the limits (lower, upper) in attribute `name`, or None if they are switched off.
 
         Attribute `flag` switches them: true, false, or auto (the default). With auto, limits of
-        nonzero width apply if `automatic`.
+        nonzero width apply if `autolimits` of the compiler element is true.
         """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")
-        if limited == "false" or (limited == "auto" and not (automatic and lower != upper)):
+        if limited == "false" or (limited == "auto" and not (autolimits and lower != upper)):
             return None
         if lower > upper:
             self._model.add_fault(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
@@ -103,7 +103,7 @@ class Mjcf:
             self._add_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def find_file(self, element: Element, name: str, folder: str) -> Path | None:
-        """Return `folder`/`name` beside the main file or the element's included file, or None."""
+        """Return `folder`/`name` beside the main file or that of `element`; None if missing."""
         places = [self.model.path.resolve().parent, self._folders.get(element)]
         find = self.model.files.find_file
         found = (find(name, place / folder) for place in places if place)
@@ -199,7 +199,7 @@ def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, 
     merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATION_ATTRIBUTES)}
     for name, text in own.items():
         words = text.split()
-        rest = merged.get(name, "").split()[len(words) :] if name in _COMPLETED_ATTRIBUTES else []
+        rest = merged.get(name, "").split()[len(words) :] if name in _PADDED_ATTRIBUTES else []
         merged[name] = " ".join([*words, *rest]) if rest else text
     return merged
 

@@ -92,9 +92,9 @@ def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
 
 
 def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
-    """Return pose X_FG and size of the primitive, such as a box, that MuJoCo fits to a mesh.
+    """Return pose X_GP in mesh axes G, and size, of the primitive P that MuJoCo fits to a mesh.
 
-    The mesh's inertia determines its size, or with `by_box` the bounding box (`fitaabb`).
+    The inertia of the mesh determines the size, or with `by_box` its bounding box (`fitaabb`).
     """
     mass, centre, inertia = unit_density_properties_of_mesh(mesh)
     moments, axes = np.linalg.eigh(inertia)
@@ -119,15 +119,15 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
 
 
 def _mass_properties_of_simplices(
-    corners: Array, weight: Array, centre: Array, count: int = 3
+    corners: Array, weight: Array, centre: Array, num_vertices: int = 3
 ) -> MassProperties:
-    """Return mass properties of triangles (`count` 3) or tetrahedra with tips at `centre` (4).
+    """Return mass properties of triangles (3 vertices), or tetrahedra (4) with tips at `centre`.
 
     `corners` (m, 3, 3) are relative to `centre`; `weight` (m,) are their masses.
     """
     total = corners.sum(axis=1)
     second = np.einsum("nai,naj->nij", corners, corners) + np.einsum("ni,nj->nij", total, total)
-    products = np.einsum("n,nij->ij", weight, second) / (count * (count + 1))
+    products = np.einsum("n,nij->ij", weight, second) / (num_vertices * (num_vertices + 1))
     inertia = np.trace(products) * np.eye(3) - products
     return MassProperties(float(weight.sum()), centre, inertia)
 

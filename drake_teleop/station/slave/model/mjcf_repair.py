@@ -96,7 +96,7 @@ def _read_world_with_only_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
         sensors = [each for each in mjcf.elements_in("sensor") if each.tag in ("force", "torque")]
         is_measured = any(each.get("site") == sensor for each in sensors)
         _insert_sensor_frame_at_site(world, sensor, is_force_sensor_site=is_measured)
-        model.add_assumption(model_repair.SITE_ASSUMPTION, sensor)
+        model.add_assumption(model_repair.FRAME_REPLACES_SITE_TEXT, sensor)
     return world
 
 
@@ -180,10 +180,10 @@ def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mj
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             model.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
         elif element.tag in ("connect", "weld", "distance") and closes_loop:
-            model.add_fault(f"its links form a loop, by {element.tag}; cut it")
+            model.add_fault(f"a {element.tag} equality closes a loop of links; remove it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
-            model.add_assumption("no effect on the arm of the equality", name)
+            model.add_assumption("no effect of this equality on the arm:", name)
     for element in mjcf.elements_in("tendon"):
         for name in (each.get("joint", "") for each in element.iter("joint")):
             if name in moving:
@@ -244,7 +244,7 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
 
 
 def _symmetric_limit_from_range(mjcf: Mjcf, given: Attributes, name: str, flag: str) -> float:
-    limits = given.read_range(name, flag, automatic=mjcf.autolimits)
+    limits = given.read_range(name, flag, autolimits=mjcf.autolimits)
     if limits is None:
         return float("inf")
     smaller, larger = sorted(map(abs, limits))

@@ -75,7 +75,7 @@ class ModelFiles:
         self._bases = {""}
 
     def merge_packages_with_map(self, known: PackageMap) -> None:
-        """Merge `packages` and Drake's map `known` into both, without the downloaded package."""
+        """Merge `packages` and Drake's map `known` into both; omit Drake's downloaded models."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -126,14 +126,14 @@ class ModelFiles:
         self._total = self._total[0] + files, self._total[1] + size
         _check_num_files_and_size(*self._total, self._model)
 
-    def _count_files_and_bytes(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
-        real, where = path.resolve(), str(including[-1] if including else self._model)
+    def _count_files_and_bytes(self, path: Path, includers: tuple[Path, ...]) -> tuple[int, int]:
+        real, where = path.resolve(), str(includers[-1] if includers else self._model)
         if not self.may_read_file(real):
             what = f"references {real}, which is outside the model's folder and its packages"
             remedy = f"move it there, or name its folder: {PACKAGE_FOLDER_SETTINGS}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
-        if real in including or len(including) > _MAX_INCLUDE_DEPTH:
-            what = "includes itself" if real in including else "is nested too deeply"
+        if real in includers or len(includers) > _MAX_INCLUDE_DEPTH:
+            what = "includes itself" if real in includers else "is nested too deeply"
             what = f"{what} through {path.name}"
             raise DrakeTeleopError(what, where=where, remedy="remove this reference")
         if real not in self.sizes:
@@ -143,14 +143,14 @@ class ModelFiles:
             files, size = 1, real.stat().st_size
             _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
-                more = self._count_files_and_bytes(named, (*including, real))
+                more = self._count_files_and_bytes(named, (*includers, real))
                 files, size = files + more[0], size + more[1]
                 _check_num_files_and_size(files, size, path)
             self.sizes[real] = files, size
         return self.sizes[real]
 
     def mesh_files(self) -> Iterator[Path]:
-        """Yield readable meshes of all links, and their files, after `check_referenced_files`."""
+        """Yield readable meshes, with their textures; call `check_referenced_files` before."""
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
         for mesh in [m for path in texts for m in self._referenced_files(path, with_meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):
@@ -200,7 +200,7 @@ class ModelFiles:
 
 
 def list_model_files(model: Path, package_paths: tuple[Path, ...]) -> list[Path]:
-    """Return the model file, files that it includes and meshes; an empty list without the file."""
+    """Return the model file, included files and meshes; an empty list if there is no such file."""
     if not os.path.isfile(model):
         return []
     try:

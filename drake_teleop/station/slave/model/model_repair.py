@@ -14,7 +14,7 @@ from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 
 MISSING_SHAPES_TEXT = "shapes are missing of"
-SITE_ASSUMPTION = "a frame of the model in place of the site"
+FRAME_REPLACES_SITE_TEXT = "a frame of the model in place of the site"
 XACRO_REMEDY = "expand it first (`xacro FILE > arm.urdf`), and give the resulting URDF"
 _MAX_LISTED_NAMES = 12  # names in one statement
 
@@ -100,10 +100,10 @@ class ModelRepair:
         own = [f"{what} {join_names(names)}" for what, names in self._names.items()]
         return list(dict.fromkeys([*own, *self._assumptions_of_parts]))
 
-    def describe_frame_fault(self, count: int, known: set[str]) -> tuple[str, str]:
+    def describe_frame_fault(self, count: int, names: set[str]) -> tuple[str, str]:
         """Return fault and remedy if `count` frames, not one, have the sensor frame's name."""
         name = self.purpose.sensor_name
-        near = get_close_matches(name, sorted(known), n=_MAX_LISTED_NAMES, cutoff=0.0)
+        near = get_close_matches(name, sorted(names), n=_MAX_LISTED_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
         return f"{count or 'no'} frames are named {name!r}", remedy
 

@@ -7,8 +7,8 @@ from xml.etree.ElementTree import Element
 from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 WORLD_NAME = "world"  # name in URDF and SDF
-_DRAKE_CONSTRAINTS = "ball_constraint", "linear_bushing_rpy", "tendon_constraint"
-_DRAKE_CONSTRAINT_TAGS = tuple(f"drake:{name}" for name in _DRAKE_CONSTRAINTS)
+_DRAKE_CONSTRAINT_NAMES = "ball_constraint", "linear_bushing_rpy", "tendon_constraint"
+_DRAKE_CONSTRAINT_TAGS = tuple(f"drake:{name}" for name in _DRAKE_CONSTRAINT_NAMES)
 
 
 def list_joints(scope: Element) -> list[Element]:
@@ -41,8 +41,8 @@ def reduce_to_chain(
     """Keep only the tree of links with the sensor; fix joints that are not between root and sensor.
 
     Joints that close a loop are removed. Held joints count as fixed. Return the joints from root to
-    sensor link, fixed ones included, and by link the number of moving ones between root and link;
-    or None, with a fault, if joints are ambiguous.
+    sensor link, fixed ones included, and by link the number of moving joints from root to link; or
+    None, with a fault, if joints are ambiguous.
     """
     joints = _joint_chain_to_link(scope, sensor_link, model)
     if joints is None:
@@ -66,7 +66,7 @@ def reduce_to_chain(
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in ends}
         scope.remove(element)
         if len(ends) < 2 or len(groups) > 1:
-            what = f"its links form a loop, by {element.tag}"
+            what = f"{element.tag} closes a loop of links"
             model.add_fault(f"{what}; model only the chain to the sensor")
     return chain, num_joints_to_link
 

@@ -212,7 +212,7 @@ def _keep_one_motor_per_joint(model: ModelRepair) -> None:
 
 
 def _repair_included_file(uri: Element, model: ModelRepair) -> None:
-    """Replace an include's address by an absolute path, to a repaired copy of URDF or SDF."""
+    """Replace an include's address by the absolute path of its file, or of the repaired copy."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, model)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
