@@ -233,13 +233,13 @@ def _update_operator_perception_and_decision(
     )
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE_INDEX] > decision.PHASE_MOVING
-    felt = perceived_forces[step % perceived_forces.shape[0]]
+    sensed = perceived_forces[step % perceived_forces.shape[0]]
     period, force, v = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
-    update_perception_into(force_memory, senses, period, hand_mass, force, v, attentive, felt)
+    update_perception_into(force_memory, senses, period, hand_mass, force, v, attentive, sensed)
     # The next entry to be overwritten is the oldest.
     seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
-    felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
-    decision.update_decision(task, person, time, seen, felt, task_state, decision_memory)
+    sensed = perceived_forces[(step + 1) % perceived_forces.shape[0]]
+    decision.update_decision(task, person, time, seen, sensed, task_state, decision_memory)
 
 
 def _make_delay_buffer(delay_s: float, initial_value: Array) -> Array:

@@ -23,7 +23,7 @@ _INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ = 0.007
 _FRICTION_SMOOTHING_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
 _FORCE_MODEL_SIZE = 6
-_MAX_STEP_DEVIATION = 0.1  # of a record, relative to the median step
+_MAX_TIME_STEP_DEVIATION = 0.1  # of a record, relative to the median step
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
@@ -171,7 +171,7 @@ def perceive_contact(
     times = finite_array("t", t, len(force))
     steps, out = np.diff(times), np.empty((len(times), OUTPUT_SIZE))
     dt = float(np.median(steps)) if len(steps) else 0.0
-    if dt <= 0.0 or np.abs(steps - dt).max() > _MAX_STEP_DEVIATION * dt:
+    if dt <= 0.0 or np.abs(steps - dt).max() > _MAX_TIME_STEP_DEVIATION * dt:
         remedy = "give two samples or more, with steps within 10 % of their median"
         raise DrakeTeleopError("times do not increase in even steps", where="t", remedy=remedy)
     parameters = perception.compiled_parameters(dt)
