@@ -239,9 +239,9 @@ def step_slave_end(
 
 @njit(cache=True)
 def _update_pose_and_twist(pose, before, T, dx, twist):
-    """Write pose change `dx` (6,) and twist (6,), 0 if this or the last `pose` (7,) is invalid.
+    """Write the change `dx` (6,) of `pose` (7,) and the `twist` (6,); return if `pose` is valid.
 
-    Return whether `pose` is valid.
+    They are 0 at and after an invalid pose. `before` (8,), updated: last valid pose, 1 if invalid.
     """
     valid = are_valid_port_values(pose)
     if valid:

@@ -41,14 +41,14 @@ class NetworkConfig:
     """Settings of one direction of a network; the default is ideal: packet k arrives at step k."""
 
     delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
-    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
+    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) * standard deviation / mean of delay")
     distribution: str = choice("uniform", tuple(_MAX_DEVIATION_OVER_JITTER), "delay distribution")
-    loss: float = quantity(0.0, "1", 0.0, 1.0, "share of the packets that is lost, mean")
+    loss: float = quantity(0.0, "1", 0.0, 1.0, "mean share of lost packets")
     burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
-    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share that is lost in the bad state")
-    duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
+    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of lost packets in a bad state")
+    duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of duplicated packets")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "largest packet rate; null: every step")
-    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age at which packets are used")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "packets are used at this age or later")
     redundant: bool = plain(False, "packets repeat the data of the last `playout` seconds")
     trace: str | None = plain(
         None,
@@ -219,7 +219,7 @@ def _draw_delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _draw_loss_and_delays(p, k, bad):
-    """Return loss state (1: bad) at step k, delays of packet and duplicate [steps] (-1: none)."""
+    """Return loss state after `bad` (1: bad), delays of packet and duplicate [steps] (-1: none)."""
     if p[_BAD_STATE_SHARE] > 0.0:
         likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
         bad = 1.0 if _draw_uniform(p, k, 0) <= likely else 0.0

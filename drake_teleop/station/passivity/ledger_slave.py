@@ -78,11 +78,11 @@ _RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() 
 
 
 @njit(cache=True)
-def filter_own_velocity(twist, share, memory):
-    """Low-pass filter the velocity in `memory`; `share` is the weight of the new `twist`."""
+def filter_own_velocity(twist, new_weight, memory):
+    """Low-pass filter `FILTERED_OWN_VELOCITY` in `memory`; `new_weight` is that of `twist`."""
     velocity = memory[FILTERED_OWN_VELOCITY]
     for i in range(6):
-        velocity[i] += share * (twist[i] - velocity[i])
+        velocity[i] += new_weight * (twist[i] - velocity[i])
 
 
 @njit(cache=True)

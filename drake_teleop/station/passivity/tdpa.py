@@ -60,11 +60,11 @@ class TdpaConfig:
         "time in which a reduced wrench returns to its full value (force-jump filter)",
     )  # fmt: skip
     drain_rate: float = quantity(
-        200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"
+        200.0, "1/s", 0.0, 1e6, "share of the stored energy that the wrench may use in a second"
     )
     drift_rate: float = quantity(
         20.0, "1/s", 0.0, 1e3,
-        "rate of the correction of a withheld command, within the available energy",
+        "rate of the return to the received command, within the available energy",
     )  # fmt: skip
     speed: list[float] = quantity(
         [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,

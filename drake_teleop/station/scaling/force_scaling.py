@@ -57,7 +57,7 @@ class ForceScalingConfig:
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
     eta: float | None = quantity(
-        None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
+        None, "1", 0.0, 1.0, "Eq. (14): kept share of the object; needs sigma = 0 and gamma = 1"
     )
     gripper_phi: list[float] | None = quantity(
         *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
