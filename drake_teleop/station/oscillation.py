@@ -144,7 +144,7 @@ class ContactChatter(NamedTuple):
 
 
 def find_contact_chatter(t: Array, force: Array, command_reversals: Array) -> list[ContactChatter]:
-    """Return each long series of touches, without those that command reversals explain.
+    """Return each long series of touches, after removal of touches near command reversals.
 
     A series has 8 or more touches, at most 0.2 s apart, lasts 0.3 s or longer and reaches 0.5 N.
 

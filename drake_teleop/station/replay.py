@@ -41,7 +41,7 @@ of the stylus, and the point (3,) [m] in it that the hand holds."""
 
 _TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
-_MASTER_BASE_P_WB = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
+_MASTER_BASE_P_WB_M = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
 _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
 _CAMERA_SHIFT_WITHOUT_DEVICE_W_M = np.array([-0.3, 0.0, 0.0])  # of camera and target
 _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
@@ -275,14 +275,14 @@ class ReplayScene:
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if (leader := scenario.master.leader) is not None:
         order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
-        on_table = RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M])
+        on_table = RigidTransform([*_MASTER_BASE_P_WB_M[:2], _TABLE_HEIGHT_M])
         arm = leader.add_to_plant(plant, on_table)
         return arm.instance, lambda q: q[order], arm.sensor_frame, np.zeros(3)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(files.models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
-    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
+    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB_M))
     to_plant_positions = serial_joint_angles if is_phantom else np.copy
     return master, to_plant_positions, plant.GetFrameByName("stylus", master), _HAND_GRIP_P_E_M
 
@@ -294,7 +294,7 @@ def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_tabl
 
     draw_box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR_COLOUR)
     if with_table:
-        x, y, _ = _MASTER_BASE_P_WB
+        x, y, _ = _MASTER_BASE_P_WB_M
         draw_box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_HEIGHT_M - 0.015), _WOOD_COLOUR)
         height = _TABLE_HEIGHT_M - 0.03
         for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):

@@ -95,7 +95,7 @@ class SimulationResult:
         names = ["t", *self._specs, *(column for spec in self.specs for column in spec.columns)]
         if len(set(names)) < len(names):
             what = f"the name '{max(names, key=names.count)}' occurs more than once"
-            raise DrakeTeleopError(what, where="specs", remedy="give each its own; t is the time")
+            raise DrakeTeleopError(what, where="specs", remedy="use unique names; t is the time")
         self._columns = {c: (s.name, i) for s in self.specs for i, c in enumerate(s.columns)}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())

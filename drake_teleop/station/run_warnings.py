@@ -32,8 +32,8 @@ Warnings = Iterator[tuple[str, Spans, str]]
 _MIN_WARNING_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
 _MAX_GAP_OF_JOINED_SPANS_S = 0.05  # shorter gaps between time spans are closed
-_SHARE_AT_LIMIT = 1 - 1e-9  # share from which a limit counts as reached (rounding)
-_SHARE_AT_MOTOR_LIMIT = 0.999  # of a leader's motors, which the joints' motion changes
+_REACHED_LIMIT_SHARE = 1 - 1e-9  # share from which a limit counts as reached (rounding)
+_REACHED_MOTOR_LIMIT_SHARE = 0.999  # of a leader's motors, which the joints' motion changes
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_WARNED_COMMAND_LAG_M = 2e-3
 _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = np.deg2rad(1.0), np.deg2rad(0.2)
@@ -123,7 +123,7 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         error = command - result["slave_state"][:, : command.shape[1]]
         checked.insert(0, ("speed", control.position_loop_gain_per_s * error, fastest))
     for what, values, limit in checked:
-        clipped = np.abs(values) >= _SHARE_AT_LIMIT * limit
+        clipped = np.abs(values) >= _REACHED_LIMIT_SHARE * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
             spans, advice = find_spans(t, clipped[:, joint]), "use smaller or slower motions"
             yield f"joint {joint + 1} is at its largest {what}", spans, advice
@@ -131,12 +131,12 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         limits = device.parameters
         largest_force = limits.peak_force or np.inf  # 0: the device has no motors
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * largest_force
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _REACHED_LIMIT_SHARE * largest_force
         if isinstance(device, LeaderDevice):
-            reached = np.abs(shown[:, 3:]) >= _SHARE_AT_LIMIT * limits.peak_torque
+            reached = np.abs(shown[:, 3:]) >= _REACHED_LIMIT_SHARE * limits.peak_torque
             full |= reached.any(axis=1) & limits.peak_torque.all()
             joints = result["master_state"][:, : device.num_joints]
-            full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
+            full |= device.is_any_motor_at_limit(joints, shown, _REACHED_MOTOR_LIMIT_SHARE)
         elif limits.peak_torque.all():
             full |= _is_torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
@@ -309,7 +309,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
 
 
 def _is_torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.parameters.peak_torque
+    full, peak = np.zeros(len(torque), bool), _REACHED_LIMIT_SHARE * device.parameters.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])

@@ -59,7 +59,7 @@ class Rates:
         2000.0, "Hz", 10.0, 1e5, "haptic device and channel; 1 kHz or more with a simulated device"
     )
     joint_control_hz: float = quantity(
-        2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz it samples inside steps"
+        2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz, several samples a step"
     )
     estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator and contact detection")
     log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "rows of the log")
@@ -136,7 +136,7 @@ class Scenario:
 
     @property
     def has_no_network_or_passivity(self) -> bool:
-        """True if the channel has no network, passivity method or own wrench limits."""
+        """True if the channel has no network, no passivity method and default wrench limits."""
         own, default = self.passivity, PassivityConfig()
         names = ("method", "force_limit", "torque_limit")
         is_plain = all(getattr(own, name) == getattr(default, name) for name in names)

@@ -21,7 +21,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
 from drake_teleop.station.signals import LOG_BLOCK_NAME, SLIDING_JOINTS_ATTRIBUTE, signal_with_size
 
-_SIM_MS_PER_PROGRESS = 20
+_PROGRESS_PERIOD_MS = 20
 # Rows of a part of a log on disk: some seconds, some MB.
 _LOG_ROWS_PER_PART = 8192
 
@@ -70,7 +70,7 @@ def simulate(
     simulator.Initialize()
     try:
         # Products, as Drake's event times are: a rounding difference would be a step of 1e-17 s.
-        milliseconds = np.arange(_SIM_MS_PER_PROGRESS, 1e3 * end - 1, _SIM_MS_PER_PROGRESS)
+        milliseconds = np.arange(_PROGRESS_PERIOD_MS, 1e3 * end - 1, _PROGRESS_PERIOD_MS)
         for time in np.append(1e-3 * milliseconds, end):
             advance_without_garbage_collection(simulator, time)
             if stops:

@@ -96,7 +96,7 @@ def MakeTeleopStation(
         if master.HasInputPort(name):
             builder.ExportInput(master.GetInputPort(name), name)
     station = build_with_log(builder, "teleop_station", sides, scenario.rates.log_hz)
-    return _with_sliding_joints(station, scenario)
+    return _store_sliding_joints(station, scenario)
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
@@ -106,10 +106,10 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     builder = DiagramBuilder()
     slave = builder.AddNamedSystem("slave_side", MakeSlaveOnTrajectory(scenario, trajectory))
     station = build_with_log(builder, "identification_station", (slave,), scenario.rates.log_hz)
-    return _with_sliding_joints(station, scenario)
+    return _store_sliding_joints(station, scenario)
 
 
-def _with_sliding_joints(station: Diagram, scenario: Scenario) -> Diagram:
+def _store_sliding_joints(station: Diagram, scenario: Scenario) -> Diagram:
     slave = NominalSlave(scenario.slave).arm.sliding_joints
     sliding = {False: slave, True: scenario.master.device(0.0, 0.0).sliding_joints}
     setattr(station, SLIDING_JOINTS_ATTRIBUTE, sliding)

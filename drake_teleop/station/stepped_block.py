@@ -22,7 +22,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
     def _declare_step(self, results: list[Array], num_states: int, period: float) -> None:
         """Declare the discrete states and the `period` [s] of their step.
 
-        Initial `results` of `_advance_states_and_outputs`; the first `num_states` are states.
+        `results` are the initial arrays, of which the first `num_states` are the states.
         """
         # Integers are faster than Drake's own indices.
         self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
@@ -36,18 +36,18 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
         self._after_step = {step.ticket()}
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._store_states_after_step)
 
-    def _declare_output(self, name: str, result: int, part: slice) -> None:
-        """Declare an output port with the slice `part` of the step's array number `result`."""
+    def _declare_output(self, name: str, result_index: int, part: slice) -> None:
+        """Declare an output port with slice `part` of the step's array `results[result_index]`."""
         block: Any = weakref.ref(self)
 
         def copy_part(context: Context, output: Any) -> None:
-            output.SetFromVector(block()._step_results(context)[result][part])
+            output.SetFromVector(block()._step_results(context)[result_index][part])
 
         self.DeclareVectorOutputPort(name, part.stop - part.start, copy_part, self._after_step)
 
     @abstractmethod
     def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
-        """Advance the states `results[:num_states]` by a period; write the others, outputs."""
+        """Advance the states `results[:num_states]` by a period; write the rest, the outputs."""
 
     def _calc_step_results(self, context: Context, step: AbstractValue) -> None:
         results = step.get_mutable_value()

@@ -12,7 +12,7 @@ from drake_teleop.load.regressor import signal_sizes_of_sample
 from drake_teleop.station.signals import LOG_BLOCK_NAME, MOVING_BODY_POSE_PREFIX, SIGNALS
 
 #: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
-COMBINED_PORTS = {
+SIGNALS_OF_COMBINED_PORT = {
     "sample": (*signal_sizes_of_sample(0), "sample_time"),
     "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
     "displayed_and_fault": ("force_to_master", "fault_at_hand"),
@@ -71,7 +71,7 @@ def build_with_log(
     for name in signals:
         builder.ExportOutput(outputs[name], name)
     wide = dict[str, str]()
-    for port, parts in COMBINED_PORTS.items():
+    for port, parts in SIGNALS_OF_COMBINED_PORT.items():
         wide |= dict.fromkeys(parts, port) if {port, *parts} <= outputs.keys() else {}
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
     # One log for all ports: at 8 kHz each system with events costs time at every step.

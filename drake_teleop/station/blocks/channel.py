@@ -97,9 +97,9 @@ class _PassivityEndBlock(SteppedBlock):
         super().__init__()
         start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
         R = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
-        parameters, frame = steps.method_parameters_and_frame(passivity, R, scales, force_scale)
+        parameters, mapping = steps.pack_parameters_and_mapping(passivity, R, scales, force_scale)
         self._method = methods.step_addresses(passivity.method)
-        self._constants = period, timeout, frame, parameters
+        self._constants = period, timeout, mapping, parameters
         ends = steps.initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]

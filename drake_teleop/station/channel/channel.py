@@ -90,10 +90,10 @@ _RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.vector(1)
 _ZERO_LOAD_WRENCH = np.zeros(6)
 
 
-def method_parameters_and_frame(
+def pack_parameters_and_mapping(
     passivity: PassivityConfig, R_WB: Array, scales: Array, force_scale: float
 ) -> tuple[Array, Array]:
-    """Return the method's parameters (NUM_PARAMETERS,), and `frame` (11,) as in `step_channel`."""
+    """Return parameters (NUM_PARAMETERS,) of the method, `mapping` (11,) as in `step_channel`."""
     # A scale of zero transfers no energy; any unit is valid.
     scales, force_scale = np.where(scales > 0.0, scales, 1.0), force_scale or 1.0
     parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
@@ -116,7 +116,7 @@ def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array
 @njit(cache=True)
 def step_channel(
     steps, pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact, T, timeout,
-    frame, parameters, forward_parameters, backward_parameters, forward, backward, ends,
+    mapping, parameters, forward_parameters, backward_parameters, forward, backward, ends,
     pose_received, ports, wrench_received,
 ):  # fmt: skip
     """Run one step of both ends and of both directions of the network.
@@ -127,7 +127,7 @@ def step_channel(
             `TeleopChannel`.
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
-        frame: (11,) R_WB by rows; slave motion over master motion: translation, rotation.
+        mapping: (11,) R_WB by rows; slave motion over master motion: translation, rotation.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
         ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
@@ -138,14 +138,14 @@ def step_channel(
     received, packet = np.zeros(fields.PACKET_SIZE), np.empty(fields.PACKET_SIZE)
     _, fresh = network.receive_packet(backward_parameters, backward, k, received)
     step_master_end(
-        steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
+        steps, pose_command, hand_B, received, fresh, T, timeout, mapping, parameters, ends,
         ports[_WORK_OF_HAND_WRENCH], packet, wrench_received,
     )  # fmt: skip
     network.send_packet(forward_parameters, forward, k, packet)
     _, fresh = network.receive_packet(forward_parameters, forward, k + 1, received)
     step_slave_end(
-        steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
-        parameters, ends, pose_received, ports, packet,
+        steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout,
+        mapping, parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
     ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][safe_state.SILENCE_TIME_INDEX]
@@ -154,8 +154,8 @@ def step_channel(
 
 @njit(cache=True)
 def step_master_end(
-    steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends, work, packet,
-    wrench_received,
+    steps, pose_command, hand_B, received, fresh, T, timeout, mapping, parameters, ends, work,
+    packet, wrench_received,
 ):  # fmt: skip
     """Run one step of the master's end; arguments are those of `step_channel`.
 
@@ -170,7 +170,7 @@ def step_master_end(
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
     if are_valid_port_values(hand_B):
-        _rotate_and_scale_wrench_to_world_into(hand_B, frame, hand)
+        _rotate_and_scale_wrench_to_world_into(hand_B, mapping, hand)
     else:
         valid = False
     healthy = fresh and received[fields.SENDER_INPUTS_FINITE] > 0.5
@@ -185,13 +185,13 @@ def step_master_end(
     )  # fmt: skip
     if not valid:
         packet[fields.SENDER_INPUTS_FINITE] = 0.0
-    _rotate_and_scale_wrench_to_master_into(held, frame, wrench_received[_RECEIVED_WRENCH])
+    _rotate_and_scale_wrench_to_master_into(held, mapping, wrench_received[_RECEIVED_WRENCH])
     wrench_received[_RECEIVED_CONTACT_FLAG] = received[fields.CONTACT_FLAG]
 
 
 @njit(cache=True)
 def step_slave_end(
-    steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
+    steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, mapping,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
@@ -211,11 +211,11 @@ def step_slave_end(
         ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
-        _rotate_and_scale_wrench_to_world_into(wrench_B, frame, wrench)
+        _rotate_and_scale_wrench_to_world_into(wrench_B, mapping, wrench)
         share = T / max(safe_state.STOP_TIME_S - ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
-        _rotate_and_scale_wrench_to_world_into(load_B, frame, wrench)
+        _rotate_and_scale_wrench_to_world_into(load_B, mapping, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_TIME_SINCE_LAST_INVALID_WRENCH_SLOT] += T
@@ -239,9 +239,9 @@ def step_slave_end(
 
 @njit(cache=True)
 def _update_pose_and_twist(pose, before, T, dx, twist):
-    """Write pose change `dx` (6,) and twist (6,), 0 if this or the last `pose` (7,) is invalid.
+    """Write the change `dx` (6,) of `pose` (7,) and the `twist` (6,); return if `pose` is valid.
 
-    Return whether `pose` is valid.
+    They are 0 at and after an invalid pose. `before` (8,), updated: last valid pose, 1 if invalid.
     """
     valid = are_valid_port_values(pose)
     if valid:
@@ -256,8 +256,8 @@ def _update_pose_and_twist(pose, before, T, dx, twist):
 
 
 @njit(cache=True)
-def _rotate_and_scale_wrench_to_world_into(wrench_B, frame, out):
-    R_WB, scales = matrix_at(frame, _R_WB_ROWS.start), frame[_MOTION_SCALES]
+def _rotate_and_scale_wrench_to_world_into(wrench_B, mapping, out):
+    R_WB, scales = matrix_at(mapping, _R_WB_ROWS.start), mapping[_MOTION_SCALES]
     for g in range(2):
         rotated = apply_matrix(R_WB, vector_at(wrench_B, 3 * g))
         for i in range(3):
@@ -265,8 +265,8 @@ def _rotate_and_scale_wrench_to_world_into(wrench_B, frame, out):
 
 
 @njit(cache=True)
-def _rotate_and_scale_wrench_to_master_into(wrench, frame, out):
-    R_BW, scales = transposed(matrix_at(frame, _R_WB_ROWS.start)), frame[_MOTION_SCALES]
+def _rotate_and_scale_wrench_to_master_into(wrench, mapping, out):
+    R_BW, scales = transposed(matrix_at(mapping, _R_WB_ROWS.start)), mapping[_MOTION_SCALES]
     for g in range(2):
         rotated = apply_matrix(R_BW, vector_at(wrench, 3 * g))
         for i in range(3):
@@ -306,8 +306,8 @@ class TeleopChannel(SteppedBlock):
         ]
         self._steps = methods.step_addresses(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
-        parameters, frame = method_parameters_and_frame(passivity, R_WB, scales, force_scale)
-        self._constants = (period, channel.timeout_s(period), frame, parameters, *lines)
+        parameters, mapping = pack_parameters_and_mapping(passivity, R_WB, scales, force_scale)
+        self._constants = (period, channel.timeout_s(period), mapping, parameters, *lines)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)

@@ -28,7 +28,7 @@ MAX_POSE_EXTRAPOLATION_S = 0.1  # [s]; after it the pose is constant
 
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
-_MAX_DELAY_DEVIATIONS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
+_MAX_DEVIATION_OVER_JITTER = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE_POLICY_NAMES = ("hold", "zero", "extrapolate")
 _SILENCE_POLICY_ZERO, _SILENCE_POLICY_EXTRAPOLATE = 1, 2
 _TRACE_STEP_S = 1e-3  # [s], for mean and maximum of a trace
@@ -41,14 +41,14 @@ class NetworkConfig:
     """Settings of one direction of a network; the default is ideal: packet k arrives at step k."""
 
     delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
-    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
-    distribution: str = choice("uniform", tuple(_MAX_DELAY_DEVIATIONS), "distribution of the delay")
-    loss: float = quantity(0.0, "1", 0.0, 1.0, "share of the packets that is lost, mean")
+    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) * standard deviation / mean of delay")
+    distribution: str = choice("uniform", tuple(_MAX_DEVIATION_OVER_JITTER), "delay distribution")
+    loss: float = quantity(0.0, "1", 0.0, 1.0, "mean share of lost packets")
     burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
-    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share that is lost in the bad state")
-    duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
+    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of lost packets in a bad state")
+    duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of duplicated packets")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "largest packet rate; null: every step")
-    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age at which packets are used")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "packets are used at this age or later")
     redundant: bool = plain(False, "packets repeat the data of the last `playout` seconds")
     trace: str | None = plain(
         None,
@@ -122,7 +122,7 @@ def network_parameters(
     trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
-    max_deviation = _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter
+    max_deviation = _MAX_DEVIATION_OVER_JITTER[config.distribution] * config.jitter
     longest = math.floor(mean * (1 + max_deviation) + 0.5)
     if trace.size:
         longest = max(int(trace.max()), 0)
@@ -134,7 +134,7 @@ def network_parameters(
     p[_RANDOM_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
     p[_STEP_PERIOD], p[_DELAY_JITTER] = period, config.jitter
     p[_MEAN_DELAY_STEPS], p[_MAX_DELAY_STEPS] = mean, longest
-    p[_DELAY_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
+    p[_DELAY_DISTRIBUTION] = list(_MAX_DEVIATION_OVER_JITTER).index(config.distribution)
     p[_BAD_STATE_SHARE] = bad
     p[_BAD_STATE_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
     p[_BAD_STATE_LOSS_SHARE], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
@@ -157,7 +157,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 def longest_delay(config: NetworkConfig) -> float:
     """Return the largest one-way delay of an arriving packet [s], but at least the playout time."""
-    longest = config.delay * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter)
+    longest = config.delay * (1 + _MAX_DEVIATION_OVER_JITTER[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_delay_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
     return max(longest, config.playout)
@@ -219,7 +219,7 @@ def _draw_delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _draw_loss_and_delays(p, k, bad):
-    """Return loss state (1: bad) at step k, delays of packet and duplicate [steps] (-1: none)."""
+    """Return loss state after `bad` (1: bad), delays of packet and duplicate [steps] (-1: none)."""
     if p[_BAD_STATE_SHARE] > 0.0:
         likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
         bad = 1.0 if _draw_uniform(p, k, 0) <= likely else 0.0

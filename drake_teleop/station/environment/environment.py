@@ -34,7 +34,7 @@ class Environment(ABC):
     @property
     @abstractmethod
     def slip_speed(self) -> float:
-        """Sliding speed of full friction [m/s]; the plant uses the smallest of all objects."""
+        """Sliding speed above which friction is full [m/s]; the plant uses the smallest one."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:

@@ -38,7 +38,7 @@ BODY_STATE_SIZE = 13
 def MakeJointTableAndRowBodies(
     plant: MultibodyPlant, bodies: Iterable[tree.BodyIndex]
 ) -> tuple[Array, list[int]]:
-    """Return a table (m, 21) of the joints from world to `bodies`, and the child of each row."""
+    """Return a table (m, 21) of joints from world to `bodies`, and the body index of each child."""
     # Parents first. Columns: 0 row of the parent, -1 if it is anchored; 1 type of joint; 2 and 3
     # first index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an
     # anchored parent) and 14-20 X_MB, a quaternion and a position each.
@@ -64,9 +64,9 @@ def MakeJointTableAndRowBodies(
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
-def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, above: int) -> Array:
+def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, parent: int) -> Array:
     F = joint.frame_on_parent()
-    X_PF = F.CalcPoseInWorld(context) if above < 0 else F.GetFixedPoseInBodyFrame()
+    X_PF = F.CalcPoseInWorld(context) if parent < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _FIXED_JOINT, np.zeros(3)
     if isinstance(joint, tree.RevoluteJoint):
@@ -77,7 +77,7 @@ def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, above
         kind = _FREE_JOINT
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
-    return np.array([above, kind, *places, *axis, *poses[0], *poses[1]])
+    return np.array([parent, kind, *places, *axis, *poses[0], *poses[1]])
 
 
 @njit(cache=True)

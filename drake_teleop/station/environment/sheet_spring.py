@@ -35,7 +35,7 @@ class SheetSpring(environment.Environment):
     damping_ratio: float = quantity(
         0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 the leaf creeps back"
     )
-    slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
+    slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "friction is full above this speed (E)")
 
     @property
     def stiffness(self) -> float:

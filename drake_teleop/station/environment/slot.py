@@ -47,7 +47,7 @@ class Slot(Environment):
 
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of its mouth")
     yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: along x_W")
-    clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot less the peg's")
+    clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot minus the peg's")
     depth: float = quantity(0.040, "m", 0.02, 0.05, "distance from mouth to floor")
     chamfer: float = quantity(
         3e-3, "m", 5e-4, 0.015, "depth of the chamfers of 45 degrees, and their width on each side"

@@ -90,8 +90,8 @@ class Wall(Surface):
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
     normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outwards, in W, of any length")
     size: list[float] = quantity(
-        [0.4, 0.4], "m", 1e-3, 4.0, "edges of its face, the second along the first of x_W, y_W, z_W"
-        " that is most perpendicular to normal; it is 0.1 m thick",
+        [0.4, 0.4], "m", 1e-3, 4.0, "edges of the face, edge 2 along the world axis that is most"
+        " perpendicular to normal (the first of equal ones); the thickness is 0.1 m",
     )  # fmt: skip
 
     def check(self, where: str) -> None:
@@ -157,7 +157,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude contact of the tool with the block's corner balls, and of others with its box."""
+        """Exclude the tool's contact with the block's corner balls, other bodies' with its box."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         tool_bodies = BodiesWeldedToTool(plant, tool)
         around = [plant.get_body(index) for index in bodies if index not in tool_bodies]

@@ -25,11 +25,11 @@ class ContactDetectionConfig:
 
     statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
     margin: float = quantity(
-        THRESHOLD_MARGIN, "1", 1.0, 10.0, "threshold over the largest value during identification"
+        THRESHOLD_MARGIN, "1", 1.0, 10.0, "ratio of threshold to the largest value in free motion"
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
-    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the offset in free motion")
-    recovery: float = quantity(5e-3, "s", 0.0, 1.0, "recovery of the low-pass after a saturation")
+    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the subtracted mean")
+    recovery: float = quantity(5e-3, "s", 0.0, 1.0, "pause of the detection after a saturation")
 
 
 @njit(cache=True)

@@ -33,11 +33,11 @@ class LoadEstimatorConfig:
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor per sample; 1 = none")
     method: str = choice("rls", (), "rls: least squares; rtls: total, for noisy motion", METHODS)
     settled_bound: float = quantity(
-        0.05, "1", 1e-6, 10.0, "predicted uncertainty of a settled load relative to a natural value"
+        0.05, "1", 1e-6, 10.0, "standard deviation of a settled load relative to its natural scale"
     )
     watch: bool = plain(False, "freeze a settled load or one with covariance; detect its change")
     relative_wrench_error: float = quantity(
-        0.0, "1", 0.0, 0.5, "watch: error of the wrench by gains, cross-talk and delays, as a share"
+        0.0, "1", 0.0, 0.5, "watch: relative wrench error due to gains, cross-talk and delays"
     )
 
     def check(self, where: str) -> None:

@@ -122,8 +122,8 @@ _STEPS_PER_EYE_FIXATION = 50  # steps of a fixation, 0.25 s
 _STATION_RESPONSE_TIME_S = 0.05  # end of a move to its effect, without network, estimate
 _APPROACH_UPDATE_PERIOD_S = 0.3  # s, update interval of the careful approach, estimate
 # Largest perceived depth without contact; beyond, the operator gives up; estimate.
-_GIVE_UP_DEPTH_M = 0.03
-_MIN_TRUST_IN_FELT_CONTACT = 0.1  # trust with vision only, estimate
+_MAX_FREE_DEPTH_M = 0.03
+_MIN_CONTACT_DETECTION_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_ASSUMED_STIFFNESS, _MIN_ASSUMED_STIFFNESS, _MAX_ASSUMED_STIFFNESS = 2000.0, 200.0, 50000.0
 _MAX_PRESS_CORRECTION_M = 0.003  # m, longest correction of the force, at the tool, estimate
@@ -182,13 +182,13 @@ def _plan_submovement(person, memory, step, time, error_W):
 
 
 @njit(cache=True)
-def _contact_force_at_tool_along_approach(task, person, felt):
+def _contact_force_at_tool_along_approach(task, person, sensed):
     axis_B = apply_matrix(transposed(matrix_as_tuple(person.R_WB)), task.approach_axis)
-    return -dot(felt, axis_B) / person.force_gain if person.force_gain > 0.0 else 0.0
+    return -dot(sensed, axis_B) / person.force_gain if person.force_gain > 0.0 else 0.0
 
 
 @njit(cache=True)
-def _update_criterion_with_hysteresis(memory, time, is_met, is_nearly_met):
+def _update_and_check_criterion(memory, time, is_met, is_nearly_met):
     if memory[_CRITERION_MET_SINCE] < 0.0 and is_met:
         memory[_CRITERION_MET_SINCE] = time
     elif not is_nearly_met:
@@ -209,25 +209,26 @@ def _enter_phase(state, memory, phase, next_move_time):
 
 
 @njit(cache=True)
-def update_decision(task, person, time, seen_W, felt, state, memory):
+def update_decision(task, person, time, seen_W, sensed, state, memory):
     """Update the operator's decisions by one step of `DECISION_PERIOD_S`.
 
     Args:
+        task, person: results of `pack_task_parameters` and `pack_operator_parameters`.
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
-        felt: (5,) output of `update_perception_into`, delayed by the reaction time.
+        sensed: (5,) output of `update_perception_into`, delayed by the reaction time.
         state: (5,) updated: phase, as `PHASE_MOVING`; outcome: 1 done, -1 given up; 1 while contact
             is detected; detection threshold [N]; trust (0.1 to 1) in detecting contact.
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
     """
     step = int(memory[_STEP_COUNT])
     memory[_STEP_COUNT] += 1.0
-    state[CONTACT_PERCEIVED_INDEX] = felt[CONTACT_NOTICED_INDEX]
-    state[FORCE_THRESHOLD_INDEX] = felt[DETECTION_THRESHOLD_INDEX]
+    state[CONTACT_PERCEIVED_INDEX] = sensed[CONTACT_NOTICED_INDEX]
+    state[FORCE_THRESHOLD_INDEX] = sensed[DETECTION_THRESHOLD_INDEX]
     # Ratio of the smallest detectable to the largest harmless contact force at the tool.
     unnoticed = math.inf
     if person.force_gain > 0.0:
-        unnoticed = felt[DETECTION_THRESHOLD_INDEX] / (person.force_gain * person.gentle_force)
-    state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_TRUST_IN_FELT_CONTACT)
+        unnoticed = sensed[DETECTION_THRESHOLD_INDEX] / (person.force_gain * person.gentle_force)
+    state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_CONTACT_DETECTION_TRUST)
     if state[PHASE_INDEX] == PHASE_WAITING and time >= task.start_time:
         _enter_phase(state, memory, PHASE_MOVING, time)
     if state[PHASE_INDEX] in (PHASE_WAITING, PHASE_OVER):
@@ -237,19 +238,19 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     elif state[PHASE_INDEX] == PHASE_MOVING:
         _move_to_target_by_vision(task, person, step, time, seen_W, state, memory)
     elif state[PHASE_INDEX] == PHASE_APPROACHING:
-        _approach_contact(task, person, time, seen_W, felt, state, memory)
+        _approach_contact(task, person, time, seen_W, sensed, state, memory)
     elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_MOVE_TIME]:
         if task.kind == tasks.KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
-            _update_criterion_with_hysteresis(memory, time, True, True)
+            _update_and_check_criterion(memory, time, True, True)
             and time - memory[_CRITERION_MET_SINCE] >= task.dwell
         ):
             _finish_task(state, memory, time, 1.0)
     elif state[PHASE_INDEX] == PHASE_PRESSING:
-        _control_press_force(task, person, step, time, felt, state, memory)
+        _control_press_force(task, person, step, time, sensed, state, memory)
     elif state[PHASE_INDEX] == PHASE_SEARCHING_SLOT and time >= memory[_NEXT_MOVE_TIME]:
-        _search_slot(task, person, step, time, seen_W, felt, state, memory)
+        _search_slot(task, person, step, time, seen_W, sensed, state, memory)
 
 
 @njit(cache=True)
@@ -277,7 +278,7 @@ def _move_to_target_by_vision(task, person, step, time, seen_W, state, memory):
     error = _perceived_standoff_target_W(task, person) - seen_W
     off = math.sqrt(dot(error, error))
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
-    met = _update_criterion_with_hysteresis(memory, time, inside, still_inside)
+    met = _update_and_check_criterion(memory, time, inside, still_inside)
     if task.kind == tasks.KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
@@ -291,14 +292,15 @@ def _move_to_target_by_vision(task, person, step, time, seen_W, state, memory):
 
 
 @njit(cache=True)
-def _approach_contact(task, person, time, seen_W, felt, state, memory):
+def _approach_contact(task, person, time, seen_W, sensed, state, memory):
     inserts = task.kind == tasks.KIND_INSERT
-    if state[CONTACT_PERCEIVED_INDEX] > 0.0 and (not inserts or _is_tool_stuck(task, person, felt)):
+    touches = state[CONTACT_PERCEIVED_INDEX] > 0.0
+    if touches and (not inserts or _is_tool_stuck(task, person, sensed)):
         plan_stop(memory, time)
         phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING
         _enter_phase(state, memory, phase, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_DEPTH_M:
+    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _MAX_FREE_DEPTH_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
@@ -311,10 +313,10 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
 
 
 @njit(cache=True)
-def _perceived_contact_force(task, person, felt, memory):
+def _perceived_contact_force(task, person, sensed, memory):
     draw = _draw_normal_number(person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3)
     error = person.weber_fraction * draw
-    return (1.0 + error) * _contact_force_at_tool_along_approach(task, person, felt)
+    return (1.0 + error) * _contact_force_at_tool_along_approach(task, person, sensed)
 
 
 @njit(cache=True)
@@ -332,11 +334,11 @@ def _calc_press_correction_m(task, memory, force):
 
 
 @njit(cache=True)
-def _control_press_force(task, person, step, time, felt, state, memory):
-    force = _perceived_contact_force(task, person, felt, memory)
+def _control_press_force(task, person, step, time, sensed, state, memory):
+    force = _perceived_contact_force(task, person, sensed, memory)
     error = abs(task.force - force)
     is_met, is_nearly_met = error <= 0.5 * task.tolerance, error <= task.tolerance
-    met = _update_criterion_with_hysteresis(memory, time, is_met, is_nearly_met)
+    met = _update_and_check_criterion(memory, time, is_met, is_nearly_met)
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
@@ -346,20 +348,20 @@ def _control_press_force(task, person, step, time, felt, state, memory):
 
 
 @njit(cache=True)
-def _lateral_contact_force_W_and_norm(task, person, felt):
-    lateral = _contact_force_at_tool_along_approach(task, person, felt) * task.approach_axis
+def _lateral_contact_force_W_and_norm(task, person, sensed):
+    lateral = _contact_force_at_tool_along_approach(task, person, sensed) * task.approach_axis
     if person.force_gain > 0.0:
         for i in range(3):
             for k in range(3):
-                lateral[i] += person.R_WB[i, k] * felt[k] / person.force_gain
+                lateral[i] += person.R_WB[i, k] * sensed[k] / person.force_gain
     return lateral, math.sqrt(dot(lateral, lateral))
 
 
 @njit(cache=True)
-def _is_tool_stuck(task, person, felt):
+def _is_tool_stuck(task, person, sensed):
     limit = _MIN_STUCK_FORCE_OVER_PUSH_FORCE * task.force
-    _, sideways = _lateral_contact_force_W_and_norm(task, person, felt)
-    return _contact_force_at_tool_along_approach(task, person, felt) >= limit or sideways >= limit
+    _, sideways = _lateral_contact_force_W_and_norm(task, person, sensed)
+    return _contact_force_at_tool_along_approach(task, person, sensed) >= limit or sideways >= limit
 
 
 @njit(cache=True)
@@ -369,9 +371,9 @@ def _search_spiral_coordinate_m(num_searches, axis):
 
 
 @njit(cache=True)
-def _search_slot(task, person, step, time, seen_W, felt, state, memory):
-    force = _perceived_contact_force(task, person, felt, memory)
-    if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
+def _search_slot(task, person, step, time, seen_W, sensed, state, memory):
+    force = _perceived_contact_force(task, person, sensed, memory)
+    if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, sensed)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
     deep = _perceived_depth_beyond_surface(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task.depth
@@ -379,7 +381,7 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
     push = _calc_press_correction_m(task, memory, force)
-    move, sideways = _lateral_contact_force_W_and_norm(task, person, felt)
+    move, sideways = _lateral_contact_force_W_and_norm(task, person, sensed)
     if sideways >= state[FORCE_THRESHOLD_INDEX] / person.force_gain:
         move *= min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
     else:

@@ -55,7 +55,7 @@ GRIP_IMPEDANCES = {
 @settings
 @dataclass
 class MinimumJerk:
-    """Minimum-jerk move; at u = (t - t_start) / duration, 10 u^3 - 15 u^4 + 6 u^5 of it is done."""
+    """Minimum-jerk move: 10 u^3 - 15 u^4 + 6 u^5 is complete at u = (t - t_start) / duration."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
@@ -233,13 +233,13 @@ def _update_operator_perception_and_decision(
     )
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE_INDEX] > decision.PHASE_MOVING
-    felt = perceived_forces[step % perceived_forces.shape[0]]
+    sensed = perceived_forces[step % perceived_forces.shape[0]]
     period, force, v = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
-    update_perception_into(force_memory, senses, period, hand_mass, force, v, attentive, felt)
+    update_perception_into(force_memory, senses, period, hand_mass, force, v, attentive, sensed)
     # The next entry to be overwritten is the oldest.
     seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
-    felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
-    decision.update_decision(task, person, time, seen, felt, task_state, decision_memory)
+    sensed = perceived_forces[(step + 1) % perceived_forces.shape[0]]
+    decision.update_decision(task, person, time, seen, sensed, task_state, decision_memory)
 
 
 def _make_delay_buffer(delay_s: float, initial_value: Array) -> Array:
@@ -331,8 +331,8 @@ class Operator(LeafSystem):
         slave_q = self._slave.Eval(context)[: self._joints]
         _update_operator_perception_and_decision(*self._task_parameters, *inputs, slave_q, *state)
 
-    def _intent_at_present(self, context: Context) -> tuple[Array, ...]:
-        """Return segments, pose and twist relative to which they move, and the decision memory."""
+    def _evaluate_intent(self, context: Context) -> tuple[Array, ...]:
+        """Return segments, the pose and twist they are relative to, and the decision memory."""
         memory = self._no_memory
         if self._has_task:
             memory = context.get_discrete_state(self._groups[1]).value()
@@ -348,11 +348,11 @@ class Operator(LeafSystem):
         return self._no_segments, self._commanded_pose, twist, memory
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        intent, time = self._intent_at_present(context), context.get_time()
+        intent, time = self._evaluate_intent(context), context.get_time()
         own = self._impedance, self._intent_pose, self._intent_twist
         stylus = self._pose.Eval(context), self._twist.Eval(context)
         _hand_wrench_at_time(intent, time, *own, *stylus, output.get_mutable_value())
 
     def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
-        intent, pose = self._intent_at_present(context), output.get_mutable_value()
+        intent, pose = self._evaluate_intent(context), output.get_mutable_value()
         _intended_plus_planned_motion_into(intent, context.get_time(), pose, self._intent_twist)

@@ -1,8 +1,8 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
 A Kalman filter estimates mass m, damping b, friction c and offset u_0 of the force without contact,
-m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A larger difference of u
-from it than the threshold is contact.
+m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). Contact is detected when u
+differs from this force by more than the threshold.
 """
 
 import math
@@ -23,7 +23,7 @@ _INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ = 0.007
 _FRICTION_SMOOTHING_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
 _FORCE_MODEL_SIZE = 6
-_MAX_STEP_DEVIATION = 0.1  # of a record, relative to the median step
+_MAX_TIME_STEP_DEVIATION = 0.1  # of a record, relative to the median step
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
@@ -50,11 +50,11 @@ class Perception:
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )
-    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "standard deviation of a surface's distance")
-    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's lateral place")
+    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "standard deviation of a perceived depth")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's xy position")
 
     def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N]; masking decay, low-pass gain per `dt` [s]."""
+        """Return (4,): Weber fraction, threshold [N]; masking decay, low-pass gain per `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
@@ -75,8 +75,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
         hand_force, velocity: (3,) force of the hand on the stylus [N], stylus velocity [m/s].
         attentive: if false, detect no contact and only adapt the expected force.
-        out: (5,) written: force on the hand minus the expected one (3) [N], threshold [N], 1 if
-            contact is detected.
+        out: (5,) written: excess over the expected force (3) [N], threshold [N], 1 in contact.
     """
     weber, absolute, fade, smooth = parameters
     first = memory[_SAMPLE_COUNT] == 0.0
@@ -164,14 +163,13 @@ def perceive_contact(
         attentive: start time of detection [s]; before, only the expected force is adapted.
 
     Returns:
-        (N, 5) force on the hand minus the expected one (3) [N], threshold [N], 1 while contact is
-            detected.
+        (N, 5) excess over the expected force (3) [N], threshold [N], 1 while contact is detected.
     """
     _, (force, speed) = broadcast_to_rows(hand_force=(hand_force, 3), velocity=(velocity, 3))
     times = finite_array("t", t, len(force))
     steps, out = np.diff(times), np.empty((len(times), OUTPUT_SIZE))
     dt = float(np.median(steps)) if len(steps) else 0.0
-    if dt <= 0.0 or np.abs(steps - dt).max() > _MAX_STEP_DEVIATION * dt:
+    if dt <= 0.0 or np.abs(steps - dt).max() > _MAX_TIME_STEP_DEVIATION * dt:
         remedy = "give two samples or more, with steps within 10 % of their median"
         raise DrakeTeleopError("times do not increase in even steps", where="t", remedy=remedy)
     parameters = perception.compiled_parameters(dt)

@@ -10,7 +10,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 @dataclass
 class _Task:
-    t_start: float = quantity(0.5, "s", 0.0, 1e6, "start, from the start of the simulation")
+    t_start: float = quantity(0.5, "s", 0.0, 1e6, "start, after the start of the simulation")
     timeout: float = quantity(10.0, "s", 0.1, 3600.0, "time after which the operator gives up")
     translation: list[float] = quantity(
         [0.0, 0.0, -0.1], "m", -2.0, 2.0, "displacement from the tool's start to the target, in W"
@@ -33,7 +33,7 @@ class Reach(_Task):
 
 @dataclass
 class _ContactTask(_Task):
-    standoff: float = quantity(0.015, "m", 0.0, 0.5, "distance where the careful approach starts")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "distance from target for a careful approach")
 
 
 @settings
@@ -83,7 +83,7 @@ class Movement:
 
     acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak acceleration in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
-    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of the end point over length")
+    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of the end point / length")
     approach_speed: float = quantity(
         0.03, "m/s", 1e-3, 1.0, "speed of the tool in a careful approach, at full trust"
     )

@@ -19,7 +19,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
-        pair: wrench in the step from k-1 to k: `held` f_(k-1), `backward` f_k, `mean` of both.
+        pair: wrench used from k-1 to k: `held` f_(k-1), `backward` f_k, or the `mean` of both.
     """
     if pair not in WEIGHT_OF_PRESENT_WRENCH:
         remedy = f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}"

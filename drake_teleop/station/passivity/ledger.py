@@ -124,7 +124,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     steady = memory[_HAND_STEP_BEYOND_DEADBAND]
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
-    shared.filter_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
+    shared.filter_own_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
     memory[_HAND_WALL_DEPTH] += work_along(memory[_DIRECTION_INTO_WALL], steady)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):

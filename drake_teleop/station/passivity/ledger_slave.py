@@ -44,9 +44,9 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-_indices = range(fields.METHOD_VALUES.start, fields.METHOD_VALUES.stop)
-PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _indices[:3]
-NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _indices[-1], fields.SENDER_ENERGY
+_method_value_indices = range(fields.METHOD_VALUES.start, fields.METHOD_VALUES.stop)
+PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _method_value_indices[:3]
+NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _method_value_indices[-1], fields.SENDER_ENERGY
 
 # Parameters, in the master's power units.
 _layout = slots.own_parameters()
@@ -78,11 +78,11 @@ _RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() 
 
 
 @njit(cache=True)
-def filter_velocity(twist, share, memory):
-    """Low-pass filter the velocity in `memory`; `share` is the weight of the new `twist`."""
+def filter_own_velocity(twist, new_weight, memory):
+    """Low-pass filter `FILTERED_OWN_VELOCITY` in `memory`; `new_weight` is that of `twist`."""
     velocity = memory[FILTERED_OWN_VELOCITY]
     for i in range(6):
-        velocity[i] += share * (twist[i] - velocity[i])
+        velocity[i] += new_weight * (twist[i] - velocity[i])
 
 
 @njit(cache=True)
@@ -137,7 +137,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
     trip = (memory[slots.STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip, 0.0)
-    filter_velocity(twist, min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0), memory)
+    filter_own_velocity(twist, min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0), memory)
     contact, load = memory[_CONTACT_WRENCH], memory[slots.LOAD_WRENCH]
     filtered = memory[_FILTERED_LOAD_WRENCH]
     for i in range(6):

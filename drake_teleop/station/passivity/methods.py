@@ -306,7 +306,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 def record_command(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
-    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state; `ledger`
-    may change it. Other arguments: see `slave_step`.
+    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state, which
+    `ledger` may change. Other arguments: see `slave_step`.
     """
     _call_record(steps[2], requested, command, pose, twist, p, memory)

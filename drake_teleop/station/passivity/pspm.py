@@ -54,11 +54,11 @@ def initialize(p, memory):
 
 
 @njit(cache=True)
-def _modulate_set_position_of_group(received, g, stiffness, dx, before, sends, p, memory, packet):
+def _modulate_set_position(received, g, stiffness, dx, square_before, is_master, p, memory, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
     damped = -dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
-    damped -= 0.5 * stiffness * (stored - before)
+    damped -= 0.5 * stiffness * (stored - square_before)
     ledger = memory[slots.STORED_ENERGY]
     energy = ledger[g] + damped
     energy += fields.count_newly_received_energy(g, received, memory)
@@ -68,7 +68,7 @@ def _modulate_set_position_of_group(received, g, stiffness, dx, before, sends, p
         offset[i] = share * requested[i]
     energy -= 0.5 * stiffness * (dot_of_group(offset, offset, g) - stored)
     surplus = max(energy - p[_MAX_STORED_ENERGY][g], 0.0)
-    if sends:
+    if is_master:
         memory[slots.SENT_ENERGY][g] += surplus
     else:
         memory[slots.DISSIPATED_ENERGY][g] += surplus
@@ -88,7 +88,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         fields.limit_group(wrench, g, limits[g])
         for i in range(3 * g, 3 * g + 3):
             requested[i] = wrench[i] / K[g]
-        _modulate_set_position_of_group(received, g, K[g], dx, before, True, p, memory, packet)
+        _modulate_set_position(received, g, K[g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         fields.limit_group(wrench, g, limits[g])
@@ -107,7 +107,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         pose_difference_into(received[fields.POSE], pose, requested)
         copy_into(memory, slots.COMMAND_TWIST.start, received, fields.VELOCITY.start, 6)
     for g in range(2):
-        _modulate_set_position_of_group(received, g, K[g], dx, before[g], False, p, memory, packet)
+        _modulate_set_position(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
     fields.move_pose_into(pose, offset, now)

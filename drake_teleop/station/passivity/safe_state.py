@@ -134,8 +134,8 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
 def fade_retreat_wrench(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow.
 
-    It falls to 0 for hand speeds along it from `FORCE_FADE_HAND_SPEED` to twice this, but not below
-    `SLAVE_MASS` times the hand's deceleration. `memory` stores it.
+    Force and torque fall to 0 for hand speeds along them from `FORCE_FADE_HAND_SPEED` to twice
+    this, but not below `SLAVE_MASS` times the hand's deceleration. `memory` stores the new wrench.
     """
     velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):

@@ -21,8 +21,8 @@ from drake_teleop.station.passivity.packet import dot_of_group, length_of_group,
 _KEPT_HAND_ENERGY_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
 _WRENCH_ONSET_FILTER_S = 0.1
-_ENDED_WRENCH_SHARE_OF_FILTERED = 0.1  # a wrench below this share of the filtered one ends
-_WRENCH_ONSET_COMPLETE_SHARE = 0.98  # share at which a quick onset is complete
+_MAX_ENDED_OVER_FILTERED_WRENCH = 0.1  # a wrench below this share of the filtered one ends
+_MIN_COMPLETE_ONSET_SHARE = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
 # [m/s, rad/s], for translation and rotation.
 _STIFFNESS_AVERAGING_TRAVEL_M_RAD = (1e-3, 1e-2)
@@ -60,11 +60,11 @@ class TdpaConfig:
         "time in which a reduced wrench returns to its full value (force-jump filter)",
     )  # fmt: skip
     drain_rate: float = quantity(
-        200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"
+        200.0, "1/s", 0.0, 1e6, "share of the stored energy that the wrench may use in a second"
     )
     drift_rate: float = quantity(
         20.0, "1/s", 0.0, 1e3,
-        "rate of the correction of a withheld command, within the available energy",
+        "rate of the return to the received command, within the available energy",
     )  # fmt: skip
     speed: list[float] = quantity(
         [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
@@ -187,10 +187,10 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
         onset_rate = min(T / _WRENCH_ONSET_FILTER_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
-        if size < _ENDED_WRENCH_SHARE_OF_FILTERED * filtered_size:
+        if size < _MAX_ENDED_OVER_FILTERED_WRENCH * filtered_size:
             rate = max(rate, onset_rate)
         else:
-            if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
+            if filtered_size * (1.0 + gain) < _MIN_COMPLETE_ONSET_SHARE * size:
                 onset = onset_rate
                 memory[_QUICK_ONSET_PACKET_NUMBER][g] = memory[slots.STEP_COUNT]
             awaited = received[_NEWEST_MASTER_PACKET_NUMBER] < memory[_QUICK_ONSET_PACKET_NUMBER][g]

@@ -57,7 +57,7 @@ class ForceScalingConfig:
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
     eta: float | None = quantity(
-        None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
+        None, "1", 0.0, 1.0, "Eq. (14): kept share of the object; needs sigma = 0 and gamma = 1"
     )
     gripper_phi: list[float] | None = quantity(
         *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
@@ -186,14 +186,14 @@ def _scaled_contact_and_fault_into(
 
 @njit(cache=True)
 def _rendered_wrench_into(
-    sample, estimate, gripper, scale_ramp, time, arm, R_WB, sample_limits, contact_factor, out
+    sample, estimate, gripper, scale_ramp, time, arm, R_WB, sample_limits, gamma_factor, out
 ):
     if find_sample_fault(sample, estimate, time, sample_limits) != _NO_FAULT:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
     blend_scales_at(scale_ramp, time, scales)
-    scales[2] *= contact_factor
+    scales[2] *= gamma_factor
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
     forward_kinematics(arm, sample[_JOINT_ANGLE_SLICE], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)

@@ -16,7 +16,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import quaternion_at, quaternion_product, scale_vector, vector_at
 from drake_teleop.station.slave.arm import ArmModel, pose_into
 
-_MIN_HALF_TURN_COSINE = 0.26  # rotation of 150 degrees: a scaled one jumps at 180 degrees
+_MIN_COS_OF_HALF_ROTATION = 0.26  # rotation of 150 degrees: a scaled one jumps at 180 degrees
 
 
 @settings
@@ -132,7 +132,7 @@ class KinematicScaling(DoubleOnlySystem, LeafSystem):
         pose = self._pose.Eval(context)
         if not np.isfinite(pose).all():  # the reference must be finite
             return
-        far = engage and abs(pose[:4] @ references[7:11]) < _MIN_HALF_TURN_COSINE
+        far = engage and abs(pose[:4] @ references[7:11]) < _MIN_COS_OF_HALF_ROTATION
         if engage == (references[14] > 0.5) and not (far and self._scaling[2] % 1.0):
             return
         _pose_command_into(pose, references, *self._scaling, references[:7])

@@ -53,7 +53,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     initialize_sensor_chain,
 )
 
-_FUNCTION_NAME = "AddWristSensor"
+_ERROR_LOCATION = "AddWristSensor"
 _DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
 # Output ports of a plant that the sensor reads, with the type of their elements.
 _PLANT_PORT_TYPES = {"body_poses": RigidTransform, "body_spatial_velocities": SpatialVelocity}
@@ -92,7 +92,7 @@ def AddWristSensor(
     """
     _check_finalized_in_builder(builder, plant)
     config = WristSensorConfig(ideal=True) if config is None else config
-    expect_type(WristSensorConfig, config, f"{_FUNCTION_NAME}: config", "take one of PRESETS")
+    expect_type(WristSensorConfig, config, f"{_ERROR_LOCATION}: config", "take one of PRESETS")
     sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
@@ -149,7 +149,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         step = plant.time_step() or None
         self._step_s, self._steps_per_sample = _event_period_and_sample_steps(step, period)
         self._pairs_steps = step is not None and plant.has_sampled_output_ports()
-        config.check(_FUNCTION_NAME, 1 / self.period)
+        config.check(_ERROR_LOCATION, 1 / self.period)
 
         which = [] if model_instance is None else [model_instance]
         n = self._n = plant.num_positions(*which)
@@ -174,7 +174,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
             self.DeclareDiscreteState(start)
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._take_sample_if_due)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._store_rotation_omega_and_joints)
+            self.DeclareInitializationDiscreteUpdateEvent(self._store_rotation_omega_joints)
         first, places = 0, np.delete(np.arange(len(sample)), [16, 17, 18])
         for name, size in {**regressor.signal_sizes_of_sample(n), "sample_time": 1}.items():
             place = places[first : first + size]
@@ -193,27 +193,27 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
 
         self.DeclareVectorOutputPort(name, len(indices), calc_part_of_sample, {self.xd_ticket()})
 
-    def _rotation_omega_and_joints(self, context: Context) -> Array:
+    def _read_rotation_omega_joints(self, context: Context) -> Array:
         _, body, _ = self._weld
         R_WB = self._poses.Eval(context)[body].rotation().matrix()
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _store_rotation_omega_and_joints(
+    def _store_rotation_omega_joints(
         self, context: Context, discrete_state: DiscreteValues
     ) -> None:
-        discrete_state.set_value(_POSTURE_GROUP_INDEX, self._rotation_omega_and_joints(context))
+        discrete_state.set_value(_POSTURE_GROUP_INDEX, self._read_rotation_omega_joints(context))
 
     def _take_sample_if_due(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
         configuration = discrete_state.value(_POSTURE_GROUP_INDEX).copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._store_rotation_omega_and_joints(context, discrete_state)
+            self._store_rotation_omega_joints(context, discrete_state)
         if step % self._steps_per_sample != 0:
             return
         if not self._pairs_steps:
-            configuration = self._rotation_omega_and_joints(context)
+            configuration = self._read_rotation_omega_joints(context)
         reaction, body, geometry = self._weld
         acceleration = self._accelerations.Eval(context)[body].get_coeffs()
         force = self._reactions.Eval(context)[reaction].get_coeffs()
@@ -248,39 +248,39 @@ def _true_sensor_values_into(geometry, configuration, acceleration, reaction, tr
 
 
 def _check_finalized_in_builder(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
-    expect_type(MultibodyPlant, plant, f"{_FUNCTION_NAME}: plant")
+    expect_type(MultibodyPlant, plant, f"{_ERROR_LOCATION}: plant")
     if not plant.is_finalized():
         what = f"plant '{plant.get_name()}' is not finalized"
-        raise DrakeTeleopError(what, where=_FUNCTION_NAME, remedy="call plant.Finalize() first")
+        raise DrakeTeleopError(what, where=_ERROR_LOCATION, remedy="call plant.Finalize() first")
     if plant not in builder.GetSystems():
         what = f"plant '{plant.get_name()}' is not in this builder"
         remedy = "add it by builder.AddSystem(plant) first"
-        raise DrakeTeleopError(what, where=_FUNCTION_NAME, remedy=remedy)
+        raise DrakeTeleopError(what, where=_ERROR_LOCATION, remedy=remedy)
 
 
 def _event_period_and_sample_steps(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
         what = f"a sampling period of {period} s is not positive and finite"
         remedy = "give the time between samples [s]"
-        raise DrakeTeleopError(what, where=f"{_FUNCTION_NAME}: period", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: period", remedy=remedy)
     if step is None:
         return period or _DEFAULT_SAMPLING_PERIOD_S, 1
     count = (period or step) / step
     if count < 1 - _STEP_RATIO_TOLERANCE or abs(count - round(count)) > _STEP_RATIO_TOLERANCE:
         what = f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s"
         remedy = f"choose a multiple, such as {max(1, round(count)) * step:g} s"
-        raise DrakeTeleopError(what, where=f"{_FUNCTION_NAME}: period", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: period", remedy=remedy)
     return step, round(count)
 
 
 def _sensor_frame_and_weld(
     plant: MultibodyPlant, joint_or_frame: Joint | Frame
 ) -> tuple[Frame, WeldJoint]:
-    expect_type((Joint, Frame), joint_or_frame, f"{_FUNCTION_NAME}: joint_or_frame")
+    expect_type((Joint, Frame), joint_or_frame, f"{_ERROR_LOCATION}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         what = f"joint or frame '{joint_or_frame.name()}' belongs to another plant"
         remedy = "pass a joint or frame of this plant"
-        raise DrakeTeleopError(what, where=f"{_FUNCTION_NAME}: joint_or_frame", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
     welds = [joint for joint in _joints_of_plant(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
@@ -291,12 +291,12 @@ def _sensor_frame_and_weld(
             found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
             what = f"the body '{S.body().name()}' of frame '{S.name()}' has {found}"
             remedy = "pass the WeldJoint between arm and tool"
-            raise DrakeTeleopError(what, where=f"{_FUNCTION_NAME}: joint_or_frame", remedy=remedy)
+            raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
         return S, beyond[0]
     if not isinstance(joint_or_frame, WeldJoint):
         what = f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld"
         remedy = "weld the tool to the arm and pass this WeldJoint"
-        raise DrakeTeleopError(what, where=f"{_FUNCTION_NAME}: joint_or_frame", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
     parent = joint_or_frame.frame_on_parent()
     arm, _ = _arm_body_and_load(plant, joint_or_frame)
     on_parent = parent.body().index() == arm
@@ -331,7 +331,7 @@ def _weld_properties(
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         what = f"the tool beyond joint '{joint.name()}' has no mass"
         remedy = "give a body of the tool a SpatialInertia"
-        raise DrakeTeleopError(what, where=f"{_FUNCTION_NAME}: joint_or_frame", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
     on_parent = joint.parent_body().index() == arm
     X_BS, X_BJc = S.GetFixedPoseInBodyFrame(), joint.frame_on_child().GetFixedPoseInBodyFrame()
     if on_parent:

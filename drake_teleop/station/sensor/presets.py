@@ -29,7 +29,7 @@ _RANGES_AND_NOISE = {
     "ur5e_built_in": (50.0, 50.0, 10.0, 10.0, 1.2, 0.07, 1e-4),
     "franka_estimated": (100.0, 100.0, 20.0, 20.0, 0.035, 5e-3, 1e-5),
 }
-_OTHER_PRESET_FIELDS: dict[str, dict[str, Any]] = {
+_EXTRA_FIELDS_OF_PRESET: dict[str, dict[str, Any]] = {
     "bota_sensone": dict(acceleration_latency=0.0, p_SoAo_S=[0.0, 0.0, 0.018]),
     "bota_rokubi": dict(acceleration_latency=0.0, p_SoAo_S=[0.0, 0.0, 0.015]),
     "robotiq_ft300": dict(bandwidth_hz=40.0, force_latency=5e-3),
@@ -60,7 +60,7 @@ _presets = {
             **_ATI_IMU_SETTINGS
             | {"force_range": [side, side, along], "torque_range": [bending, bending, twist]}
             | {"force_noise": force, "torque_noise": torque, "resolution": step}
-            | _OTHER_PRESET_FIELDS.get(name, {})
+            | _EXTRA_FIELDS_OF_PRESET.get(name, {})
         )
         for name, (side, along, bending, twist, force, torque, step) in _RANGES_AND_NOISE.items()
     },

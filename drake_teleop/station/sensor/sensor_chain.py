@@ -80,7 +80,7 @@ class WristSensorConfig:
     ideal: bool = plain(False, "true values at the sampling instant, at So in S, without errors")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
-    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest cross-talk in ranges per full range")
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "full-range cross-talk as share of own range")
     misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the real wrench axes")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
     acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
@@ -183,14 +183,14 @@ class WristSensorConfig:
             remedy = "give nine numbers row by row; its columns are the axes of A in S"
             raise DrakeTeleopError(what, where=f"{where}.R_SA", remedy=remedy)
         if not self.ideal and self.low_pass != "none":
-            place, otherwise = f"{where}.bandwidth_hz", ", or set low_pass: none"
-            check_bandwidth(self.bandwidth_hz, rate_hz, place, otherwise)
+            place, alternative = f"{where}.bandwidth_hz", ", or set low_pass: none"
+            check_bandwidth(self.bandwidth_hz, rate_hz, place, alternative)
 
 
-def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, otherwise: str = "") -> None:
+def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, alternative: str = "") -> None:
     if bandwidth_hz >= 0.45 * rate_hz:
         what = f"a bandwidth of {bandwidth_hz:g} Hz is too near to half of the sensor's rate"
-        remedy = f"lower the bandwidth below 0.45 of the sensor's rate{otherwise}"
+        remedy = f"lower the bandwidth below 0.45 of the sensor's rate{alternative}"
         raise DrakeTeleopError(f"{what} ({rate_hz:g} Hz)", where=where, remedy=remedy)
 
 

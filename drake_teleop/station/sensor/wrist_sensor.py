@@ -63,7 +63,7 @@ _EQUAL_TIME_TOLERANCE_PERIODS, _MAX_QUEUED_PLANT_STEPS = 1e-6, 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
-#: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
+#: Value of `contact_W` in `take_due_samples` that selects the compiled contact law.
 _EMPTY_WRENCH_FOR_COMPILED_CONTACT = np.zeros(0)
 
 
@@ -120,7 +120,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 @njit(cache=True)
 def append_step_to_queue(queue, time, state, surroundings):
-    """Append time and state of a step's end to the queue, `tail` of `take_due_samples`."""
+    """Append time and state of a step's end to `queue`, which is `tail` in `take_due_samples`."""
     width = state.shape[0] + 1 + surroundings.shape[0]
     entry = queue[2 + int(queue[1]) * width :][:width]
     entry[0] = time
@@ -145,26 +145,25 @@ def _extrapolate_torque_into(torque_and_rate, elapsed_s, torque):
 
 @njit(cache=True, omits_reference_counting=True)
 def take_due_samples(
-    physics, sensor, period, time, state, surroundings, held, applied_W, noise, memory, until_now,
-    touching_W, scratch, result,
+    physics, sensor, period, time, state, surroundings, torques, applied_W, noise, memory,
+    include_now, contact_W, scratch, result,
 ):  # fmt: skip
     """Take the samples that are due in the integration steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
             damping, gravity; joint table of other moving bodies; wrenches from Drake).
-        sensor: (argument `sensor` of `measure_sample_into`, start of the estimator's memory and of
-            `tail`).
+        sensor: (`sensor` of `measure_sample_into`, starts of estimator's memory and of `tail`).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         surroundings: [deflection and rate of the sheet, plant's state if other bodies move] now.
-        held: motor torque (n,) now [N m], and its rate (n,) in these steps, or (0,) if constant.
+        torques: motor torque (n,) now [N m], and its rate (n,) in these steps, or (0,) if constant.
         applied_W: (6,) additional wrench on the tool.
         memory: [last two samples (16 + n each) | sensor chain | motion estimator | `tail`:
             number of samples, number of queued steps, time and state of each queued step's end].
-        until_now: True to include a sample at `time`.
-        touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
-            calculate it with `physics`.
+        include_now: True to include a sample at `time`.
+        contact_W: (6,) contact wrench on the tool about Wo, in W; (0,): calculate by `physics`.
+        scratch: (9, m) work array, overwritten.
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
@@ -182,13 +181,13 @@ def take_due_samples(
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_plant_state_into(state, surroundings, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
-    _extrapolate_torque_into(held, 0.0, tau)
-    if touching_W.shape[0] > 0:
+    _extrapolate_torque_into(torques, 0.0, tau)
+    if contact_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], surroundings[:2], surroundings[2:]
         environment_wrench_about_Wo_into(
             physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
         )
-        now_wrench_W += touching_W
+        now_wrench_W += contact_W
         plant_rates_under_wrench_into(physics, now, tau, applied_W, now_wrench_W, now_dot)
     else:
         contact_and_plant_rates_into(physics, now, tau, applied_W, now_wrench_W, now_dot)
@@ -200,10 +199,10 @@ def take_due_samples(
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
         if (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period >= until:
             continue
-        _extrapolate_torque_into(held, start[0] - time, tau)
+        _extrapolate_torque_into(torques, start[0] - time, tau)
         contact_and_plant_rates_into(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
-            _extrapolate_torque_into(held, until - time, tau)
+            _extrapolate_torque_into(torques, until - time, tau)
             contact_and_plant_rates_into(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
         while (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period < until:
@@ -212,7 +211,7 @@ def take_due_samples(
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
                 interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
-            _extrapolate_torque_into(held, count * period - time, tau)
+            _extrapolate_torque_into(torques, count * period - time, tau)
             contact_and_plant_rates_into(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
@@ -220,7 +219,7 @@ def take_due_samples(
     taken = (count - 1.0 + _EQUAL_TIME_TOLERANCE_PERIODS) * period > time
     copy_into(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
-    if until_now and (count - _EQUAL_TIME_TOLERANCE_PERIODS) * period < time:
+    if include_now and (count - _EQUAL_TIME_TOLERANCE_PERIODS) * period < time:
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
@@ -386,21 +385,22 @@ class WristSensor(LeafSystem):
     def _calc_samples_until_now(self, context: Context, output: BasicVector) -> None:
         self._take_due_samples_into(context, True, output.get_mutable_value())
 
-    def _take_due_samples_into(self, context: Context, until_now: bool, result: Array) -> None:
+    def _take_due_samples_into(self, context: Context, include_now: bool, result: Array) -> None:
         seen = self._states_of_arm_and_environment(context)
-        near, touching_W = self._classify_tool_proximity(*seen), _EMPTY_WRENCH_FOR_COMPILED_CONTACT
-        if until_now and near == PROXIMITY_FAR:
-            touching_W = self._zero_wrench
-        elif until_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
-            touching_W = self._plant_contact_wrench_W(context)
+        near, contact_W = self._classify_tool_proximity(*seen), _EMPTY_WRENCH_FOR_COMPILED_CONTACT
+        if include_now and near == PROXIMITY_FAR:
+            contact_W = self._zero_wrench
+        elif include_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
+            contact_W = self._plant_contact_wrench_W(context)
         rate = self._no_rate if self._rate is None else self._rate.Eval(context)
-        held, applied = (self._torque.Eval(context), rate), self._evaluate_applied_wrench(context)
+        torques = self._torque.Eval(context), rate
+        applied = self._evaluate_applied_wrench(context)
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
         memory = context.get_discrete_state_vector().value()
         constants = self._physics, self._sensor, self._period
-        inputs = (*constants, context.get_time(), *seen, held, applied, noise, memory)
+        inputs = (*constants, context.get_time(), *seen, torques, applied, noise, memory)
         if near != PROXIMITY_NEAR_MONITORED:
-            take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
+            take_due_samples(*inputs, include_now, contact_W, self._scratch, result)
             return
         own = 2 * self._n + 2
         size = own + len(self._around) - 2
@@ -410,7 +410,7 @@ class WristSensor(LeafSystem):
         # The state of each requested wrench depends on the previous wrenches.
         for k in range(self._max_copy_wrenches):
             table[0, :2] = k, 0.0
-            take_due_samples(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
+            take_due_samples(physics, *inputs[1:], include_now, contact_W, self._scratch, result)
             if table[0, 1] <= k:
                 return
             state = table[0, 2:]
