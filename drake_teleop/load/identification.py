@@ -114,7 +114,7 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def with_unidentified_load(self) -> Identification:
-        """Return the result with all ten parameters of the load marked as not identified."""
+        """Return the result with all ten load parameters marked as not identified."""
         return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PART_OF_THETA)
 
     def with_nothing_identified(self) -> Identification:

@@ -28,7 +28,7 @@ _MIN_TOLERANCE, _MAX_TOLERANCE = 1e-9, 10.0
 
 
 class Tolerance(NamedTuple):
-    """Largest permitted standard deviations of a load; None for no requirement.
+    """Largest permitted errors of a load; None for no requirement.
 
     Attributes:
         mass: relative to the mass.
@@ -111,14 +111,14 @@ def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
 
 
 def display_values_of_required_entries(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the values (k,) of the required entries of load phi [kg, mm, kg m^2]."""
+    """Return the values (k,) of required entries of load phi [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
 def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the absolute tolerances (k,) of the required entries of load phi [kg, mm, kg m^2]."""
+    """Return the absolute tolerances (k,) of required entries for load phi [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": _bounded_mean_principal_moment(m, c, inertia)}
     names = tolerance.required_quantity_names

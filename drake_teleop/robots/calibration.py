@@ -211,7 +211,7 @@ def calibrate(
 ) -> list[RecordEvaluation]:
     """Record a stream until the tolerance is met or it ends; return evaluations.
 
-    The record lasts at most `seconds`; a live stream may stall for the longer of this and 10 s.
+    Record at most `seconds`; end if a live stream stalls for max(`seconds`, 10 s).
     """
     results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S

@@ -114,7 +114,7 @@ def run_compensate_command(
         sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        attach: called with a function that makes the compensator of a load; returns the one in use.
+        attach: receives the function that makes compensators; returns the one in use.
         options: those of `Compensator.set_scales` and `open_source`.
     """
     found = Identification.load(load)

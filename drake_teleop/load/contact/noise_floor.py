@@ -127,7 +127,7 @@ def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, fac
     """Write the variances (6,) of a sample's contact wrench into `out`.
 
     `peaks` (2,) are the held |acceleration|^2 and |alpha|^2, which are updated; `V` (6, 10) is
-    scratch memory; others: `NoiseFloor.compiled_parameters` n^2, P, [k^2 l^2], fade.
+    scratch memory; others: `NoiseFloor.compiled_parameters`.
     """
     peaks[0] = max(dot(acceleration, acceleration), fade * peaks[0])
     peaks[1] = max(dot(alpha, alpha), fade * peaks[1])
