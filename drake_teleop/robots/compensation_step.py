@@ -46,11 +46,11 @@ def low_pass_into(x, low_pass, memory):
 
 @njit(cache=True)
 def contact_and_scaled_wrench_into(
-    values, gravity, offsets, phi, no_load, scales, low_pass, memory, tare_rows, row, out
+    values, gravity, offsets, phi, no_load, scales, low_pass, memory, rest, at, out
 ):
     """Write contact wrench and scaled wrench of a valid reading `values` (15,) to out (12,).
 
-    Row `row` of `tare_rows` (n, 21) receives the reading and its unfiltered contact wrench.
+    Row `at` of `rest` (n, 21), for a tare, receives the reading and its unfiltered contact wrench.
     `gravity` (3,) matters if weight and inertia differ in scale. `no_load` (10,) is 0,
     `memory` (2, 12) the filter's state; `set_scale_factors_into` sets `scales`.
     """
@@ -61,8 +61,8 @@ def contact_and_scaled_wrench_into(
     scaled_wrench_into(wrench, offsets, s, omega, alpha, no_load, phi, a, b, c, scaled)
     if scales[3] != 0.0:
         add_excess_weight_into(gravity, no_load, phi, 0.0, scales[3], scaled)
-    tare_rows[row, :15] = values
-    tare_rows[row, 15:] = contact
+    rest[at, :15] = values
+    rest[at, 15:] = contact
     if len(low_pass) > 0:
         low_pass_into(out, low_pass, memory)
 
