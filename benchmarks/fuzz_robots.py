@@ -17,7 +17,7 @@ from drake_teleop.robots.assembly import ReadingAssembler, WrenchAndMotionStream
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
 from drake_teleop.robots.ros2 import MESSAGE_TYPE_OF_TOPIC
-from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
+from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, ros2_type_store
 from drake_teleop.robots.rtde import readings_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import (
@@ -61,7 +61,7 @@ def messages(_: Path) -> list[bytes]:
 
 
 def _message(name: str, k: int) -> bytes:
-    store = message_types()
+    store = ros2_type_store()
     kinds = {kind.split("/")[-1]: made for kind, made in store.types.items()}
     ns = round(1e9 * (1.7e9 + DT * k))
     header = kinds["Header"](kinds["Time"](ns // 10**9, ns % 10**9), "base")

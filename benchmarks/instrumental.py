@@ -27,12 +27,12 @@ from drake_teleop.load.online.recursive_tls import (
     discount_samples_and_recentre_prior,
     eliminate_rows,
     nonzero_regressor_terms,
-    residual_products,
     solve_augmented_system_in_place,
-    weighted_gram,
-    weighted_right_side,
     write_inverse_6x6,
     write_products_vector,
+    write_residual_products,
+    write_weighted_gram,
+    write_weighted_right_side,
 )
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
@@ -60,15 +60,15 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
     """
     E, g, L, LZ, inverse, S, W = space
     measured, mixed, instruments = memory[:19], memory[19:38], memory[38:57]
-    residual_products(measured, theta, index, factors, L, LZ, S)
+    write_residual_products(measured, theta, index, factors, L, LZ, S)
     for c in range(6):
         S[c, c] += _NOISE_SAMPLES * noise_std[c] ** 2 + _ROUNDING_SQUARE * measured[13 + c, 13 + c]
         for d in range(6):
             S[c, d] /= measured[0, 0] + _NOISE_SAMPLES
     write_inverse_6x6(S, inverse, W)
-    weighted_gram(instruments, W, index, factors, E, MRg, 0)
-    weighted_gram(mixed, W, index, factors, E, MRg, 16)
-    weighted_right_side(mixed[:, 13:].T, W, index, factors, g)
+    write_weighted_gram(instruments, W, index, factors, E, MRg, 0)
+    write_weighted_gram(mixed, W, index, factors, E, MRg, 16)
+    write_weighted_right_side(mixed[:, 13:].T, W, index, factors, g)
     for i in range(16):
         MRg[i, 32] = g[i]
         MRg[i, i] += _RIDGE * MRg[i, i] + information[i]

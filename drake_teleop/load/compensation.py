@@ -139,7 +139,7 @@ def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return sigma_gripper 0, sigma_object eta (share of the object) and gamma 1, Eq. (14)."""
+    """Return sigma_gripper = 0, sigma_object = eta (remaining share) and gamma = 1, Eq. (14)."""
     if not 0.0 <= to_float("eta", eta) <= 1.0:
         what = f"{eta:g} is outside 0 to 1"
         raise DrakeTeleopError(what, where="eta", remedy="give the object's remaining share")

@@ -114,7 +114,7 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def with_unidentified_load(self) -> Identification:
-        """Return the result with all ten parameters of the load marked as not identified."""
+        """Return the result with all ten load parameters marked as not identified."""
         return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PART_OF_THETA)
 
     def with_nothing_identified(self) -> Identification:
@@ -157,7 +157,7 @@ class Identification:
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
-        """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
+        """Read identification.json; raise DrakeTeleopError, which names an invalid field."""
         expect_type((str, Path), path, "load")
         document = _read_identification_document(path)
         known = (*cls.__dataclass_fields__, *_DERIVED_FILE_FIELDS, "verdicts")
@@ -203,7 +203,7 @@ def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool
 
 
 def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
-    """Return the covariance (n, n) with variance inf, and no correlation, of flagged parameters."""
+    """Return the covariance (n, n) with variance inf and no correlation for flagged parameters."""
     out = np.where(undetermined[:, None] | undetermined, 0.0, covariance)
     out[undetermined, undetermined] = np.inf
     return out

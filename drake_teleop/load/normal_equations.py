@@ -167,7 +167,7 @@ class SecondMoments:
         return self._covariance_and_dof(*self._minimum_norm_solution()[:2])[0]
 
     def _covariance_and_dof(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
-        variances, degrees, _ = self._long_run_variances(theta, inverse)
+        variances, degrees, _ = self._variances_dof_and_slow_noise(theta, inverse)
         # Contribution of each channel to the covariance, and Satterthwaite's degrees of freedom.
         parts = self._gram_matrix_of_each_channel() * (self._weights**2 * variances)[:, None, None]
         parts = inverse @ parts @ inverse
@@ -204,23 +204,23 @@ class SecondMoments:
         They are n times the variances of means of n samples, for large n.
         """
         inverse = self._minimum_norm_solution()[1]
-        return self._long_run_variances(finite_array("theta", theta, 16), inverse)[:2]
+        return self._variances_dof_and_slow_noise(finite_array("theta", theta, 16), inverse)[:2]
 
     def has_slow_noise(self) -> NDArray[np.bool_]:
         """Return (6,) True for wrench channels with drift, or noise as slow as the record."""
-        return self._long_run_variances(*self._minimum_norm_solution()[:2])[2]
+        return self._variances_dof_and_slow_noise(*self._minimum_norm_solution()[:2])[2]
 
-    def _long_run_variances(
+    def _variances_dof_and_slow_noise(
         self, theta: Array, inverse: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         grams = self._gram_matrix_of_each_channel()
         n = float(self.num_samples)
         square_sums = self.residual_square_sums(theta)
         if self._resolution is not None:
-            absorbed = self._degrees_of_freedom_of_fit(grams, inverse)
-            rest_variances = self._residual_variances_of_poses_at_rest(square_sums, absorbed, theta)
+            fit_dof = self._degrees_of_freedom_of_fit(grams, inverse)
+            rest_variances = self._residual_variances_of_poses_at_rest(square_sums, fit_dof, theta)
             return *rest_variances, np.zeros(6, dtype=bool)
-        variances, degrees, sample_absorbed = self._unbiased_residual_variances(
+        variances, degrees, sample_fit_dof = self._unbiased_residual_variances(
             square_sums, n, grams, grams, inverse
         )
         of_samples = variances
@@ -235,7 +235,7 @@ class SecondMoments:
             rows = _regressor_sums_of_blocks(blocks)
             square_sums = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
-            estimated, counted, absorbed = self._unbiased_residual_variances(
+            estimated, counted, fit_dof = self._unbiased_residual_variances(
                 square_sums, len(blocks), between, grams, inverse
             )
             usable = ~found & (counted >= _MIN_DOF_OF_VARIANCE)
@@ -248,7 +248,7 @@ class SecondMoments:
             variances = np.where(take, corrected, variances)
             degrees = np.where(take, counted, degrees)
             found |= enough
-            has_motion = absorbed >= _MIN_FIT_DOF_SHARE_IN_BLOCKS * sample_absorbed
+            has_motion = fit_dof >= _MIN_FIT_DOF_SHARE_IN_BLOCKS * sample_fit_dof
             is_longest = has_motion & (counted >= _MIN_DOF_OF_LONGEST_BLOCKS)
             longest = np.where(is_longest, estimated, longest)
             longest_degrees = np.where(is_longest, counted, longest_degrees)
@@ -263,10 +263,10 @@ class SecondMoments:
         return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_OVER_WRENCH**2 * wrench)
 
     def _residual_variances_of_poses_at_rest(
-        self, square_sums: Array, absorbed: Array, theta: Array
+        self, square_sums: Array, fit_dof: Array, theta: Array
     ) -> tuple[Array, Array]:
         assert self._resolution is not None
-        squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (square_sums, absorbed))
+        squares, fit_dof_sums = (x.reshape(2, 3).sum(axis=1) for x in (square_sums, fit_dof))
         min_variance = np.array(self._resolution) ** 2 / 12.0
         blocks = self._blocks[: self._state[0] + 1]
         count = blocks[:, 0]
@@ -275,7 +275,7 @@ class SecondMoments:
         groups = (np.unique(first)[:, None] == first).astype(float)
         sums = groups @ (blocks[:, _WRENCH_COLUMNS] - _regressor_sums_of_blocks(blocks) @ theta)
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
-        left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.num_samples - len(groups))
+        left, repeats = 3.0 * len(groups) - fit_dof_sums, 3.0 * (self.num_samples - len(groups))
         within = np.maximum(squares - between, repeats * min_variance) / max(repeats, 1.0)
         testable = (left > 0.0) & (within > 0.0)
         f_ratio = np.divide(between, left * within, out=np.zeros(2), where=testable)
@@ -292,15 +292,15 @@ class SecondMoments:
         self, square_sums: Array, count: float, block_grams: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array, Array]:
         w = self._weights
-        absorbed = self._degrees_of_freedom_of_fit(block_grams, inverse)
+        fit_dof = self._degrees_of_freedom_of_fit(block_grams, inverse)
         shares = np.einsum("cij,kji->ck", block_grams, inverse @ grams @ inverse) * w**2
-        degrees = np.maximum(count - absorbed, 0.0)
-        equations = np.diag(count - 2.0 * absorbed) + shares
+        degrees = np.maximum(count - fit_dof, 0.0)
+        equations = np.diag(count - 2.0 * fit_dof) + shares
         if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
-            return square_sums / np.maximum(degrees, 1.0), degrees, absorbed
+            return square_sums / np.maximum(degrees, 1.0), degrees, fit_dof
         solution = np.linalg.solve(equations, square_sums)
         # Errors of the other channels can make a small solution negative.
-        return np.maximum(solution, square_sums / count), degrees, absorbed
+        return np.maximum(solution, square_sums / count), degrees, fit_dof
 
 
 def identify(
@@ -379,7 +379,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T, r = F - [E, V] theta, from Z = mean z z^T (module: z)."""
+    """Return the mean (6, 6) of r r^T, r = F - [E, V] theta, from Z, the mean of z z^T."""
     L = -np.einsum("cjk,j->ck", regressor_coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T

@@ -51,16 +51,16 @@ class Address:
 
     def wrench_name(self) -> str:
         """Return the parameter `wrench`: "contact" (default) or "scaled"."""
-        return self._known_word("wrench", ("contact", "scaled"), "give contact or scaled")
+        return self._chosen_value("wrench", ("contact", "scaled"), "give contact or scaled")
 
     def wrench_sign(self) -> float:
         """Return the factor, -1 (default) or 1, from the reported wrench to that of Eq. (1)."""
-        words = "-1", "1", "+1", " 1"  # parse_qsl decodes + as a space
-        return -1.0 if self._known_word("sign", words, "give 1 or -1") == "-1" else 1.0
+        choices = "-1", "1", "+1", " 1"  # parse_qsl decodes + as a space
+        return -1.0 if self._chosen_value("sign", choices, "give 1 or -1") == "-1" else 1.0
 
-    def _known_word(self, name: str, words: tuple[str, ...], remedy: str) -> str:
-        text = self._parameters.get(name, words[0])
-        if text not in words:
+    def _chosen_value(self, name: str, choices: tuple[str, ...], remedy: str) -> str:
+        text = self._parameters.get(name, choices[0])
+        if text not in choices:
             what = f"{name}={text!r} is unknown"
             raise DrakeTeleopError(what, where=self.text, remedy=remedy)
         return text

@@ -39,7 +39,7 @@ from drake_teleop.robots.streams import (
     ReadingFlag,
     Source,
 )
-from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, white_wrench_noise
+from drake_teleop.robots.watch import RELATIVE_LOAD_WRENCH_ERROR, white_wrench_noise
 
 DELAY_FORGETTING_TIME_S = 10.0
 """Time constant of the exponential weights of past samples [s]."""
@@ -113,7 +113,7 @@ class DelayTracker:
         starting = self._samples < _MIN_DELAY_SAMPLES
         limit = _MAX_INLIER_RESIDUAL_SIGMAS * self._noise + self._delay_error * np.abs(slope)
         drift, offsets = starting * MAX_SENSOR_OFFSET_DRIFT, self._offsets
-        limit += LOAD_WRENCH_ERROR_FRACTION * np.abs(self._wrenches[0]) + drift
+        limit += RELATIVE_LOAD_WRENCH_ERROR * np.abs(self._wrenches[0]) + drift
         if not starting:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
         return bool((np.abs(residual - offsets) < limit).all())
@@ -157,7 +157,7 @@ class ArmKinematics(Protocol):
 
 
 class WrenchAndMotionStreams(Source):
-    """Source of wrenches and motions, from one or two sources; errors name `where`.
+    """Source of wrenches and motions, from one or two sources; `where` is its name in errors.
 
     The kinematics `arm` convert joint positions to poses of the sensor frame S.
     """
@@ -248,7 +248,7 @@ class MotionWindow:
             self.reset()
 
     def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
-        """Add a sample; return new times [s], motions [s, omega, alpha, gravity (of poses)]."""
+        """Add a sample; return new times [s], motions [s, omega, alpha; gravity if from poses]."""
         row = self._motion_row_if_valid(sample)
         if row is None:
             return []
@@ -355,6 +355,7 @@ class ReadingAssembler(Source):
 
     @property
     def lag_s(self) -> float:
+        """Delay [s] of readings behind their wrenches: half the smoothing window plus `delay_s`."""
         return max(0.0, self._window.half_window_s + self.delay_s)
 
     def read(self, timeout_s: float) -> list[Reading] | None:

@@ -56,7 +56,7 @@ class RecordEvaluation:
     """Intermediate result of a calibration, for the k parameters with a tolerance.
 
     Attributes:
-        identified_log: the identification; None if it failed for the reason `failure`.
+        identified_log: load and findings of the record; None if this failed for reason `failure`.
         relative_half_widths: (k,) of the 95 % intervals, divided by the tolerances.
         is_within_tolerance: (k,) True if the `TOLERANCE_CONFIDENCE` interval is within the
             tolerance, without `doubts`.
@@ -118,7 +118,7 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: tolerances.Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return 95 % and `TOLERANCE_CONFIDENCE` half widths over tolerances, degrees of freedom."""
+    """Return half widths (95 %, `TOLERANCE_CONFIDENCE`) over tolerances, and degrees of freedom."""
     load = found.identification
     errors = tolerances.derivatives_over_tolerances(tolerance, load.phi)
     deviations = tolerances.deviations_over_tolerances(errors, load.covariance)
@@ -211,7 +211,7 @@ def calibrate(
 ) -> list[RecordEvaluation]:
     """Record a stream until the tolerance is met or it ends; return evaluations.
 
-    Record and silence last at most `seconds`; silence may last 10 s.
+    Record at most `seconds`; end if a live stream stalls for max(`seconds`, 10 s).
     """
     results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S
@@ -222,13 +222,13 @@ def calibrate(
         previous = results[-1] if results else None
         return evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay)
 
-    def store_evaluation_and_get_is_done(result: RecordEvaluation) -> bool:
+    def store_evaluation_and_test_end(result: RecordEvaluation) -> bool:
         results.append(result)
         show(result)
         return bool(result.is_known.all())
 
     def write_record() -> None:
-        if recorder.longest_part_s:
+        if recorder.longest_record_s:
             move_earlier_recordings(*earlier)
             earlier.clear()
         recorder.write(path)
@@ -242,25 +242,25 @@ def calibrate(
                     break
                 for reading in readings:
                     recorder.add(reading)
-                    if pending is None and recorder.longest_part_s >= next_length_s:
-                        next_length_s = RECORD_GROWTH_FACTOR * recorder.longest_part_s
+                    if pending is None and recorder.longest_record_s >= next_length_s:
+                        next_length_s = RECORD_GROWTH_FACTOR * recorder.longest_record_s
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):
-                        done, pending = store_evaluation_and_get_is_done(pending.result()), None
-                    done = done or recorder.longest_part_s >= seconds
+                        done, pending = store_evaluation_and_test_end(pending.result()), None
+                    done = done or recorder.longest_record_s >= seconds
                     if done:
                         break
-                if recorder.longest_part_s > grown_s:
-                    grown_s, grown_at = recorder.longest_part_s, time.monotonic()
+                if recorder.longest_record_s > grown_s:
+                    grown_s, grown_at = recorder.longest_record_s, time.monotonic()
                 done = done or (source.live and time.monotonic() - grown_at > max_silence_s)
     except Exception:  # raised again: the record is kept whatever ended the loop
-        if recorder.longest_part_s:
+        if recorder.longest_record_s:
             write_record()
         raise
     if pending is not None:
-        store_evaluation_and_get_is_done(pending.result())
+        store_evaluation_and_test_end(pending.result())
     if not results or not results[-1].is_known.all():
         write_record()
-        store_evaluation_and_get_is_done(evaluate())
+        store_evaluation_and_test_end(evaluate())
     return results

@@ -108,7 +108,7 @@ def _find_changes_in_subprocess(rows: Array, dt: float) -> list[TimedChangeText]
 
 
 def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
-    """Return zero and load changes in `rows` (N, 16): time [s], values of `Reading`."""
+    """Return the changes of zero and load in `rows` (N, 16) of time [s] and `Reading.values`."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
     if len(t) * dt < _MIN_TESTED_RECORD_S:

@@ -20,7 +20,7 @@ from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
-from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SCALE_NAMES, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -64,7 +64,7 @@ def compensate_stream(
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
 
-    def write(out: CompensatedWrench) -> None:
+    def write_and_count(out: CompensatedWrench) -> None:
         sink.write(out)
         counts["wrenches"] += 1
         for name in flag_names(out.flags) if out.flags else ():
@@ -81,10 +81,10 @@ def compensate_stream(
                 break
             stale = compensator.stale_output(time.monotonic()) if source.live else None
             if stale and not readings:
-                write(stale)
+                write_and_count(stale)
             for reading in readings:
                 out = compensator.step(reading, time.monotonic() if source.live else reading.t)
-                write(out)
+                write_and_count(out)
                 if changes is not None:
                     changes.add_reading(reading, out.flags)
                 if compensator.good_readings_in_row >= tare_count:
@@ -116,10 +116,11 @@ def run_compensate_command(
         sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
+        attach: receives the function that makes compensators; returns the one in use.
         options: those of `Compensator.set_scales` and `open_source`.
     """
     found = Identification.load(load)
-    scales = {name: options.pop(name) for name in SIGMA_GAMMA_NAMES if name in options}
+    scales = {name: options.pop(name) for name in SCALE_NAMES if name in options}
     limits = None if sensor_range is None else np.repeat(sensor_range, 3)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **options)
     input_files = [load, *readings.files]

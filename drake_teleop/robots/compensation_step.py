@@ -50,8 +50,8 @@ def contact_and_scaled_wrench_into(
 ):
     """Write contact wrench and scaled wrench of a valid reading `values` (15,) to out (12,).
 
-    Row `at` of `rest` (rows, 21), for a tare, receives the reading and its unfiltered contact
-    wrench. `gravity` (3,) matters if weight and inertia differ in scale. `no_load` (10,) is 0,
+    Row `at` of `rest` (n, 21), for a tare, receives the reading and its unfiltered contact wrench.
+    `gravity` (3,) matters if weight and inertia differ in scale. `no_load` (10,) is 0,
     `memory` (2, 12) the filter's state; `set_scale_factors_into` sets `scales`.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]

@@ -36,7 +36,7 @@ RELATIVE_RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
-SIGMA_GAMMA_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
+SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 """Arguments of `Compensator.set_scales`."""
 _MAX_FORCE_TORQUE_OFFSET_DRIFT = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
 MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_FORCE_TORQUE_OFFSET_DRIFT, 3)
@@ -87,7 +87,7 @@ class Compensator:
     """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
-        delay_readings: delay of outputs; the source has removed it from the motion [readings].
+        delay_readings: delay of outputs [readings]: that of the motion, which the source removed.
         predicted: extrapolate over `delay_readings` and the delay of the low-pass.
         sensor_range: (6,) range of the sensor [N, N m].
         scales: arguments of `set_scales`.

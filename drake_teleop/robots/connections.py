@@ -163,7 +163,7 @@ def _sensor_pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return assembly.IDENTITY_POSE if sensor_pose is None else assembly.pose_from_rpy(sensor_pose)
 
 
-def _make(module: str, class_name: str, *arguments: Any) -> Any:
+def _create(module: str, class_name: str, *arguments: Any) -> Any:
     return getattr(import_module(f"drake_teleop.robots.{module}"), class_name)(*arguments)
 
 
@@ -173,12 +173,12 @@ SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], Source]] = Regi
         "udp": lambda at, hz, joints: UdpSource(at, _period_s(hz, at)),
         "-": lambda at, hz, joints: JsonLineSource(sys.stdin.fileno(), _period_s(hz, at)),
         "posed": lambda at, hz, joints: UdpWrenchPoseSource(at, _period_s(hz, at)),
-        "rtde": lambda at, hz, joints: _make("rtde", "RtdeSource", at),
-        "netft": lambda at, hz, joints: _make("netft", "NetFtSource", at, hz and 1.0 / hz),
-        "zenoh": lambda at, hz, joints: _make(
+        "rtde": lambda at, hz, joints: _create("rtde", "RtdeSource", at),
+        "netft": lambda at, hz, joints: _create("netft", "NetFtSource", at, hz and 1.0 / hz),
+        "zenoh": lambda at, hz, joints: _create(
             "ros2_zenoh", "ZenohSource", at, _period_s(hz, at), joints
         ),
-        "ros2": lambda at, hz, joints: _make("ros2", "Ros2Source", at, _period_s(hz, at), joints),
+        "ros2": lambda at, hz, joints: _create("ros2", "Ros2Source", at, _period_s(hz, at), joints),
     },
 )
 """Sources by the scheme of their address, called with address, rate [Hz] or None, joint names."""
@@ -187,12 +187,12 @@ SINKS: Registry[Callable[[str], Sink]] = Registry(
     {
         "-": lambda address: JsonLineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": lambda address: _make("ros2_zenoh", "ZenohSink", address),
-        "ros2": lambda address: _make("ros2", "Ros2Sink", address),
-        "foxglove": lambda address: _make("foxglove", "FoxgloveSink", address),
+        "zenoh": lambda address: _create("ros2_zenoh", "ZenohSink", address),
+        "ros2": lambda address: _create("ros2", "Ros2Sink", address),
+        "foxglove": lambda address: _create("foxglove", "FoxgloveSink", address),
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
-        ".mcap": lambda address: _make("foxglove", "McapSink", Path(address)),
+        ".mcap": lambda address: _create("foxglove", "McapSink", Path(address)),
     },
 )
 """Sinks by the scheme or suffix of their address, called with the address."""

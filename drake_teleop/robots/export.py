@@ -121,20 +121,20 @@ def _export_warnings(found: Identification, to: str, format: Format) -> list[str
 
 
 def _make_template_renderer(name: str) -> Callable[[ExportedLoad], str]:
-    def numbers(values: Iterable[float], separator: str = ", ") -> str:
+    def join_numbers(values: Iterable[float], separator: str = ", ") -> str:
         return separator.join(repr(float(value) + 0.0) for value in values)
 
-    def yaml(values: Iterable[float]) -> str:
+    def join_yaml_numbers(values: Iterable[float]) -> str:
         return format_yaml_value([float(value) + 0.0 for value in values])[1:-1]
 
-    def write(load: ExportedLoad) -> str:
+    def render_load(load: ExportedLoad) -> str:
         names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         entries = dict(zip(names, load.inertia_entries, strict=True))
-        values = {**vars(load), "entries": entries, "numbers": numbers, "yaml": yaml}
-        values["weight"] = load.mass * STANDARD_GRAVITY_M_S2
+        values = {**vars(load), "numbers": join_numbers, "yaml": join_yaml_numbers}
+        values |= {"entries": entries, "weight": load.mass * STANDARD_GRAVITY_M_S2}
         return render_page("drake_teleop.robots", f"formats/{name}.j2", **values) + "\n"
 
-    return write
+    return render_load
 
 
 _RENAME_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"

@@ -128,7 +128,7 @@ def parse_counts_and_rate(content: bytes) -> list[float]:
     counts = [x / _SI_VALUE_OF_SENSOR_UNIT[u] for x, u in zip(per_unit, units, strict=True)]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
-        raise ValueError("counts and rate are not positive")
+        raise ValueError(f"counts and rate {values} are not between 0 and 1e12")
     return values
 
 
@@ -137,10 +137,7 @@ _MAX_SAMPLE_NUMBER_STEP_S = 1.0  # a larger step of the number is a restart
 
 
 class SampleClock:
-    """Clock that derives times from sample numbers.
-
-    Its period is `dt` [s] in the first second, then the measured one.
-    """
+    """Clock of sample numbers, whose period is `dt` [s] for one second, then the measured one."""
 
     def __init__(self, dt: float) -> None:
         self._dt = self._period = dt

@@ -73,15 +73,15 @@ class Recorder:
         self.log_file_name = "log.yaml" if tables else "log.parquet"
         self.file_names = self.log_file_name, *(f"{each}.parquet" for each in tables)
         self.left_out, self.clock_changes = 0, 0
-        self._part, self._other_clock = self._make_empty_record(), self._make_empty_record()
-        self._longest = self._part
+        self._record, self._other_clock = self._make_empty_record(), self._make_empty_record()
+        self._longest = self._record
 
     def _make_empty_record(self) -> dict[str, _SampleSeries]:
         return {stream: _SampleSeries() for stream in self._streams}
 
     def add(self, reading: Reading) -> None:
         stream, t, values = reading.stream, reading.t, reading.values
-        if stream not in self._part:
+        if stream not in self._record:
             return
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
         valid = finite and not reading.flags & _FLAGS_OF_REJECTED_READINGS
@@ -92,7 +92,7 @@ class Recorder:
         if not valid:
             self.left_out += 1
             return
-        samples, other = self._part[stream], self._other_clock[stream]
+        samples, other = self._record[stream], self._other_clock[stream]
         same_clock = not samples.is_clock_jump(t)
         if same_clock or other.is_clock_jump(t):
             self.left_out += len(other.t)
@@ -101,28 +101,28 @@ class Recorder:
         if len(other.t) == _NUM_SAMPLES_THAT_CONFIRM_NEW_CLOCK:
             self.clock_changes += 1
             self._longest = self._longest_record()
-            self._part, self._other_clock = self._other_clock, self._make_empty_record()
+            self._record, self._other_clock = self._other_clock, self._make_empty_record()
 
     def _longest_record(self) -> dict[str, _SampleSeries]:
-        return max(self._part, self._longest, key=_duration_of_shortest_stream_s)
+        return max(self._record, self._longest, key=_duration_of_shortest_stream_s)
 
     @property
-    def longest_part_s(self) -> float:
+    def longest_record_s(self) -> float:
         return _duration_of_shortest_stream_s(self._longest_record())
 
     def write(self, path: Path) -> None:
         import polars as pl
 
-        part = self._longest_record()
-        if WRENCH_AND_MOTION in part:
-            size, samples = streams.NUM_READING_VALUES, part[WRENCH_AND_MOTION]
+        record = self._longest_record()
+        if WRENCH_AND_MOTION in record:
+            size, samples = streams.NUM_READING_VALUES, record[WRENCH_AND_MOTION]
             t, values = samples.times_and_values(size, self.left_out)
             wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
             write_log(Log(t - t[0], wrench, s, omega, alpha), path)
             return
-        start = part[WRENCH].times_and_values(6, self.left_out)[0][0]
-        for stream, samples in part.items():
-            shift = samples.min_offset - part[WRENCH].min_offset if self._two_clocks else 0.0
+        start = record[WRENCH].times_and_values(6, self.left_out)[0][0]
+        for stream, samples in record.items():
+            shift = samples.min_offset - record[WRENCH].min_offset if self._two_clocks else 0.0
             names = list(chain(*_LOG_COLUMNS_OF_STREAM[stream].values()))
             t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + (shift - start)} | dict(zip(names, values.T, strict=True))
@@ -159,11 +159,11 @@ class _SampleSeries:
         self.min_offset = min(self.min_offset, reading.arrival - reading.t)
         return True
 
-    def times_and_values(self, num_columns: int, num_rejected_in_error: int) -> tuple[Array, Array]:
+    def times_and_values(self, num_columns: int, num_rejected: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
-            counts = f"{len(self.t)} valid and {num_rejected_in_error} invalid readings"
+            counts = f"{len(self.t)} valid and {num_rejected} invalid readings"
             what, remedy = f"{counts} received (minimum: 2 valid)", "check the source's address"
-            if num_rejected_in_error:
+            if num_rejected:
                 remedy = "check --range and the values that the source sends"
             raise DrakeTeleopError(what, where="calibrate", remedy=remedy)
         return np.array(self.t), np.array(self._values).reshape(-1, num_columns)

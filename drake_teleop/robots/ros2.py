@@ -94,7 +94,7 @@ class MessageConverter:
         self._links: dict[str, tuple[str, Array]] = {}
 
     def readings_of_message(self, name: str, data: Any, number: int) -> list[Reading]:
-        """Return the readings of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
+        """Return the readings of a deserialized message; `name`: key of `MESSAGE_TYPE_OF_TOPIC`."""
         if name == "tf":
             samples = self._stamped_poses_of_transforms(data)
         else:

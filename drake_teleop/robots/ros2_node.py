@@ -16,7 +16,7 @@ from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCES_TEXT
 from drake_teleop.robots.compensate import run_compensate_command
-from drake_teleop.robots.compensator import SIGMA_GAMMA_NAMES, Compensator
+from drake_teleop.robots.compensator import SCALE_NAMES, Compensator
 from drake_teleop.robots.ros2 import (
     SOURCE_PARAMETERS,
     domain_of_address,
@@ -51,7 +51,7 @@ class ServedCompensator:
         self._current = make(Identification.load(load))
         self._pool = ThreadPoolExecutor(1)
         self._process: subprocess.Popen[str] | None = None
-        for name in SIGMA_GAMMA_NAMES:
+        for name in SCALE_NAMES:
             node.declare_parameter(name, float(scales[name]))
         node.declare_parameter("load", str(load))
         node.declare_parameter("until", DEFAULT_TOLERANCES_TEXT)
@@ -80,7 +80,7 @@ class ServedCompensator:
         return self._node.get_parameter(name).value
 
     def _apply_scale_parameters(self, compensator: Compensator, **changes: float) -> None:
-        values = {name: self._parameter_value(name) for name in SIGMA_GAMMA_NAMES} | changes
+        values = {name: self._parameter_value(name) for name in SCALE_NAMES} | changes
         sigma, gamma, *others = values.values()
         weight, inertia = (None if value < 0.0 else value for value in others)
         compensator.set_scales(sigma, gamma, weight, inertia)
@@ -88,9 +88,9 @@ class ServedCompensator:
     def _check_and_apply_scale_parameters(self, parameters: list[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
-        scales = [each for each in parameters if each.name in SIGMA_GAMMA_NAMES]
+        scales = [each for each in parameters if each.name in SCALE_NAMES]
         for each in scales:
-            lowest = -math.inf if each.name in SIGMA_GAMMA_NAMES[2:] else 0.0
+            lowest = -math.inf if each.name in SCALE_NAMES[2:] else 0.0
             if not (math.isfinite(each.value) and each.value >= lowest):
                 reason = f"{each.name}: {each.value} is outside {lowest:g} to inf"
                 return SetParametersResult(successful=False, reason=reason)
@@ -162,7 +162,7 @@ def run_ros2_command(
             what = "is not an address of a ROS topic"
             raise DrakeTeleopError(what, where=address, remedy="give ros2://TOPIC")
     node = shared_node(domain_of_address(parse_ros2_address(source, SOURCE_PARAMETERS)))
-    scales = {k: -1.0 if options.get(k) is None else options[k] for k in SIGMA_GAMMA_NAMES}
+    scales = {k: -1.0 if options.get(k) is None else options[k] for k in SCALE_NAMES}
     served: list[ServedCompensator] = []
 
     def serve_compensator(make: Callable[[Identification], Compensator]) -> Any:

@@ -39,7 +39,7 @@ def require_libraries(where: str) -> None:
     require_library("rosbags", "rosbags", "ros", where)
 
 
-def message_types() -> Any:
+def ros2_type_store() -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -113,7 +113,7 @@ class CdrConverter(MessageConverter):
         from rosbags.serde.errors import SerdeError
 
         super().__init__(sign, frames, joints)
-        self._types, self._damaged = message_types(), SerdeError
+        self._types, self._damaged = ros2_type_store(), SerdeError
         self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
         for name in MESSAGE_TYPE_OF_TOPIC:  # creates the deserializers before the first message
             self.readings_of_cdr(name, b"", b"")
@@ -180,7 +180,7 @@ class ZenohSink:
         domain, topic = domain_of_address(parsed), checked_topic_name(parsed, parsed.path)
         self._which = parsed.wrench_name()
         require_libraries(address)
-        self._types = message_types()
+        self._types = ros2_type_store()
         self._frame = parsed.optional_parameter("frame") or ""
         type_hash = self._types.hash_rihs01(WRENCH_STAMPED)
         self._session = open_session(parsed)

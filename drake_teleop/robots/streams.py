@@ -18,7 +18,7 @@ NUM_READING_VALUES = 15
 
 
 class ReadingFlag(IntFlag):
-    """Flag of an output wrench, also in packets: reason why it is zero, or information."""
+    """Flag of a reading and its output wrench: reason why the wrench is zero, or information."""
 
     SATURATED = 1  #: reported by the sensor, or a channel at its range
     DAMAGED = 2  #: invalid packet
@@ -88,7 +88,7 @@ class Source(Protocol):
 
     Attributes:
         dt: period of the wrenches [s].
-        live: whether the readings arrive in real time; else as fast as they are read.
+        live: whether readings arrive in real time; False for a log without waiting times.
         streams: WRENCH_AND_MOTION, or streams of wrench and motion to combine.
         files: replayed files.
     """

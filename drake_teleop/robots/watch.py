@@ -22,7 +22,7 @@ from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import ReadingFlag
 
-LOAD_WRENCH_ERROR_FRACTION = 0.02
+RELATIVE_LOAD_WRENCH_ERROR = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
 MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
@@ -45,7 +45,7 @@ class ContactAndLoadMonitor:
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = white_wrench_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
-        errors = {"relative_wrench_error": LOAD_WRENCH_ERROR_FRACTION}
+        errors = {"relative_wrench_error": RELATIVE_LOAD_WRENCH_ERROR}
         errors["mass_std_ratio"] = _MASS_STD_RATIO_TO_NEVER_REPLACE_LOAD
         self._parameters = change_detector_parameters(noise, np.zeros(9), dt, **errors)
         self._phi = phi_with_inertia_replaced(load)[0]
@@ -78,10 +78,7 @@ _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
-    """Contact detector with the noise floor of the free-motion log `free`.
-
-    `ahead_s`: extrapolation of the contact wrenches [s]; `files`: those of the log.
-    """
+    """Contact detector for wrenches extrapolated by `ahead_s` [s]; `free`: log of free motion."""
 
     def __init__(
         self,

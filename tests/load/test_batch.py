@@ -245,8 +245,8 @@ def test_consistent_fit_is_the_constrained_total_fit():
         METHODS[m].fit(SampleRecord(F, s, omega, alpha), EstimatorOptions(noise))
         for m in ("total", "consistent")
     ]
-    gram, right, free = fits[0].form[:3]
-    found = fits[1].form.theta
+    gram, right, free = fits[0].solved[:3]
+    found = fits[1].solved.theta
     assert not is_physically_consistent(free[6:]) and is_physically_consistent(found[6:])
     truth = np.concatenate([OFFSETS, plate])
     for theta in (free, found, truth):

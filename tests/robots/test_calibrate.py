@@ -94,7 +94,7 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     path = tmp_path / "log.parquet"
     recorder = Recorder()
     looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, TOLERANCE)
-    assert recorder.longest_part_s < 8.0
+    assert recorder.longest_record_s < 8.0
     assert [at.is_within_tolerance.all() for at in looks[-3:]] == [False, True, True]
     assert [at.is_known.all() for at in looks[-3:]] == [False, False, True]
     last = looks[-1]
@@ -144,7 +144,7 @@ def test_record_is_not_longer_than_the_maximum(tmp_path: Path, seconds: float) -
         *(Stream(recorded(5.0, [0])), recorder, tmp_path / "log.parquet", TOLERANCE),
         seconds=seconds,
     )
-    assert recorder.longest_part_s == pytest.approx(seconds, abs=1.1 * DT)
+    assert recorder.longest_record_s == pytest.approx(seconds, abs=1.1 * DT)
 
 
 class UselessStream(Stream):
@@ -188,7 +188,7 @@ def test_short_calibration_waits_for_a_late_source(tmp_path: Path) -> None:
     recorder = Recorder()
     source = LateStream(recorded(1.0, [0]))
     calibrate(source, recorder, tmp_path / "log.parquet", TOLERANCE, seconds=0.2)
-    assert recorder.longest_part_s == pytest.approx(0.2, abs=1.1 * DT)
+    assert recorder.longest_record_s == pytest.approx(0.2, abs=1.1 * DT)
 
 
 @pytest.mark.parametrize("name", ["log.parquet", "../{}/log.parquet"])
@@ -329,11 +329,11 @@ def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: P
                     Reading(2, 2 * DT, rows[5]), Reading(3, 3 * DT, rows[7]),
                     Reading(2, 2 * DT, rows[6])):  # fmt: skip
         recorder.add(reading)
-    assert recorder.left_out == 4 and recorder.longest_part_s == pytest.approx(3 * DT)
+    assert recorder.left_out == 4 and recorder.longest_record_s == pytest.approx(3 * DT)
     for k in range(50):
-        assert recorder.clock_changes == 0 and recorder.longest_part_s == pytest.approx(3 * DT)
+        assert recorder.clock_changes == 0 and recorder.longest_record_s == pytest.approx(3 * DT)
         recorder.add(Reading(4 + k, 100.0 + DT * k, rows[8]))
-    assert recorder.clock_changes == 1 and recorder.longest_part_s == pytest.approx(49 * DT)
+    assert recorder.clock_changes == 1 and recorder.longest_record_s == pytest.approx(49 * DT)
     assert recorder.left_out == 4
 
 
@@ -352,7 +352,7 @@ def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
 def test_wrong_stamps_reject_only_their_own_readings(wrong: float, count: int) -> None:
     recorder = take(Recorder(), (10.0, 800), (wrong, count), (14.0, 200))
     assert (recorder.left_out, recorder.clock_changes) == (count, 0)
-    assert recorder.longest_part_s == pytest.approx(4.0 + 199 * DT)
+    assert recorder.longest_record_s == pytest.approx(4.0 + 199 * DT)
 
 
 @pytest.mark.parametrize(("first", "second"), [(800, 60), (60, 800)])
@@ -361,7 +361,7 @@ def test_longest_part_is_written_after_a_clock_change(
 ) -> None:
     recorder = take(Recorder(), (0.0, first), (1e6, 1), (500.0, second))
     assert (recorder.left_out, recorder.clock_changes) == (1, 1)
-    assert recorder.longest_part_s == pytest.approx(799 * DT)
+    assert recorder.longest_record_s == pytest.approx(799 * DT)
     recorder.write(tmp_path / recorder.log_file_name)
     assert len(pl.read_parquet(tmp_path / recorder.log_file_name)) == 800
 
@@ -372,7 +372,7 @@ def test_record_is_as_long_as_its_shortest_stream() -> None:
         recorder.add(Reading(k, DT * k, np.ones(6), stream=WRENCH))
         if k < 60:
             recorder.add(Reading(k, DT * k, np.eye(7)[0], stream=POSE))
-    assert recorder.longest_part_s == pytest.approx(59 * DT)
+    assert recorder.longest_record_s == pytest.approx(59 * DT)
 
 
 def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
@@ -381,11 +381,11 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
     for k in range(1000):
         recorder.add(Reading(k, 1e7 if k == 400 else DT * k, wrench, stream=WRENCH, arrival=DT * k))
         recorder.add(Reading(k, 1e4 + DT * k, pose, stream=POSE, arrival=DT * k))
-    assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
+    assert recorder.longest_record_s == pytest.approx(999 * DT) and recorder.left_out == 1
     for k in range(100):  # both clocks were set
         recorder.add(Reading(k, 70.0 + DT * k, wrench, stream=WRENCH, arrival=DT * k))
         recorder.add(Reading(k, 90.0 + DT * k, pose, stream=POSE, arrival=DT * k))
-    assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
+    assert recorder.longest_record_s == pytest.approx(999 * DT) and recorder.left_out == 1
     assert recorder.clock_changes <= 2
 
 

@@ -79,7 +79,7 @@ def _cone_program_of_thread(thread: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _distance_cone_coefficients(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return A, c: A [x; t] + c in the cone means t >= |R x - d|; R^T R = H, R^T d = b, scaled."""
+    """Return A, c: A [x; t] + c is in the Lorentz cone if t >= |R x - d|; R^T (R, d) ~ (H, b)."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale

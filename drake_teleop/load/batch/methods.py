@@ -35,7 +35,7 @@ from drake_teleop.load.normal_equations import (
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
 _MIN_NOISE_OVER_RMS = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_MIN_WRENCH_NOISE_VARIANCE_SHARE = 0.01
+_MIN_NOISE_OVER_RESIDUAL_VARIANCE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
@@ -58,7 +58,7 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
-        equations: second moments of the samples that are not rejected.
+        equations: `SecondMoments` of the samples that are not rejected.
     """
 
     identification: Identification
@@ -69,8 +69,8 @@ class BatchResult:
 
 
 def _fit_ordinary_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    form = total_least_squares(record.moments, NoiseStd(), np.ones(6), offsets=options.offsets)
-    return EstimatorFit(form, np.ones(6), record.moments, np.zeros(len(record.s), bool))
+    solved = total_least_squares(record.moments, NoiseStd(), np.ones(6), offsets=options.offsets)
+    return EstimatorFit(solved, np.ones(6), record.moments, np.zeros(len(record.s), bool))
 
 
 def _fit_whitened_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -96,19 +96,20 @@ def _fit_total_least_squares(
             if options.shared_noise:
                 squares = squares.reshape(2, 3).mean(axis=1).repeat(3)
                 explained = explained.reshape(2, 3).mean(axis=1).repeat(3)
-            variances = np.maximum(squares - explained, _MIN_WRENCH_NOISE_VARIANCE_SHARE * squares)
+            variances = np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL_VARIANCE * squares)
             std = np.sqrt(variances.clip(floor**2))
-    form = total_least_squares(moments, noise, std, offsets=options.offsets)
-    return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
+    solved = total_least_squares(moments, noise, std, offsets=options.offsets)
+    return EstimatorFit(solved, std, moments, np.zeros(len(record.s), bool))
 
 
 def _fit_consistent_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
     fit = _fit_robust_least_squares(record, options)
-    gram, right, theta = fit.form[:3]
+    gram, right, theta = fit.solved[:3]
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
         return fit
-    return replace(fit, form=fit.form._replace(theta=consistent_least_squares(gram, right, theta)))
+    solved = fit.solved._replace(theta=consistent_least_squares(gram, right, theta))
+    return replace(fit, solved=solved)
 
 
 def _fit_robust_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -117,18 +118,18 @@ def _fit_robust_least_squares(record: SampleRecord, options: EstimatorOptions) -
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
     # A subset of the samples is sufficient as a starting point.
-    form = _fit_huber_regression(record.with_row_step(max(1, n // _MAX_HUBER_SAMPLES)), options)
+    solved = _fit_huber_regression(record.with_row_step(max(1, n // _MAX_HUBER_SAMPLES)), options)
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
-        distances = _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
+        distances = _largest_residuals_over_robust_std(record, solved.theta, options.shared_noise)
         rejected = distances > _REJECTION_STDS
         moments = SecondMoments()
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
             return replace(whole, note=NOTHING_REJECTED_NOTE)
         fit = _fit_total_least_squares(record, options, moments)
-        form = fit.form
+        solved = fit.solved
         if (rejected == previous).all():
             break
     return replace(fit, rejected=rejected)
@@ -138,14 +139,14 @@ def _fit_huber_regression(record: SampleRecord, options: EstimatorOptions) -> So
     moments, weights = record.moments, np.ones(len(record.s))
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
-        form = _fit_total_least_squares(record, options, moments).form
-        distances = _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
+        solved = _fit_total_least_squares(record, options, moments).solved
+        distances = _largest_residuals_over_robust_std(record, solved.theta, options.shared_noise)
         weights = np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
             break
         moments = SecondMoments()
         moments.add_samples(*record.wrench_and_motion, weights=weights)
-    return form
+    return solved
 
 
 def _std_growth_by_rejection(whole: EstimatorFit, kept_moments: SecondMoments) -> float:
@@ -154,8 +155,9 @@ def _std_growth_by_rejection(whole: EstimatorFit, kept_moments: SecondMoments) -
     used = excited_columns(whole.moments.mean_products)
     variances = []
     for moments in (whole.moments, kept_moments):
-        gram = moments.num_samples * normal_equations(moments.mean_products, whole.form.weights)[0]
-        variances.append(np.sum(root_of_pseudo_inverse(gram, used) ** 2, axis=1)[used])
+        gram, _ = normal_equations(moments.mean_products, whole.solved.weights)
+        root = root_of_pseudo_inverse(moments.num_samples * gram, used)
+        variances.append(np.sum(root**2, axis=1)[used])
     return float(np.sqrt(np.max(variances[1] / variances[0])))
 
 
@@ -215,16 +217,16 @@ def identify_batch(
     options = EstimatorOptions(noise or NoiseStd(), offsets, shared_noise)
     fit = METHODS[method].fit(record, options)
     steps_at_rest = resolution if shared_noise else None
-    equations = SecondMoments(np.diag(fit.form.weights) ** -0.5, resolution=steps_at_rest)
+    equations = SecondMoments(np.diag(fit.solved.weights) ** -0.5, resolution=steps_at_rest)
     kept = ~fit.rejected
     equations.add_samples(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
-    theta, Z = fit.form.theta, fit.moments.mean_products
+    theta, Z = fit.solved.theta, fit.moments.mean_products
     walk = np.square(np.broadcast_to(options.noise.walk, 12))
     steps = residual_covariance(np.diag(np.pad(walk, (1, 6))), theta)
     covariance = uncertainty.covariance_for_white_noise(plain.covariance, equations, fit)
     covariance = covariance + uncertainty.covariance_for_random_walks(record, kept, fit, steps)
-    covariance = uncertainty.covariance_of_solution(covariance, fit.form, offsets)
+    covariance = uncertainty.covariance_of_solution(covariance, fit.solved, offsets)
     if gain_std > 0.0:
         known = np.isfinite(np.diag(covariance))
         gain_covariance = gain_std**2 * uncertainty.covariance_for_gain_errors(fit, offsets)

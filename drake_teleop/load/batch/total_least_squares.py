@@ -61,19 +61,19 @@ def total_least_squares(
         raise unidentifiable_mass_error("the wrench is 0 throughout")
     W: Array = np.diag(wrench_noise**-2.0)
     excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
-    previous, min_remaining = np.zeros(16), excess / (1.0 + excess)
+    previous, min_remaining_share = np.zeros(16), excess / (1.0 + excess)
     for _ in range(_MAX_REWEIGHTINGS):
-        form = _solve_noise_compensated_equations(Z, Q, W, offsets, min_remaining)
-        change = np.linalg.norm(form.theta - previous)
+        solved = _solve_noise_compensated_equations(Z, Q, W, offsets, min_remaining_share)
+        change = np.linalg.norm(solved.theta - previous)
         if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
             break
-        W = np.asarray(np.linalg.inv(residual_covariance(Q, form.theta)), np.float64)
-        previous = form.theta
-    return form
+        W = np.asarray(np.linalg.inv(residual_covariance(Q, solved.theta)), np.float64)
+        previous = solved.theta
+    return solved
 
 
 def _solve_noise_compensated_equations(
-    Z: Array, Q: Array, W: Array, offsets: bool, min_remaining: float
+    Z: Array, Q: Array, W: Array, offsets: bool, min_remaining_share: float
 ) -> SolvedNormalEquations:
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
@@ -81,13 +81,13 @@ def _solve_noise_compensated_equations(
         right[:6] = 0.0
     compensation, _ = normal_equations(Q, W)
     root = root_of_pseudo_inverse(gram, excited_columns(Z))
-    # In these coordinates G is the identity; nu is the noise share of each direction.
-    nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
+    # In these coordinates G is the identity; shares are the noise shares of the directions.
+    shares, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
     squares, noise = (float(np.sum(W * moments[1:7, 1:7])) for moments in (Z, Q))
-    scale = _min_singular_noise_scale(basis.T @ right, nu, squares, noise)
-    remaining = 1.0 - scale * nu
-    kept = remaining > (min_remaining if nu[-1] > 0.0 else 0.0)
+    scale = _min_singular_noise_scale(basis.T @ right, shares, squares, noise)
+    remaining = 1.0 - scale * shares
+    kept = remaining > (min_remaining_share if shares[-1] > 0.0 else 0.0)
     inverse = (basis[:, kept] / remaining[kept]) @ basis[:, kept].T
     theta = inverse @ right
     if not offsets:
@@ -105,13 +105,13 @@ def _solve_noise_compensated_equations(
     )
 
 
-def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: float) -> float:
+def _min_singular_noise_scale(right: Array, shares: Array, squares: float, noise: float) -> float:
     def schur_complement(scale: float) -> float:
-        return float(squares - scale * noise - np.sum(right**2 / (1.0 - scale * nu)))
+        return float(squares - scale * noise - np.sum(right**2 / (1.0 - scale * shares)))
 
     highest = squares / noise
-    if highest * nu[-1] >= 1.0:
-        highest = (1.0 - _MIN_POLE_DISTANCE) / nu[-1]
+    if highest * shares[-1] >= 1.0:
+        highest = (1.0 - _MIN_POLE_DISTANCE) / shares[-1]
     if schur_complement(0.0) <= 0.0:  # no residual
         return 0.0
     from scipy.optimize import brentq  # 0.2 s, which a study with known loads saves
@@ -152,8 +152,8 @@ class SampleRecord:
     def with_row_step(self, step: int) -> SampleRecord:
         return SampleRecord(*(table[::step] for table in self.wrench_and_motion))
 
-    def residual(self, theta: Array, part: slice) -> Array:
-        F, s, omega, alpha = (table[part] for table in self.wrench_and_motion)
+    def residual(self, theta: Array, rows: slice) -> Array:
+        F, s, omega, alpha = (table[rows] for table in self.wrench_and_motion)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 
 
@@ -161,7 +161,7 @@ class SampleRecord:
 class EstimatorFit:
     """Fit of an estimator: solution, wrench noise (6,) [N, N m], rejected samples (N,), note."""
 
-    form: SolvedNormalEquations
+    solved: SolvedNormalEquations
     wrench_noise: Array
     moments: SecondMoments
     rejected: NDArray[np.bool_]

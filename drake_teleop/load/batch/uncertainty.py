@@ -56,7 +56,7 @@ class ParameterCombination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading_index: index of the leading parameter in `PARAMETER_NAMES`.
-        relative_std: standard deviation over the norm of the coefficients times `natural_scales`.
+        relative_std: standard deviation / |coefficients * `natural_scales`|.
         text: the sum as a formula, such as "m c_x + 0.5 f_ox".
     """
 
@@ -78,7 +78,7 @@ class BaseParameters:
 
     Attributes:
         parameters_without_influence: names of parameters without influence on the wrench.
-        weak_directions: principal combinations of parameters that are determined, not identified.
+        weak_directions: principal combinations of unidentified parameters with finite variance.
         channels_with_slow_noise: names of wrench channels with drift or slow noise.
     """
 
@@ -175,13 +175,13 @@ def covariance_for_white_noise(
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] for noise correlated between channels.
 
-    The correlation is that of the inverse of `fit.form.weights`.
+    The correlation is that of the inverse of `fit.solved.weights`.
     """
-    W, Z = fit.form.weights, fit.moments.mean_products
+    W, Z = fit.solved.weights, fit.moments.mean_products
     if np.array_equal(W, np.diag(np.diag(W))):
         return least_squares_covariance
     predicted = np.linalg.inv(W)
-    scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
+    scale = np.sqrt(equations.long_run_variances(fit.solved.theta)[0] / np.diag(predicted))
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
     covariance = inverse @ (fit.moments.num_samples * normal_equations(Z, of_sums)[0]) @ inverse
@@ -190,7 +190,7 @@ def covariance_for_white_noise(
 
 def _inverse_gram(fit: EstimatorFit) -> Array:
     Z = fit.moments.mean_products
-    root = root_of_pseudo_inverse(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
+    root = root_of_pseudo_inverse(normal_equations(Z, fit.solved.weights)[0], excited_columns(Z))
     return np.asarray(root @ root.T / fit.moments.num_samples)
 
 
@@ -212,7 +212,7 @@ def covariance_for_random_walks(
         rows = np.zeros((len(used[part]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
         rows[:, :, 6:] = regressor(*(table[part] for table in backwards.wrench_and_motion[1:]))
-        rows = fit.form.weights @ (rows * used[part, None, None])
+        rows = fit.solved.weights @ (rows * used[part, None, None])
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
         sums -= rows
@@ -235,24 +235,24 @@ def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Arra
 
 def covariance_for_gain_errors(fit: EstimatorFit, offsets_estimated: bool) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] for gain errors of standard deviation 1."""
-    Z, W = fit.moments.mean_products, fit.form.weights
+    Z, W = fit.moments.mean_products, fit.solved.weights
     used = excited_columns(Z) & (offsets_estimated | (np.arange(16) >= 6))
     root = root_of_pseudo_inverse(normal_equations(Z, W)[0], used)
     products = (regressor_coefficients() @ Z)[None, :, :, 1:7]
     errors = parameter_errors_by_gains(products, W[None], root @ root.T)
-    effects = fit.form.map_from_ordinary @ errors
+    effects = fit.solved.map_from_ordinary @ errors
     return np.asarray(effects @ effects.T)
 
 
 def covariance_of_solution(
-    least_squares_covariance: Array, form: SolvedNormalEquations, offsets_estimated: bool
+    least_squares_covariance: Array, solved: SolvedNormalEquations, offsets_estimated: bool
 ) -> Array:
-    """Return the covariance (16, 16) of `form.theta` from that of ordinary least squares."""
+    """Return the covariance (16, 16) of `solved.theta` from that of ordinary least squares."""
     unknown = np.isinf(np.diag(least_squares_covariance))
     covariance = np.where(unknown[:, None] | unknown, 0.0, least_squares_covariance)
     if not offsets_estimated:
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
         covariance -= covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
-    covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
-    return identification.mark_undetermined(covariance, unknown | form.is_undetermined)
+    covariance = solved.map_from_ordinary @ covariance @ solved.map_from_ordinary.T
+    return identification.mark_undetermined(covariance, unknown | solved.is_undetermined)

@@ -1,7 +1,7 @@
 """Contact detection, sample by sample, in a wrench from which the load's wrench is removed.
 
-z is the wrench whitened to unit covariance, e the part of z that the last z does not predict, and
-w_n a factor from `NoiseFloor.sum_widths`::
+z is the wrench whitened to unit covariance, e (innovation) its part that the previous z does not
+predict, at unit variance, and w_n, n = 1, 2, 4 ... 128, a factor from `NoiseFloor.sum_widths`::
 
     level    |z|; its square is chi-squared with six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|) (Crosier, Technometrics 30, 1988)

@@ -69,8 +69,8 @@ class NoiseFloor:
         covariance: (16, 16) finite covariance P of [offsets; phi].
         per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
         correlation: (6, 6) correlation between channels.
-        rho: (6,) correlation of successive samples of the normalised wrench.
-        sum_widths: (8,) standard deviations of sums of n = 1, 2 ... 128 innovations over sqrt(n).
+        rho: (6,) correlation of successive samples of the whitened wrench.
+        sum_widths: (8,) scales of sums of n = 1, 2 ... 128 innovations over sqrt(n); 1 if white.
         fade: factor per sample on held maxima of |a|^2 and |alpha|^2; 0: no hold.
         free_maxima: (3,) largest value of each statistic in the fitted motion.
     """
@@ -111,8 +111,8 @@ class NoiseFloor:
     def compiled_parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
         """Arguments of compiled functions: n^2, P, [k^2 l^2], whitening, rho, widths, fade."""
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
-        variances, growth = self.noise**2, self.per_acceleration**2
-        return variances, self.covariance, growth, root, self.rho, self.sum_widths, self.fade
+        variances, factors = self.noise**2, self.per_acceleration**2
+        return variances, self.covariance, factors, root, self.rho, self.sum_widths, self.fade
 
     def noise_std_along(self, *motion: ArrayLike) -> Array:
         """Return sigma (N, 6) [N, N m] for a motion: s, omega, alpha, acceleration (N, 3)."""
@@ -123,7 +123,7 @@ class NoiseFloor:
 
 
 @njit(cache=True)
-def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
+def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, factors, fade, V, out):
     """Write the variances (6,) of a sample's contact wrench into `out`.
 
     `peaks` (2,) are the held |acceleration|^2 and |alpha|^2, which are updated; `V` (6, 10) is
@@ -141,14 +141,14 @@ def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, gro
             for j in range(10):
                 row += V[c, j] * P[6 + i, 6 + j]
             value += V[c, i] * row
-        moving = growth[c, 0] * peaks[0] + growth[c, 1] * peaks[1]
+        moving = factors[c, 0] * peaks[0] + factors[c, 1] * peaks[1]
         out[c] = variances[c] + max(value, 0.0) + moving
 
 
 @njit(cache=True)
-def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, out):
+def noise_std_into(s, omega, alpha, acceleration, variances, P, factors, fade, out):
     """Write sigma (N, 6) of N samples to `out`; arguments as for `noise_variances_into`."""
-    peaks, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, growth, fade)
+    peaks, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, factors, fade)
     for k in range(s.shape[0]):
         noise_variances_into(peaks, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])
         out[k] = np.sqrt(out[k])

@@ -5,7 +5,7 @@ Its states::
     known       the known load explains the mean wrench of blocks of samples
     disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
     changed     a new load explains it
-    identified  mass and first moments of the new load are identified
+    identified  mass and first moments of the new load are identified: it is now the known load
 """
 
 from __future__ import annotations
@@ -277,6 +277,7 @@ def change_detector_parameters(
     """Return block length [samples], noise (17,), window and hold [blocks], mass_std_ratio.
 
     `noise`: variances of wrench, motion and relative wrench error, duration of that error [blocks].
+    `window`: time until the filter restarts; `hold`: time until a new load is accepted.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of the long-run variances of `SecondMoments` [SI].
@@ -328,7 +329,7 @@ def initial_change_memory(
 
 @njit(cache=True)
 def current_change_state(memory):
-    """Return the index of the state in `STATE_NAMES`; "identified" is returned as "known"."""
+    """Return the index of the state in `STATE_NAMES`, with "known" instead of "identified"."""
     is_known = memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
     return STATE_KNOWN if is_known else int(memory[_STATE_INDEX])
 

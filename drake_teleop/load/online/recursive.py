@@ -90,7 +90,7 @@ class RecursiveEstimator(ABC):
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
         prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
-        settled_std: standard deviation that `is_settled` requires, relative to `natural_scales`.
+        settled_std: largest standard deviation for `is_settled`, relative to `natural_scales`.
     """
 
     #: Value of `Identification.method`.

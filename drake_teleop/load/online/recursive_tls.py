@@ -74,7 +74,7 @@ def discount_samples_and_recentre_prior(memory, theta, information, forgetting):
 
 
 @njit(cache=True)
-def residual_products(Z, theta, index, factors, L, LZ, S):
+def write_residual_products(Z, theta, index, factors, L, LZ, S):
     """Write L, LZ = L Z and S = L Z L^T (6, 6), where r = F - [E V] theta = L z is the residual."""
     L[:] = 0.0
     LZ[:] = 0.0
@@ -97,7 +97,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 
 @njit(cache=True)
-def noise_products(Z, noise_std, motion_std, Q):
+def write_noise_products(Z, noise_std, motion_std, Q):
     """Write to Q (19, 19) the part of Z, the sum of z z^T, that noise is expected to cause."""
     Q[:] = 0.0
     for c in range(6):
@@ -114,7 +114,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 
 @njit(cache=True)
-def weighted_gram(Z, W, index, factors, E, G, first):
+def write_weighted_gram(Z, W, index, factors, E, G, first):
     """Write the sum of [E V](y)^T W [E V](z) to G[:, first:]; Z (19, 19) is the sum of y z^T."""
     E[:] = 0.0
     for t in range(len(factors)):
@@ -135,7 +135,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 
 @njit(cache=True)
-def weighted_right_side(LZ, W, index, factors, g):
+def write_weighted_right_side(LZ, W, index, factors, g):
     """Write the sum of [E V](z)^T W F over samples to g (16,); LZ (6, 19) is the sum of F z^T."""
     g[:] = 0.0
     for t in range(len(factors)):
@@ -194,8 +194,9 @@ class MomentEstimator(RecursiveEstimator):
 
     def _residual_rms(self) -> Array:
         L, LZ, S = np.empty((6, 19)), np.empty((6, 19)), np.empty((6, 6))
-        residual_products(self._memory[:19], self._theta, *nonzero_regressor_terms(), L, LZ, S)
-        return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
+        Z, terms = self._memory[:19], nonzero_regressor_terms()
+        write_residual_products(Z, self._theta, *terms, L, LZ, S)
+        return np.sqrt(np.maximum(np.diag(S), 0.0) / Z[0, 0])
 
     def _limit_variances_to_prior(self, covariance: Array) -> Array:
         shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
@@ -203,12 +204,12 @@ class MomentEstimator(RecursiveEstimator):
 
 
 @njit(cache=True)
-def select_compensated_parameters(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise part N of G is subtractable, else to 0."""
-    taper[:] = 1.0
+def select_compensated_parameters(G, N, noise_scale, K, subtract):
+    """Set `subtract` (16,) to 1 for parameters whose noise part N can be removed from G, else 0."""
+    subtract[:] = 1.0
     for i in range(16):
         for j in range(16):
-            K[i, j] = G[i, j] - strength * N[i, j]
+            K[i, j] = G[i, j] - noise_scale * N[i, j]
     eliminate_rows(K)
     definite = True
     for i in range(16):
@@ -217,39 +218,39 @@ def select_compensated_parameters(G, N, strength, K, taper):
         return
     for i in range(16):
         for attempt in range(2):
-            taper[i] = 1.0 - attempt
+            subtract[i] = 1.0 - attempt
             for j in range(i):
-                total = G[i, j] - strength * taper[i] * taper[j] * N[i, j]
+                total = G[i, j] - noise_scale * subtract[i] * subtract[j] * N[i, j]
                 for k in range(j):
                     total -= K[i, k] * K[j, k]
                 K[i, j] = total / K[j, j]
-            total = G[i, i] - strength * taper[i] * N[i, i]
+            total = G[i, i] - noise_scale * subtract[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
             if total > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]:
                 break
         if not total > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]:
-            taper[:] = 0.0
+            subtract[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
 
 
 @njit(cache=True)
-def write_rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
+def write_rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, scratch, Q, G, N):
     """Write [G g] to G and G's noise part to N; return the ratio of observed to stated noise."""
-    E, g, L, LZ, inverse, S, W = space
-    noise_products(Z, noise_std, motion_std, Q)
-    residual_products(Q, theta, index, factors, L, LZ, S)
+    E, g, L, LZ, inverse, S, W = scratch
+    write_noise_products(Z, noise_std, motion_std, Q)
+    write_residual_products(Q, theta, index, factors, L, LZ, S)
     S /= Z[0, 0]
     write_inverse_6x6(S, inverse, W)
-    residual_products(Z, theta, index, factors, L, LZ, S)
+    write_residual_products(Z, theta, index, factors, L, LZ, S)
     scale = 0.0
     for c in range(6):
         for d in range(6):
             scale += W[c, d] * S[c, d]
-    weighted_gram(Z, W, index, factors, E, G, 0)
-    weighted_gram(Q, W, index, factors, E, N, 0)
-    weighted_right_side(Z[:, 13:].T, W, index, factors, g)
+    write_weighted_gram(Z, W, index, factors, E, G, 0)
+    write_weighted_gram(Q, W, index, factors, E, N, 0)
+    write_weighted_right_side(Z[:, 13:].T, W, index, factors, g)
     G[:, 16] = g
     return max(0.0, scale) / (6.0 * Z[0, 0])
 
@@ -263,7 +264,7 @@ def rtls_update(
     `noise_std` (6,) is of the wrench, `motion_std` (9,) of [s, omega, alpha]; `information` (16,)
     contains inverse variances of the prior.
     """
-    space, Q, z, taper = allocate_scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
+    scratch, Q, z, subtract = allocate_scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
     Z, options = memory[:19], (noise_std, motion_std, index, factors)
     for n in range(len(samples)):
@@ -271,16 +272,16 @@ def rtls_update(
             discount_samples_and_recentre_prior(memory, theta, information, forgetting)
         write_products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION], z)
         add_outer_product(z, z, Z)
-        scale = write_rtls_normal_equations(Z, theta, *options, space, Q, G, N)
+        scale = write_rtls_normal_equations(Z, theta, *options, scratch, Q, G, N)
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
         gain = 1.0 - _MIN_COMPENSATED_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
-            select_compensated_parameters(G, N, scale / gain, K, taper)
+            select_compensated_parameters(G, N, scale / gain, K, subtract)
             for i in range(6, 16):
                 for j in range(6, 16):
-                    G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
+                    G[i, 16] += scale * subtract[i] * subtract[j] * N[i, j] * theta[j]
         solve_augmented_system_in_place(G)
         theta[:] = G[:, 16]
 
@@ -325,8 +326,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
-        noise, space = (self._noise_std, self._motion_std), allocate_scratch()
-        options = *noise, *nonzero_regressor_terms(), space, Q
+        noise, scratch = (self._noise_std, self._motion_std), allocate_scratch()
+        options = *noise, *nonzero_regressor_terms(), scratch, Q
         scale = write_rtls_normal_equations(memory[:19], theta, *options, G, N)
         return G[:, :16], N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
 

@@ -35,7 +35,7 @@ from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 """Options of a C compiler for results that are bit-equal to those of Python."""
-_TEST_VECTOR_SIGMA_AND_GAMMA = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
+_TEST_VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
 _FMU_MODEL_NAME = "wrench_compensator"
@@ -116,14 +116,14 @@ def render_template(name: str, **values: Any) -> str:
 def _render_test_vector_header(target: ExportedCompensation) -> str:
     inputs, sensor_range = _simulated_readings_and_sensor_range(target)
     target = target._replace(sensor_range=sensor_range)
-    python = target.make_compensator(**_TEST_VECTOR_SIGMA_AND_GAMMA)
+    python = target.make_compensator(**_TEST_VECTOR_SCALES)
     outputs = [
         python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
         "test_vector.h",
-        settings=target.settings_initializer(**_TEST_VECTOR_SIGMA_AND_GAMMA),
+        settings=target.settings_initializer(**_TEST_VECTOR_SCALES),
         inputs=[_c_literal(row) for row in inputs],
         outputs=[_c_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
         flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
