@@ -120,7 +120,7 @@ AIMS: dict[str, Callable[[Figures], float]] = {
 def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
     """Return the figures of a run."""
     charged = round(CHARGED / PERIOD_S)
-    later = (run.accounts[:, AT_HAND] + run.accounts[:, AT_SLAVE])[charged:]
+    later = (run.input_energies[:, AT_HAND] + run.input_energies[:, AT_SLAVE])[charged:]
     found = Figures(
         actual=run.least_energy_sum(AT_SLAVE),
         motor=run.least_energy_sum(AT_MOTOR),

@@ -38,7 +38,7 @@ _UP = (0.0, 0.0, 1.0)
 _GAP, _DEPTH = 0.03, 0.03  # m, distance from tip to leaf; depth of the press
 _RATIOS = (
     ("hand_force", "hand_velocity"),
-    ("felt_force", "hand_velocity"),
+    ("displayed_force", "hand_velocity"),
     ("tool_velocity", "hand_velocity"),
 )
 
@@ -90,7 +90,7 @@ def predict_frequency_response(
         # Unit force in place of the intent, plus the operator's reaction.
         "hand_force": 1 + along("operator_wrench", task.hand),
         "hand_velocity": along("twist_master", task.hand),
-        "felt_force": delay_factor * along("wrench_B", task.hand),
+        "displayed_force": delay_factor * along("wrench_B", task.hand),
         "tool_velocity": along("twist_slave", task.tool),
     }
     return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
@@ -133,7 +133,7 @@ def _compared(
     if not reach:
         figures[f"{name}: apparent mass, kg"] = response.apparent_mass()
     for output, input_ in _RATIOS:
-        if output == "felt_force" and not reach and not scenario.force_scaling.sigma:
+        if output == "displayed_force" and not reach and not scenario.force_scaling.sigma:
             continue  # without load there is no force
         ratio = response.response(output, input_) / predicted.response(output, input_)
         label = f"{name}: {output} / {input_}"

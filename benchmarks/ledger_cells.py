@@ -301,8 +301,8 @@ def measured(result: SimulationResult, scenario: Scenario, times: Times) -> dict
     held = (t >= times.judged) & (t < times.judged + HELD)
     pressed = contact[held].mean(axis=0)
     error = float(np.linalg.norm(rendered[held].mean(axis=0) - pressed))
-    accounts = station_energies(result, scenario)
-    energy = accounts[:, AT_HAND] + accounts[:, AT_SLAVE] + start_energy(scenario)
+    energies = station_energies(result, scenario)
+    energy = energies[:, AT_HAND] + energies[:, AT_SLAVE] + start_energy(scenario)
     if scaling.sigma > 0.0:
         energy += work_of_displayed_load_wrench(result, scenario)
     at = int(np.searchsorted(t, times.let_go))

@@ -141,11 +141,11 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     result = simulate(station, scenario.simulation, progress=False)
     spent = time.thread_time() - began
     found = measures_of_press(result, scenario, task)
-    accounts = station_energies(result, scenario)
-    accounts[:, AT_HAND] += start_energy(scenario)
+    energies = station_energies(result, scenario)
+    energies[:, AT_HAND] += start_energy(scenario)
     if sigma > 0.0:
-        accounts[:, AT_HAND] += work_of_displayed_load_wrench(result, scenario)
-    inside, at_motors = (accounts[:, AT_HAND] + accounts[:, k] for k in (AT_SLAVE, AT_MOTOR))
+        energies[:, AT_HAND] += work_of_displayed_load_wrench(result, scenario)
+    inside, at_motors = (energies[:, AT_HAND] + energies[:, k] for k in (AT_SLAVE, AT_MOTOR))
     scale = scenario.force_scaling.force_scale
     rubbed = scale * friction_work(result, scenario)
     held = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)

@@ -36,7 +36,7 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
-    is_share_accepted,
+    is_force_share_accepted,
     make_operating_range,
     settings_from_values,
     without_task_and_method,
@@ -105,10 +105,10 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
     def failing_share_in_axis(points: list[dict[str, Any]], gamma: float) -> float:
         tried = dataclasses.replace(settings, gamma=gamma)
         shares = [
-            search.share_in_one_axis(axis, tried, p["hand"], p["wall"], 100 + k)
+            search.displayed_force_share(axis, tried, p["hand"], p["wall"], 100 + k)
             for k, p in enumerate(points)
         ]
-        return float(np.mean([not is_share_accepted(share) for share in shares]))
+        return float(np.mean([not is_force_share_accepted(share) for share in shares]))
 
     inside = drawn_walls(*stated.walls, asked.station_draws)
     for point in inside:

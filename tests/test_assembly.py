@@ -643,19 +643,19 @@ def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
     """The first two are zero to rounding without contact; for the motors this log is too slow."""
     recorded = assembled_over_a_network
     log = recorded.log
-    accounts = station_energies(log, recorded.scenario)
+    energies = station_energies(log, recorded.scenario)
     wrench = in_power_units(wanted_at_the_hand(recorded, slave))
     received = steps(rotations(log["pose_received"]), log["pose_received"][:, 4:])
     for g in (0, 1):
         group = slice(3 * g, 3 * g + 3)
         # The log shows at row k + 1 what is sent at row k.
         put_in = np.cumsum(np.sum(wrench[:-1, group] * received[1:, group], axis=1))
-        np.testing.assert_allclose(accounts[:-1, AT_COMMAND, g], put_in - put_in[0], atol=EXACT)
+        np.testing.assert_allclose(energies[:-1, AT_COMMAND, g], put_in - put_in[0], atol=EXACT)
         assert np.ptp(put_in) > 1e-4
         counted = log["ports"][1:, g] - log["ports"][1, g]
-        np.testing.assert_allclose(accounts[:-1, AT_HAND, g], counted, atol=EXACT)
-    np.testing.assert_array_equal(accounts[:, AT_SLAVE], 0.0)
-    assert np.isnan(accounts[:, AT_MOTOR]).all()
+        np.testing.assert_allclose(energies[:-1, AT_HAND, g], counted, atol=EXACT)
+    np.testing.assert_array_equal(energies[:, AT_SLAVE], 0.0)
+    assert np.isnan(energies[:, AT_MOTOR]).all()
 
 
 def test_the_motors_account_is_the_arms_speed(finely_logged, slave):

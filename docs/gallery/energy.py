@@ -15,7 +15,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 figure, panels = plt.subplots(1, 2, figsize=(8.5, 3.2))
 for axes, method in zip(panels, ("none", "ledger"), strict=True):
     run = run_one_dof(REFERENCE_ONE_DOF, PassivityConfig(method=method), NetworkConfig(delay=0.025))
-    hand, wall = run.accounts[:, AT_HAND], run.accounts[:, AT_SLAVE]
+    hand, wall = run.input_energies[:, AT_HAND], run.input_energies[:, AT_SLAVE]
     axes.plot(run.t, hand, label="hand")
     axes.plot(run.t, wall, label="wall")
     axes.plot(run.t, run.start_energy + hand + wall, "k", label="both, and the start")

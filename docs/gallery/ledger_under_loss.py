@@ -20,7 +20,7 @@ above.plot(run.t, REFERENCE_ONE_DOF.force_scale * run.wall_force, label="wall / 
 above.plot(run.t, run.hand_force, label="displayed")
 above.set(ylabel="force at the hand [N]")
 above.legend()
-energy = run.start_energy + run.accounts[:, AT_HAND] + run.accounts[:, AT_SLAVE]
+energy = run.start_energy + run.input_energies[:, AT_HAND] + run.input_energies[:, AT_SLAVE]
 below.plot(run.t, 1e3 * energy, "k")
 below.axhline(0, color="red", linewidth=0.8)
 below.set(xlabel="t [s]", ylabel="left in the station [mJ]")

@@ -65,7 +65,7 @@ def test_station_with_displayed_tool_agrees_with_linearisation():
     response, predicted = measured(station(sigma=1.0, coulomb=0.0))
     assert response.omega[-1] >= 2 * np.pi * 29.99
     assert_agrees(response, predicted, "hand_velocity", "hand_force")
-    assert_agrees(response, predicted, "felt_force", "hand_velocity")
+    assert_agrees(response, predicted, "displayed_force", "hand_velocity")
     assert_agrees(response, predicted, "tool_velocity", "hand_velocity")
     assert response.apparent_mass() == pytest.approx(3.13, rel=0.01)
 

@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison import compare_passivity as study
 from drake_teleop.lab.comparison import whole_station
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
-from drake_teleop.lab.comparison.report import RUN_COLUMNS, run_cells
+from drake_teleop.lab.comparison.report import RUN_COLUMNS, cells_of_run
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.environment.solids import Wall
@@ -36,7 +36,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study,
-        "_SIGMA_ROUND_TRIP_WALL_CASES",
+        "_INJECTED_ENERGY_STUDY_CASES",
         tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))),
     )
     # Use the load of the shipped scenario, which other tests have identified.
@@ -75,7 +75,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     assert 0.0 <= runs["tdpa"]["left_behind"] == abs(runs["tdpa"]["drift"]) < 0.5e-3
     # A run that is not at rest in its hold ends there.
     assert runs["none"]["left_behind"] is None is runs["none"]["drift"]
-    assert run_cells(runs["none"])[[key for key, *_ in RUN_COLUMNS].index("left_behind")] == "–"
+    assert cells_of_run(runs["none"])[[key for key, *_ in RUN_COLUMNS].index("left_behind")] == "–"
     assert runs["none"]["leaked"] > 0.3 > 100 * runs["tdpa"]["leaked"]
     # Taps leak, the press does not.
     assert [cell["verdict"] for cell in summary["decision"]] == ["unstable", "leaks"]
@@ -94,7 +94,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     # 8.5 px, and a column 11 px to its neighbour. Headings have one line a word.
     assert re.search(r"\nth\.number {[^}]*white-space: normal", page)
     rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in RUN_COLUMNS)]]
-    rows += [["four_channel", "yes", *run_cells(row)] for row in summary["station"]]
+    rows += [["four_channel", "yes", *cells_of_run(row)] for row in summary["station"]]
     words = [max(map(len, " ".join(column).split())) for column in zip(*rows, strict=True)]
     assert page.split("</thead>")[0].count("<th") - 1 == len(words)  # <thead> is one of them
     assert sum(8.5 * letters + 11 for letters in words) < 944

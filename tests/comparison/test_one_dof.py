@@ -217,7 +217,7 @@ def test_energy_balances_agree_with_spring_and_inertia():
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
     spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave_position, 0.0) ** 2
-    hand, command, motor, actual = run.accounts.T
+    hand, command, motor, actual = run.input_energies.T
     # A spring returns its energy, to rounding: the wall is not active.
     np.testing.assert_allclose(actual, -spring, rtol=0.0, atol=1e-14)
     assert spring.max() > 0.01 and run.start_energy == 0.0
@@ -247,7 +247,7 @@ def test_energy_balances_agree_with_spring_and_inertia():
         wall=np.tile([0.0, 5100.0], (len(intent), 1)),
         delays=(np.full(2000, ahead), np.full(2000, ahead)),
     )
-    np.testing.assert_array_equal(given.accounts, run.accounts)
+    np.testing.assert_array_equal(given.input_energies, run.input_energies)
 
 
 def test_changing_hand_wall_and_imperfections():
@@ -282,7 +282,7 @@ def test_changing_hand_wall_and_imperfections():
         run.wall_force[:599].min() == 0.0 == run.wall_force[750:].min()
         and run.wall_force[600:750].min() < -20.0
     )
-    assert run.accounts[749, AT_SLAVE] == run.accounts[-1, AT_SLAVE]
+    assert run.input_energies[749, AT_SLAVE] == run.input_energies[-1, AT_SLAVE]
     noise = run.hand_force[50:590] / model.force_scale
     assert noise.std() == pytest.approx(0.5, rel=0.15)
     assert run.master_position[749] < 0.019 and np.all(run.time_without_packets[-1] > 0.09)

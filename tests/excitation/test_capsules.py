@@ -14,7 +14,7 @@ from drake_teleop.lab.excitation.collision import (
     MIN_CLEARANCE_M,
     Capsule,
     _exclude_coaxial_pairs,
-    _required_capsule_distance,
+    _min_capsule_pair_distance,
     bounding_capsule,
 )
 
@@ -63,13 +63,13 @@ def test_minimum_distance_subtracts_the_quartile_of_the_excess():
     """Shapes near contact, capsules 0 to 100 mm nearer: the correction is 25 mm."""
     touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)
     nearer = touching - np.linspace(0.0, 0.1, 101)
-    kept = _required_capsule_distance(
+    kept = _min_capsule_pair_distance(
         np.concatenate([touching, far]), np.concatenate([nearer, far])
     )
     assert kept == pytest.approx(MIN_CLEARANCE_M - 0.025)
     # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
-    assert _required_capsule_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
+    assert _min_capsule_pair_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_only_near_shapes_at_a_constant_distance_are_measured_in_the_first_postures():

@@ -197,7 +197,7 @@ def test_regression_does_not_extrapolate_into_failed_cells():
     means = model.means(value[known], terms)[0]
     assert value[known].min() < means.min() and means.max() < value[known].max()
     cells, _, terms = model.comparison_weights(0, 1)
-    lost = model.failed[0, 1]
+    lost = model.excluded_cells[0, 1]
     assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
     assert np.array_equal(cells, ~lost.ravel())
     # The edge of failures crosses one cell: one of its four points succeeded.

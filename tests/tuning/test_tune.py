@@ -346,7 +346,7 @@ def test_low_pass_of_the_sensor_delays_the_force_alone(
     tuned = TunedSettings("ledger", 1.5, 0.3, 100.0)
     with pytest.raises(CapturedArguments) as found:
         axis = OneAxis(position_scale=scale, force_scale=0.1)
-        search_.share_in_one_axis(axis, tuned, "firm", 3000.0, 4)
+        search_.displayed_force_share(axis, tuned, "firm", 3000.0, 4)
     (model, _, forward, backward), options = found.value.args
     lag = 0.416 / 100.0
     assert forward.delay == 0.02 and backward.delay == pytest.approx(0.05 + lag)

@@ -1,4 +1,4 @@
-"""Stability criteria of a station for any passive hand and environment, or for given ranges.
+"""Stability criteria of a station for any passive hand and environment, or impedance ranges.
 
 H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega [rad/s].
 """
@@ -90,8 +90,8 @@ def structured_singular_value(
 ) -> Array:
     """Return the structured singular value mu of the scattering matrix S (T56).
 
-    The loads' wave reflection factors are bounded. With bounds of 1 (any passive load), mu <= 1
-    means absolutely stable.
+    The loads' wave reflection factors are at most the given ones. With 1 (any passive load),
+    mu <= 1 means absolutely stable.
     """
     s11, s12, s21, s22 = matrix_entries(S)
     r1, r2 = np.asarray(max_hand_reflection), np.asarray(max_environment_reflection)
@@ -157,8 +157,8 @@ def impedance_range_of_grips() -> ImpedanceRange:
 def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     """Return, for each omega, the softest wall [N/m] that oscillates with a hand in range (T57).
 
-    0: oscillates in free motion; inf: with no wall. If a grid, dense for the range, contains only
-    inf, all hands are stable or all are unstable. A single hand returns inf.
+    0: oscillates in free motion; inf: with no wall. If all values of a dense grid of omega are inf,
+    all hands in range are stable, or all are unstable. A range of one hand always gives inf.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)

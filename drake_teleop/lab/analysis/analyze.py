@@ -163,7 +163,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 
 def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in its base B, for a tip 5 mm in the sheet spring."""
+    """Return the master's displacement [m], in its base B, to a tip 5 mm inside the leaf."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
@@ -198,13 +198,13 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 
 
 def summarise_diagram_stability(
-    name: str, system: Linearization, axis: OneAxis, sampling: Sampling
+    point: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest mode (largest multiplier) of Diagram and one-axis model."""
+    """Return stability and slowest mode (largest multiplier) of the Diagram and of one axis."""
     loop = cut_loop.cut_loop(axis, sampling)
     stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
     return {
-        "point": name,
+        "point": point,
         "states": system.num_states,
         **_slowest_mode(system, stable),
         # The count of unstable multipliers also includes those far from the unit circle.
@@ -225,7 +225,7 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
 
 
 def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
-    # One axis has one delay: the mean. The product h12 h21 is unchanged.
+    """Return H with the mean delay in both directions, as in one axis; h12 h21 is unchanged."""
     ahead, back = linearization.network_delay_periods(scenario)
     shift = np.exp(S_AT_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
     h11, h12, h21, h22 = two_port.matrix_entries(H)
@@ -233,7 +233,7 @@ def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
 
 
 def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest deviation of each entry of H from the one-axis models up to 30 Hz.
+    """Return the largest deviation of each entry of H from both one-axis models up to 30 Hz.
 
     The deviations are relative to the entry's largest magnitude. H includes the hand's mass.
     """

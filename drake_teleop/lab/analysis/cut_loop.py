@@ -82,16 +82,16 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < 1e-9:  # no loop
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    crossings = _zero_crossing_interval_fractions(log_gain)
+    crossings = _zero_crossing_fractions(log_gain)
     lag = np.mod(_interpolate_in_intervals(np.unwrap(angle), crossings), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    fraction = np.where(is_jump, np.nan, _zero_crossing_interval_fractions(angle))
+    fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
     factor = np.exp(-_interpolate_in_intervals(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _zero_crossing_interval_fractions(value: Array) -> Array:
+def _zero_crossing_fractions(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
@@ -144,7 +144,7 @@ def _find_gain_crossings_into(open_multipliers, closed_multipliers, angles, foun
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
         more = _add_angles_near_poles(angles, poles)
-        at, values = _add_gain_extremes_and_get_responses(more, poles, zeros)
+        at, values = _add_angles_of_gain_extremes(more, poles, zeros)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
@@ -176,7 +176,7 @@ def _add_angles_near_poles(angles, poles):
 
 
 @njit(cache=True)
-def _add_gain_extremes_and_get_responses(angles, poles, zeros):
+def _add_angles_of_gain_extremes(angles, poles, zeros):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
         values[i] = _response_at(zeros, poles, angles[i], 1.0)

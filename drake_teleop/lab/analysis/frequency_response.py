@@ -77,8 +77,8 @@ class MultiSine:
 class StationResponse:
     """Spectra of the station's signals along a direction, measured or predicted.
 
-    Signals: `hand_force`, of the hand on the stylus [N]; `hand_velocity` [m/s]; `felt_force`,
-    displayed by the device [N]; `tool_velocity`, of the tip [m/s].
+    Signals: `hand_force`, of the hand on the stylus [N]; `hand_velocity` [m/s]; `displayed_force`,
+    of the device on the hand [N]; `tool_velocity`, of the tip [m/s].
     """
 
     omega: Array  #: (n,) [rad/s]
@@ -96,14 +96,14 @@ class StationResponse:
         return cross / power
 
     def apparent_mass(self) -> float:
-        """Return the displayed tool mass over the force scale [kg], for delays far below 0.1 s."""
+        """Return the displayed tool mass [kg] at force scale 1; delays must be far below 0.1 s."""
         low = self.omega <= 2 * np.pi * 10.0
         if (count := np.count_nonzero(low)) < 3:
             what = f"{count} frequencies are below 10 Hz (the fit of a mass needs 3)"
             remedy = "lower `lowest` or lengthen `period` of the MultiSine"
             raise DrakeTeleopError(what, where="MultiSine", remedy=remedy)
         omega = self.omega[low]
-        displayed = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
+        displayed = -self.response("displayed_force", "tool_velocity")[low] / self.force_scale
         # The force noise is about equal at all lines, so that the weights are the accelerations.
         acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
         mass = (displayed / (1j * omega)).real
@@ -151,7 +151,7 @@ def measure_frequency_response(
     signals = {
         "hand_force": result["hand_wrench_E"] @ task.hand,
         "hand_velocity": result["twist_master"] @ task.hand,
-        "felt_force": result["force_to_master"] @ task.hand,
+        "displayed_force": result["force_to_master"] @ task.hand,
         "tool_velocity": twists @ task.tool,
     }
     odd_multiples = excitation.odd_multiples_of_base_rate()

@@ -126,9 +126,9 @@ def two_port_along(system: Linearization, omega: Array, hand: Array, tool: Array
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
 
-    def response(output: str, left: Array, input_: str, right: Array) -> Complex:
+    def response(output: str, output_axis: Array, input_: str, input_axis: Array) -> Complex:
         row, column = o.index(f"{output}.x"), i.index(f"{input_}.x")
-        return left @ G[:, row : row + 6, column : column + 6] @ right
+        return output_axis @ G[:, row : row + 6, column : column + 6] @ input_axis
 
     step = 1j * np.asarray(omega) * system.dt
     hold = -np.expm1(-step) / step
@@ -150,7 +150,7 @@ def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class _StateGroup:
+class _SystemStates:
     system_name: str
     discrete_group: int | None
     indices: slice | NDArray[np.intp]
@@ -226,27 +226,27 @@ class _PeriodSimulator:
     def _fix_input_port(self, system: str, port: str, value: object) -> None:
         self._get_block(system).GetInputPort(port).FixValue(self._get_context(system), value)
 
-    def _make_state_groups(self) -> list[_StateGroup]:
+    def _make_state_groups(self) -> list[_SystemStates]:
         whole = slice(None)
         axes = self._device.num_joints
         joints = self._get_context("slave_plant").num_continuous_states() // 2
         # The sensor's memory contains angles, which must stay small.
         remembered = self._sensor.motion_dependent_state_indices
         groups = [
-            _StateGroup("master_device", 0, whole, np.repeat([_ANGLE_STEP, _RATE_STEP], axes)),
-            _StateGroup("master_device", 1, whole, np.full(7, _ANGLE_STEP)),
-            _StateGroup("master_device", 2, whole, np.full(6, _RATE_STEP)),
+            _SystemStates("master_device", 0, whole, np.repeat([_ANGLE_STEP, _RATE_STEP], axes)),
+            _SystemStates("master_device", 1, whole, np.full(7, _ANGLE_STEP)),
+            _SystemStates("master_device", 2, whole, np.full(6, _RATE_STEP)),
             # The angles for the display; its other states act only after faults.
-            _StateGroup("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
-            _StateGroup("joint_control", 0, whole, np.full(self._joints, _LINEAR_STATE_STEP)),
-            _StateGroup(
+            _SystemStates("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
+            _SystemStates("joint_control", 0, whole, np.full(self._joints, _LINEAR_STATE_STEP)),
+            _SystemStates(
                 "slave_plant", None, whole, np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
-            _StateGroup("wrist_sensor", 0, remembered, np.full(len(remembered), _ANGLE_STEP)),
+            _SystemStates("wrist_sensor", 0, remembered, np.full(len(remembered), _ANGLE_STEP)),
         ]
         if self._has_ik_state:
             steps = np.full(self._joints, self._command_step)
-            groups.append(_StateGroup("inverse_kinematics", 0, slice(0, self._joints), steps))
+            groups.append(_SystemStates("inverse_kinematics", 0, slice(0, self._joints), steps))
         return groups
 
     def get_state(self) -> Array:

@@ -1,4 +1,4 @@
-"""Sampled one-axis model of the station over a period of the hand.
+"""Sampled one-axis model of the station over a hand period, 1 / `Sampling.hand_hz`.
 
 All updates at one instant read earlier values. Device and servo hold their forces; the sensor
 samples just before the servo's update.
@@ -62,12 +62,12 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     shape = np.broadcast_shapes(*map(np.shape, parameters.values()))
     zeros = np.zeros((*shape, n + 3, n + 3))
     two_rows = zeros[..., :2, :]
-    hand = _map_rows_of_hand(two_rows, axis, hand_period)
-    servo = _map_row_of_servo(zeros[..., :1, :], axis)
-    sensor = _map_rows_of_sensor(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
+    hand = _hand_map_rows(two_rows, axis, hand_period)
+    servo = _servo_map_row(zeros[..., :1, :], axis)
+    sensor = _sensor_map_rows(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
-    slave = {gap: _map_rows_of_slave(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)}
+    slave = {gap: _slave_map_rows(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)}
     M = zeros + np.eye(n + 3)
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
@@ -153,7 +153,7 @@ def _low_pass_sections(sampling: Sampling) -> Array:
     return sections.reshape(*rates.shape, 2, 5)
 
 
-def _map_rows_of_hand(zero_rows: Array, axis: OneAxis, period: Array) -> Array:
+def _hand_map_rows(zero_rows: Array, axis: OneAxis, period: Array) -> Array:
     rows, mass = zero_rows.copy(), axis.hand_mass + axis.device_mass
     responses = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
     rows[..., [MASTER_X, MASTER_V]] = responses[..., :2]
@@ -163,7 +163,7 @@ def _map_rows_of_hand(zero_rows: Array, axis: OneAxis, period: Array) -> Array:
     return rows
 
 
-def _map_row_of_servo(zero_row: Array, axis: OneAxis) -> Array:
+def _servo_map_row(zero_row: Array, axis: OneAxis) -> Array:
     row, kv, kp = zero_row.copy(), axis.velocity_gain, axis.position_gain
     row[..., 0, MASTER_X] = kv * kp * axis.position_scale
     row[..., 0, SLAVE_X] = -kv * kp
@@ -171,7 +171,7 @@ def _map_row_of_servo(zero_row: Array, axis: OneAxis) -> Array:
     return row
 
 
-def _map_rows_of_sensor(zero_rows: Array, axis: OneAxis, sections: Array) -> Array:
+def _sensor_map_rows(zero_rows: Array, axis: OneAxis, sections: Array) -> Array:
     rows, displayed_mass = zero_rows.copy(), axis.displayed_tool_mass
     scale = axis.force_scale * (axis.gamma - displayed_mass / axis.slave_mass)
     value = rows[..., 0, :]
@@ -190,7 +190,7 @@ def _map_rows_of_sensor(zero_rows: Array, axis: OneAxis, sections: Array) -> Arr
     return rows
 
 
-def _map_rows_of_slave(zero_rows: Array, axis: OneAxis, time: Array) -> Array:
+def _slave_map_rows(zero_rows: Array, axis: OneAxis, time: Array) -> Array:
     rows, mass = zero_rows.copy(), axis.slave_mass
     springs = axis.wall_stiffness / mass, axis.wall_damping / mass
     responses = mass_spring_responses_to_unit_x_v_u(*springs, time)

@@ -228,37 +228,37 @@ def _draw_stability_map(axes: Axes, map_of_grip: Mapping[str, StabilityMap], gri
     return mesh
 
 
-def verdict_sentences(figures: dict[str, Any]) -> list[str]:
+def verdict_sentences(summary: dict[str, Any]) -> list[str]:
     sentences = []
-    if figures["method"] != "none":
+    if summary["method"] != "none":
         sentences += [
-            f"The method {figures['method']} is not linear.",
+            f"The method {summary['method']} is not linear.",
             "The analysis is for the station without this method.",
         ]
-    if "is not analysed" in figures["wall_is"]:
-        sentences.append(f"The wall is {figures['wall_is']}.")
-    sentences += [_stability_sentence(point, figures["grip"]) for point in figures["diagram"]]
-    for row in figures["margins"]:
-        if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]:
-            sentences += _margin_sentences(row, figures["delay_s"])
-    if (worst := max(figures["two_port"]["sampled"].values())) > 0.1:
+    if "is not analysed" in summary["wall_is"]:
+        sentences.append(f"The wall is {summary['wall_is']}.")
+    sentences += [_stability_sentence(row, summary["grip"]) for row in summary["diagram"]]
+    for row in summary["margins"]:
+        if row["grip"] == summary["grip"] and row["wall_N_per_m"] == summary["wall_N_per_m"]:
+            sentences += _margin_sentences(row, summary["delay_s"])
+    if (worst := max(summary["two_port"]["sampled"].values())) > 0.1:
         sentences += [
-            f"Along {figures['direction']} the station is not one axis.",
+            f"Along {summary['direction']} the station is not one axis.",
             "Contact rotates the tool, or its motion is estimated with a delay (encoders).",
             f"Its two-port differs from one axis by up to {100 * worst:.2g} % below 30 Hz.",
             "Margins and maps assume one axis and are approximate here.",
         ]
-    return sentences + _stability_limit_sentences(figures) + _transparency_sentences(figures)
+    return sentences + _stability_limit_sentences(summary) + _transparency_sentences(summary)
 
 
-def _stability_sentence(point: dict[str, Any], grip: str) -> str:
-    decay, hertz = point["decay_1_per_s"], point["frequency_Hz"]
+def _stability_sentence(row: dict[str, Any], grip: str) -> str:
+    decay, hertz = row["decay_1_per_s"], row["frequency_Hz"]
     if decay is None:
-        stable = "stable" if point["stable"] else "unstable"
-        return f"In the state '{point['point']}' the one-axis model of the station is {stable}."
-    state = f"In '{point['point']}', {grip} grip, the station is"
+        stable = "stable" if row["stable"] else "unstable"
+        return f"In the state '{row['point']}' the one-axis model of the station is {stable}."
+    state = f"In '{row['point']}', {grip} grip, the station is"
     motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
-    if point["stable"]:
+    if row["stable"]:
         return f"{state} stable: motion halves every {1e3 * np.log(2) / decay:.3g} ms, {motion}."
     return f"{state} unstable: motion doubles every {-1e3 * np.log(2) / decay:.3g} ms, {motion}."
 
@@ -274,8 +274,8 @@ def _margin_sentences(row: dict[str, Any], one_way_delay_s: float) -> list[str]:
     return [f"A {wall} is stable up to {longest}, or up to {more}."]
 
 
-def _stability_limit_sentences(figures: dict[str, Any]) -> list[str]:
-    bounded, absolute = figures["bounded"], figures["absolute"]
+def _stability_limit_sentences(summary: dict[str, Any]) -> list[str]:
+    bounded, absolute = summary["bounded"], summary["absolute"]
     each = ", ".join(f"{grip} {_stiffness_text(K)}" for grip, K in bounded["each"].items())
     every = _stiffness_text(bounded["grips"])
     sentences = [
@@ -297,16 +297,16 @@ def _stability_limit_sentences(figures: dict[str, Any]) -> list[str]:
     ]
 
 
-def _transparency_sentences(figures: dict[str, Any]) -> list[str]:
-    free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
+def _transparency_sentences(summary: dict[str, Any]) -> list[str]:
+    free, wall = summary["transparency"]["free"], summary["transparency"]["wall"]
     rendered, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
-    sigma = f"σ = {figures['axis']['sigma']:g}"
+    sigma = f"σ = {summary['axis']['sigma']:g}"
     return [
         f"In free motion the displayed mass is {1e3 * free['felt']['mass']:.3g} g.",
         f"The ideal mass for this device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
         f"At the wall the displayed stiffness is {rendered:.3g} N/m; the ideal is {ideal:.3g} N/m.",
         f"A human cannot distinguish it from the ideal up to {wall['unnoticed_to_Hz']:.2g} Hz.",
-        f"The slave tracks up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
+        f"The slave tracks up to {summary['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
     ]
 
 

@@ -1,6 +1,6 @@
 """Parameters of the one-axis model along a task direction.
 
-One axis represents the station if a contact force causes no rotation (along the tool).
+One axis represents the station if contact does not rotate the tool, as for forces along it.
 """
 
 from __future__ import annotations

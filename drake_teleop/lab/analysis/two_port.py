@@ -66,7 +66,7 @@ def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0,
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return both ports' reference impedances [N s/m]: the hand's damping, in each port's scale."""
+    """Return reference impedances [N s/m]: hand damping b, and b / (force scale * motion scale)."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         name = "force_scale" if axis.force_scale == 0 else "position_scale"

@@ -1,7 +1,7 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies: the whole station presses on sheet springs (`whole_station`); a hand releases the
-device and taps a wall, and the longest stable round trip is found (both `one_dof`).
+Four studies: presses of the whole station on sheet springs (`whole_station`); and with `one_dof`
+release of the device and taps on a wall, longest stable round trips, energy added by the delay.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
-_SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+_INJECTED_ENERGY_STUDY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of every run: a quarter (sensor) or half of those of the shipped scenarios.
 _COMPARISON_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
@@ -95,7 +95,7 @@ def compare_command(
         limits = _run_longest_round_trip_study(methods, seed, jobs, stage)
         released = _run_release_and_tap_study(networks, methods, seed, jobs, stage)
         runs, traces = _run_station_study(base, networks, methods, jobs, stage)
-        covering = _run_elimination_energy_study(stage)
+        covering = _run_injected_energy_study(stage)
     summary = {
         "networks": list(networks),
         "methods": list(methods),
@@ -325,16 +325,16 @@ def _run_station_study(
     return rows, traces
 
 
-def _run_elimination_energy_study(stage: StartStage) -> list[dict[str, Any]]:
-    progress, rows = stage("Energy added by the elimination"), []
-    for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
+def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
+    progress, rows = stage("Energy added by the delay"), []
+    for done, (sigma, round_trip, wall) in enumerate(_INJECTED_ENERGY_STUDY_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = one_dof.run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         row = {"sigma": sigma, "round_trip_s": round_trip, "wall_N_per_m": wall}
         row["injected_J"] = max(0.0, -run.least_energy_sum(one_dof.AT_SLAVE))
-        row["damping_Ns_per_m"] = one_dof.covering_damping(model, round_trip)
+        row["damping_Ns_per_m"] = one_dof.damping_for_passivity(model, round_trip)
         rows.append(row)
-        progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))
+        progress((done + 1) / len(_INJECTED_ENERGY_STUDY_CASES))
     return rows
 
 

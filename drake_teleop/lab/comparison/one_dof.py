@@ -99,7 +99,7 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 class OneDofRun:
     """Time series (N,) of a run.
 
-    `accounts` (N, 4) contains the energy [J] that entered the station so far at four places, at the
+    `input_energies` (N, 4) is the energy [J] put into the station so far at four places, at the
     master's scale. In a passive station, AT_HAND plus any other is at least -start_energy::
 
         AT_HAND     -sum f_(k-1) (x_k - x_(k-1))   f: displayed force, held
@@ -116,16 +116,16 @@ class OneDofRun:
     wall_force: Array  #: N, on the slave
     channel_energy: Array  #: (N, 2) from hand and slave into the channel [J]
     time_without_packets: Array  #: (N, 2) time without packets of hand and slave [s]
-    accounts: Array  #: (N, 4) J
+    input_energies: Array  #: (N, 4) J
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
-        """Return the minimum over time [J] of start energy plus `accounts` at AT_HAND and `place`.
+        """Return the minimum over time [J] of start energy plus input at AT_HAND and `place`.
 
         Negative: the station is active.
         """
-        other = 0.0 if place == AT_HAND else self.accounts[:, place]
-        return self.start_energy + float(np.nanmin(self.accounts[:, AT_HAND] + other))
+        other = 0.0 if place == AT_HAND else self.input_energies[:, place]
+        return self.start_energy + float(np.nanmin(self.input_energies[:, AT_HAND] + other))
 
 
 @dataclass(frozen=True)
@@ -206,13 +206,13 @@ def run_one_dof(
     )  # fmt: skip
     hand = (model.hand_mass, model.hand_damping, model.hand_stiffness) if grip is None else grip
     inputs = intent, hand, (0.0, model.wall_stiffness) if wall is None else wall
-    course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in inputs]
+    columns = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in inputs]
     # These methods use the motor's force, which is held over a period; the others interpolate the
     # command over it.
     held = METHODS[passivity.method].balance_at_motors and not model.ideal_servo
     rows = _simulate_one_dof_run(
         methods.step_addresses(passivity.method), tuple(map(float, numbers)), held, p, *lines,
-        *states, ends, start, timeout, np.concatenate(course, axis=1),
+        *states, ends, start, timeout, np.concatenate(columns, axis=1),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD_S
     master, slave, command, displayed, pushed = rows.T[:5]
@@ -300,7 +300,7 @@ def measures_of_traces(
     )
 
 
-def covering_damping(model: OneDof, round_trip: float) -> float:
+def damping_for_passivity(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
     return max(0.0, -float(_displayed_impedance_real_part(model, round_trip).min()))
 
@@ -336,8 +336,8 @@ def _rise_delay_in_samples(hand_force: Array, contact_force: Array, steady_force
 
 @njit(cache=True)
 def _simulate_one_dof_run(
-    steps, model, holds_motor_force, p, forward_line, backward_line, forward, backward, ends, start,
-    timeout, course,
+    method_steps, model, holds_motor_force, method_parameters, forward_line, backward_line,
+    forward, backward, end_states, start, timeout, inputs,
 ):  # fmt: skip
     device_mass, friction, slave_mass, K, D, ideal, slave_friction, lag = model[:8]
     tool_mass, wall_damping, scale, sigma, gamma = model[8:13]
@@ -347,40 +347,40 @@ def _simulate_one_dof_run(
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
     displayed, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
-    # Columns: master, slave, command, displayed, wall, energy (2), silent (2), accounts (4).
-    rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
+    # Columns: master, slave, command, displayed, wall, energy (2), silent (2), energies (4).
+    rows, energies = np.empty((inputs.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
     dt = PERIOD_S / _SUBSTEPS_PER_CHANNEL_PERIOD
-    for k in range(course.shape[0]):
-        mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
-        x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
-        v_w = (course[following, 5] - x_w) / PERIOD_S
+    for k in range(inputs.shape[0]):
+        mass, damping, stiffness = device_mass + inputs[k, 2], inputs[k, 3], inputs[k, 4]
+        x_w, wall_stiffness, following = inputs[k, 5], inputs[k, 6], min(k + 1, len(inputs) - 1)
+        v_w = (inputs[following, 5] - x_w) / PERIOD_S
         push = _wall_force(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
         load[0] = -scale * sigma * tool_mass * a_s
         if noise > 0.0:
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
-        hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
+        hand[0] = stiffness * (inputs[k, 0] - x) + damping * (inputs[k, 1] - v)
         pose_m[4], pose_s[4] = _quantise(x, master_resolution), _quantise(x_s, slave_resolution)
-        accounts[AT_HAND] -= displayed[0] * (x - x_before)
+        energies[AT_HAND] -= displayed[0] * (x - x_before)
         before, x_before = received[4], x
         # A literal False would compile the whole channel once more.
         step_channel(
-            steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S, timeout,
-            frame, p, forward_line, backward_line, forward, backward, ends, received, ports,
-            displayed,
+            method_steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S,
+            timeout, frame, method_parameters, forward_line, backward_line, forward, backward,
+            end_states, received, ports, displayed,
         )  # fmt: skip
-        command, accounts[AT_COMMAND] = received[4], ports[6]
+        command, energies[AT_COMMAND] = received[4], ports[6]
         copy_into(rows[k], 0, (x, x_s, command, displayed[0], wall, ports[0], ports[2]), 0, 7)
         copy_into(rows[k], 7, ports, 4, 2)
-        copy_into(rows[k], 9, accounts, 0, 4)
+        copy_into(rows[k], 9, energies, 0, 4)
         servo_force = K * (command - x_s) - D * v_s
         for i in range(_SUBSTEPS_PER_CHANNEL_PERIOD):
             share = (i + 0.5) / _SUBSTEPS_PER_CHANNEL_PERIOD
-            x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
-            v_i = course[k, 1] + share * (course[following, 1] - course[k, 1])
+            x_i = inputs[k, 0] + share * (inputs[following, 0] - inputs[k, 0])
+            v_i = inputs[k, 1] + share * (inputs[following, 1] - inputs[k, 1])
             force = stiffness * (x_i - x) + damping * (v_i - v) + displayed[0]
             v += dt / mass * (force - friction * np.tanh(v / _DEVICE_FRICTION_SPEED_M_S))
             x += dt * v
@@ -401,12 +401,12 @@ def _simulate_one_dof_run(
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * PERIOD_S * v_w)
             push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
             work = -_mean_of_positive_part_of_ramp(push_then, push) * (x_s - x_then)
-            accounts[AT_SLAVE] += scale * gamma * work
+            energies[AT_SLAVE] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
             if ideal == 0.0:
                 work = -motor * 0.5 * (v_then + v_s) * dt
-            accounts[AT_MOTOR] += scale * gamma * work
+            energies[AT_MOTOR] += scale * gamma * work
         if not abs(x) + abs(x_s) < 1e3:
             rows[k + 1 :] = np.nan
             break

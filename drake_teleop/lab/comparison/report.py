@@ -63,12 +63,12 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         pictures,
         networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
         columns=[heading for _, heading, _, _ in RUN_COLUMNS],
-        station=[(row, run_cells(row)) for row in summary["station"]],
+        station=[(row, cells_of_run(row)) for row in summary["station"]],
         covering=summary["covering"],
     )
 
 
-def run_cells(row: Mapping[str, Any]) -> list[str]:
+def cells_of_run(row: Mapping[str, Any]) -> list[str]:
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
@@ -95,7 +95,7 @@ class MethodResult:
 
     @property
     def least_displayed_share_text(self) -> str:
-        """Smallest displayed share [%] of the scaled contact force, all springs; "" if unstable."""
+        """Smallest displayed share [%] of scaled contact force over all springs; "" if unstable."""
         shares = [displayed / pressed for displayed, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
@@ -199,9 +199,9 @@ def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    def draw_run(axes: Any, shown: Mapping[str, Array]) -> None:
-        axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
-        axes.plot(shown["t"], shown["hand_force"], color=COLOURS[0], linewidth=0.9)
+    def draw_run(axes: Any, trace: Mapping[str, Array]) -> None:
+        axes.plot(trace["t"], trace["pressed"], color=GREY, linewidth=0.8)
+        axes.plot(trace["t"], trace["hand_force"], color=COLOURS[0], linewidth=0.9)
 
     figure = _draw_trace_grid(summary, traces, draw_run, "force [N]")
     figure.suptitle("Rendered force (blue) and scaled contact force (grey)", x=0.01, ha="left")
@@ -209,9 +209,9 @@ def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    def draw_run_energy(axes: Any, shown: Mapping[str, Array]) -> None:
+    def draw_run_energy(axes: Any, trace: Mapping[str, Array]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
-        axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
+        axes.plot(trace["t"], trace["energy"], color=COLOURS[2], linewidth=1.0)
 
     figure = _draw_trace_grid(summary, traces, draw_run_energy, "energy [J]")
     words = "Energy between hand and actual motion:\nbelow 0 the station is active"
@@ -226,15 +226,15 @@ def _draw_trace_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit
         grid = figure.subplots(len(methods), len(networks), squeeze=False, sharex="col")
         for i, method in enumerate(methods):
             for j, network in enumerate(networks):
-                axes, shown = grid[i, j], traces.get((network, method))
+                axes, trace = grid[i, j], traces.get((network, method))
                 if i == 0:
                     axes.set_title(f"{network}, RTT {2e3 * PRESETS[network].delay:g} ms")
                 if j == 0:
                     axes.set_ylabel(f"{method}\n{unit}", fontsize=8)
-                if shown is None:
+                if trace is None:
                     axes.text(0.5, 0.5, "ended early", transform=axes.transAxes, ha="center")
                 else:
-                    draw(axes, shown)
+                    draw(axes, trace)
         for axes in grid[-1]:
             axes.set_xlabel("time [s]")
     return figure

@@ -1,6 +1,6 @@
 """The whole station: task (swing, press on a sheet spring, rest), measures and energy balances.
 
-The balances are those of `one_dof.OneDofRun.accounts`, at the master's scale, positive inwards [J],
+The balances are those of `OneDofRun.input_energies`, at the master's scale, positive inwards [J],
 for translation and rotation. AT_MOTOR is computed from motor torque minus gravity torque.
 """
 
@@ -137,10 +137,10 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energy (N,) [J] that hand and environment put in so far, plus `start_energy`."""
-    accounts = station_energies(result, scenario)[:, [AT_HAND, AT_SLAVE]].sum(axis=1)
+    energies = station_energies(result, scenario)[:, [AT_HAND, AT_SLAVE]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
-        accounts += work_of_displayed_load_wrench(result, scenario)
-    return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
+        energies += work_of_displayed_load_wrench(result, scenario)
+    return np.asarray(start_energy(scenario).sum() + energies.sum(axis=1))
 
 
 def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> tuple[Array, Array]:
@@ -172,22 +172,22 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
     gamma = scenario.force_scaling.scales().gamma
     power = scenario.force_scaling.force_scale * gamma / _kinematic_scales_with_1_for_0(scenario)
     rates = scenario.rates
-    accounts = np.empty((len(t), 4, 2))
+    energies = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
     has_torques = rates.log_hz >= rates.joint_control_hz
-    accounts[:, AT_MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
-    accounts[:, AT_SLAVE] = power * port_work(contact, poses, "mean")
+    energies[:, AT_MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
+    energies[:, AT_SLAVE] = power * port_work(contact, poses, "mean")
     # A row contains the channel's sum of one period ago.
     channel_times = t - 1 / rates.hand_hz
     for place, first in ((AT_HAND, 0), (AT_COMMAND, 6)):
         for g in range(2):
             so_far = np.interp(t, channel_times, result["ports"][:, first + g])
-            accounts[:, place, g] = so_far - so_far[0]
-    return accounts
+            energies[:, place, g] = so_far - so_far[0]
+    return energies
 
 
 def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the work (N, 2) [J] so far of the load's displayed wrench: translation, rotation."""
+    """Return the work (N, 2) [J] so far of the displayed load wrench: translation, rotation."""
     arm, t = slave_arm(scenario), result.t
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [arm.num_joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))

@@ -94,9 +94,9 @@ _NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
 _NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.02, 0.05), 0.25, 0.1
-_MIN_POSTURES_NEAR_CONTACT = 5  # for a correction
+_MIN_NUM_POSTURES_NEAR_CONTACT = 5  # for a correction
 # Pairs whose capsules are near in fewer postures count although their shapes were never near.
-_RARE_CAPSULE_CONTACT_POSTURE_SHARE = 0.05
+_MAX_POSTURE_SHARE_OF_RARE_CONTACT = 0.05
 
 _TABLE_SHAPE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
@@ -107,7 +107,7 @@ _MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
 
 _ShapePair = tuple[geometry.GeometryId, geometry.GeometryId]
-ParseArm = Callable[[MultibodyPlant], tuple[tree.ModelInstanceIndex, tree.Frame]]
+ArmParser = Callable[[MultibodyPlant], tuple[tree.ModelInstanceIndex, tree.Frame]]
 
 
 class CollisionScene:
@@ -119,7 +119,7 @@ class CollisionScene:
     """
 
     def __init__(
-        self, parse: ParseArm, extra_phi: Array, *, visuals_collide: bool, where: str = ""
+        self, parse: ArmParser, extra_phi: Array, *, visuals_collide: bool, where: str = ""
     ) -> None:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -225,26 +225,26 @@ class CollisionScene:
         capsule_distances = limits.capsule_distances(motions, *fields.values(), pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _required_capsule_distance(shape_distances[a, b], capsule_distances[:, k])
+            distance = _min_capsule_pair_distance(shape_distances[a, b], capsule_distances[:, k])
             near = shape_distances[a, b] < MIN_CLEARANCE_M
             capsules_near = capsule_distances[:, k] < distance
-            if near.sum() >= _MIN_POSTURES_NEAR_CONTACT:
+            if near.sum() >= _MIN_NUM_POSTURES_NEAR_CONTACT:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
                 near_share = np.mean(capsule_distances[:, k] < MIN_CLEARANCE_M)
-                useful = near.any() or 0 < near_share < _RARE_CAPSULE_CONTACT_POSTURE_SHARE
+                useful = near.any() or 0 < near_share < _MAX_POSTURE_SHARE_OF_RARE_CONTACT
             if useful:
                 used.append(k)
                 distances.append(distance)
         return fields | {"capsule_pairs": pairs[used], "min_pair_distances": np.array(distances)}
 
 
-def _required_capsule_distance(shape_distances: Array, capsule_distances: Array) -> float:
+def _min_capsule_pair_distance(shape_distances: Array, capsule_distances: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     low, high = _NEAR_CONTACT_GAPS_M
     touching = (shape_distances > low) & (shape_distances < high)
     excess = np.zeros(1)
-    if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT:
+    if touching.sum() >= _MIN_NUM_POSTURES_NEAR_CONTACT:
         excess = (shape_distances - capsule_distances)[touching]
     required = MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE)
     free = capsule_distances[shape_distances > MIN_CLEARANCE_M]

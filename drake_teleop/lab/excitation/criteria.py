@@ -124,7 +124,7 @@ class Criterion:
 
 @njit(cache=True)
 def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
-    """Write a scalar's gradients (3,) by s, omega, alpha, given g_V, that by the regressor V."""
+    """Write gradients (3,) by s, omega, alpha of a scalar with gradient g_V by the regressor V."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]

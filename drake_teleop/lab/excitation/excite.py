@@ -70,7 +70,7 @@ def excite(
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
     scaled = Criterion(criterion, robot.criterion_scales)
-    if _num_rotation_axes(robot.arm) < 2:
+    if _num_sensor_rotation_axes(robot.arm) < 2:
         what = "the joints rotate the sensor about fewer than two axes, so no motion excites"
         remedy = "use an arm with two, or pass a known load_estimate to MakeTeleopStation (Python)"
         raise DrakeTeleopError(f"{what} all parameters", where=robot.name, remedy=remedy)
@@ -95,7 +95,7 @@ def excite(
     return excitation
 
 
-def _num_rotation_axes(arm: ArmModel) -> int:
+def _num_sensor_rotation_axes(arm: ArmModel) -> int:
     # Axes in S: a SCARA arm has one, although it can rotate about several joints.
     postures = np.random.default_rng(0).uniform(*joint_sampling_range(arm), (20, arm.num_joints))
     first, *others = (tuple(arm.pose(q)[:4]) for q in postures)

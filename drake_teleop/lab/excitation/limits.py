@@ -45,7 +45,7 @@ class Limits(NamedTuple):
         box_middle, box_half: (3,) middle and half size of the box in W [m]; half may be inf.
         capsule_links: (C,) link of each capsule, a row of `link_motions`; -1 is the world.
         capsule_ends, capsule_radius: (C, 2, 3) end points in the link's frame, (C,) radii [m].
-        capsule_pairs, min_pair_distances: (K, 2), and (K,) distances [m], possibly negative.
+        capsule_pairs, min_pair_distances: (K, 2) capsules, (K,) distances [m], maybe negative.
         clearance: minimum distance of the true shapes [m].
     """
 
@@ -94,9 +94,9 @@ def sensor_motion_series(motions):
 
 @njit(cache=True)
 def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
-    """Add a scalar's gradient by q, qd, qdd to `gradient`, given g_V, that by the regressor V."""
-    work, g = _allocate_gradient_buffers(motions), np.empty((3, 3))
-    seed = work[0][-1]
+    """Add to `gradient` derivatives by q, qd, qdd of a scalar with gradient g_V by regressor V."""
+    buffers, g = _allocate_gradient_buffers(motions), np.empty((3, 3))
+    seed = buffers[0][-1]
     for t in range(len(motions)):
         motion = motions[t, -1]
         write_gradients_by_motion(
@@ -105,7 +105,7 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
         seed[:] = 0.0
         for k in range(3):
             add_vector_to_seed(motion, 3 * k, vector_at(g[k], 0), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, work)
+        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
 
 
 @njit(cache=True)
@@ -154,8 +154,8 @@ def _allocate_gradient_buffers(motions):
 
 
 @njit(cache=True)
-def _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, work):
-    seeds, c, virtual = work
+def _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers):
+    seeds, c, virtual = buffers
     pull_back_seeds(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
         gradient[0, t], gradient[1, t], gradient[2, t],
@@ -170,8 +170,8 @@ def _max_torque_use_into(samples, limits, sharpness, gradient):
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
     use = np.abs(tau) / limits.max_torques
     maxima = _exact_and_smooth_maximum(use, sharpness)
-    work = _allocate_gradient_buffers(motions)
-    seeds, c, virtual = work
+    buffers = _allocate_gradient_buffers(motions)
+    seeds, c, virtual = buffers
     for t in range(len(q)):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
@@ -181,7 +181,7 @@ def _max_torque_use_into(samples, limits, sharpness, gradient):
         gradient[2, t] += c * table[:-1, 22]
         gradient[1, t] += c * table[:-1, 23]
         add_torque_to_seeds(table, motions[t], c, virtual, seeds)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, work)
+        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -199,8 +199,8 @@ def _max_sensor_use_into(samples, limits, sharpness, gradient):
             size[t, k] = np.sqrt(dot(part, part))
     use = size / limits.max_sensor_norms
     maxima = _exact_and_smooth_maximum(use, sharpness)
-    work = _allocate_gradient_buffers(motions)
-    seed = work[0][-1]
+    buffers = _allocate_gradient_buffers(motions)
+    seed = buffers[0][-1]
     for t in range(len(motions)):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
@@ -212,7 +212,7 @@ def _max_sensor_use_into(samples, limits, sharpness, gradient):
         add_wrench_to_seed(motion, limits.heaviest_phi, vector_at(g, 0), vector_at(g, 3), seed)
         add_vector_to_seed(motion, 0, vector_at(g, 6), seed)
         add_vector_to_seed(motion, 6, vector_at(g, 9), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, work)
+        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -228,15 +228,15 @@ def _max_workspace_use_into(samples, limits, sharpness, gradient):
     use = (np.abs(x) / limits.box_half).reshape(T, 3 * P)
     maxima = _exact_and_smooth_maximum(use, sharpness)
     by_x = use.reshape(T, P, 3) * (np.sign(x) / limits.box_half)
-    work = _allocate_gradient_buffers(motions)
-    seed = work[0][-1]
+    buffers = _allocate_gradient_buffers(motions)
+    seed = buffers[0][-1]
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
         seed[:] = 0.0
         for k in range(P):
             add_point_to_seed(motions[t, -1], limits.points_S[k], vector_at(by_x[t, k], 0), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, work)
+        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -256,8 +256,8 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
             excess = distance - limits.min_pair_distances[k]
             use[t, k] = 1.0 - excess / ZERO_USE_CLEARANCE_MARGIN_M
     maxima = _exact_and_smooth_maximum(use, sharpness)
-    work = _allocate_gradient_buffers(motions)
-    seeds = work[0]
+    buffers = _allocate_gradient_buffers(motions)
+    seeds = buffers[0]
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
@@ -274,7 +274,7 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
                     start, along = _start_and_direction(limits.capsule_ends[capsule])
                     point = plus(start, scale_vector(share, along))
                     add_point_to_seed(motions[t, row], point, scale_vector(sign, g), seeds[row])
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, work)
+        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 

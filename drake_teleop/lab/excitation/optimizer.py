@@ -145,7 +145,7 @@ _SLSQP_SETTINGS_BY_STAGE = ((12.0, 200.0, 80), (40.0, 400.0, 120))
 # SLSQP outside this factor of the best.
 _MAX_INFEASIBLE_EVALUATIONS, _MAX_CRITERION_RATIO_TO_BEST = 250, 1.08
 # A bounded descent is repeated while it improves the criterion by this factor.
-_MAX_NEW_TO_OLD_CRITERION_FOR_REPEAT = 0.995
+_MAX_CRITERION_RATIO_FOR_REPEAT = 0.995
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ class _DescentSearch:
                 return
             x = self._run_slsqp(x, *stage)
         before = float("inf")
-        while is_bounded and self._best_of_start < _MAX_NEW_TO_OLD_CRITERION_FOR_REPEAT * before:
+        while is_bounded and self._best_of_start < _MAX_CRITERION_RATIO_FOR_REPEAT * before:
             before = self._best_of_start
             x = self._run_slsqp(x, *_SLSQP_SETTINGS_BY_STAGE[-1])
 

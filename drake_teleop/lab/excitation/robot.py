@@ -109,7 +109,7 @@ def RobotFromModel(
 ) -> Robot:
     """Return a serial arm from a model file; weld free bases, lock joints beyond the sensor.
 
-    Acceleration limits [rad/s^2] and payload [kg] are used where the model has none.
+    `acceleration` limits [rad/s^2] replace the model's; `payload` [kg] includes the model's load.
     """
     missing: list[str] = []
 

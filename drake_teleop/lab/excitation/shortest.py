@@ -45,7 +45,7 @@ _MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 _SEED_INCREMENT_PER_ROUND = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
 _MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
-_TOLERANCE_OVER_CRITERION_SHARPNESS = 4.0  # ratio of the maxima's sharpnesses
+_TOLERANCE_SHARPNESS_FACTOR = 4.0  # ratio of the maxima's sharpnesses
 _INFORMATION_REGULARISATION = 1e-11  # of balanced information, which is singular without motion
 
 
@@ -176,7 +176,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         self._period = T = float(np.exp(log_period))
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[0] = 0.0
-        sharpness = _TOLERANCE_OVER_CRITERION_SHARPNESS * criterion_sharpness
+        sharpness = _TOLERANCE_SHARPNESS_FACTOR * criterion_sharpness
         use, worst, g_V = self._tolerance_use_and_regressor_gradient(sharpness)
         smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g[1:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))

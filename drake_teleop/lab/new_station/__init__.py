@@ -41,7 +41,7 @@ def new_command(
     """Write `station.yaml` and `start.png` into `folder`, run the station, return its summary.
 
     Args:
-        tool: model file of the tool; None: the bodies beyond the sensor, or a placeholder.
+        tool: model file of the tool; None: the bodies beyond the sensor, or a stand-in.
         sensor: preset of the wrist sensor; None: the default sensor.
     """
     scenario = folder / "station.yaml"
@@ -92,7 +92,7 @@ def new_command(
 def scenario_text(
     plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
-    """Return the commented scenario as YAML; `slave` has its model, packages and sensor frame."""
+    """Return the commented scenario as YAML; `slave`: its model, package_paths and sensor_frame."""
     s, swing, place = plan.translation_scale, plan.swing_amplitude_m, plan.place
     down = 1.5 * swing + min(0.01, swing / 4.0)  # at most 10 mm into the wall
     if place.is_set_by_position:

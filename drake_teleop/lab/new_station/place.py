@@ -1,4 +1,4 @@
-"""Start of an arm whose tool points down, chosen among random postures.
+"""Start posture of an arm whose tool points down, chosen among random postures.
 
 The start is the posture with the largest reachable cube among those with the best
 `posture_scores`. Frame A is S, rotated so that z_A is the axis of S along the tool.
@@ -79,7 +79,7 @@ _COST_OF_TILTED_TOOL, MIN_COS_OF_TOOL_DOWN = 1.0, 0.9999  # the cosine of 0.8 de
 
 
 class StartPlace(NamedTuple):
-    """Start of an arm whose tool points down.
+    """Start posture of an arm whose tool points down.
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
@@ -238,13 +238,15 @@ def _solve_starts(
         yield StartPlace(pose, by_position, q, 0.0, float(room), float(merit))
 
 
-def _starts_below_6_dof(arm: ArmModel, at: Postures, k: int) -> Iterator[tuple[Array, Array, bool]]:
+def _starts_below_6_dof(
+    arm: ArmModel, postures: Postures, row: int
+) -> Iterator[tuple[Array, Array, bool]]:
     # The posture, and that after the smallest rotation of its tool to downwards, if reachable.
-    R_WA, q = at.R_WS[k], at.q[k]
+    R_WA, q = postures.R_WS[row], postures.q[row]
     yield q, arm.pose(q), False
     K = np.cross(np.cross(R_WA[:, 2], [0.0, 0.0, -1.0]), np.eye(3)).T
     R_WA = (np.eye(3) + K + K @ K / (1.0 - R_WA[2, 2])) @ R_WA
-    pose = np.array([*RotationMatrix(R_WA).ToQuaternion().wxyz(), *at.p_WS[k]])
+    pose = np.array([*RotationMatrix(R_WA).ToQuaternion().wxyz(), *postures.p_WS[row]])
     found, status = find_posture(arm, pose, q)
     if status == IkStatus.OK:
         yield found, pose, False
@@ -363,14 +365,14 @@ def _can_reach_corner(
 
 _MIN_COSINE_TOOL_TO_AXIS = 0.75  # smallest cosine of the angle between tool and axis
 _ROUNDING_TOLERANCE_M = 1e-9
-_MIN_OFFSET_WITH_DIRECTION_M = 0.02  # below, the offset of a centre of mass has no direction
+_MIN_DIRECTION_LENGTH_M = 0.02  # below, the offset of a centre of mass has no direction
 
 
 def nearest_sensor_axis(direction: Array) -> str:
     """Return the axis of S nearest to a vector (3,) [m]; "" if it is short or between axes."""
     size = np.linalg.norm(direction)
     k = int(np.argmax(np.abs(direction)))
-    if size < _MIN_OFFSET_WITH_DIRECTION_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
+    if size < _MIN_DIRECTION_LENGTH_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
         return ""
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 
@@ -379,8 +381,8 @@ def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
     """Return the axis of S along the tool, with the sign away from the arm.
 
     It is the axis nearest to `p_SScm_S` [m], the tool's centre of mass, else to the last joint's
-    axis. The sign is that of the displacement from the arm to this centre, or to So if it is zero.
-    The arm's point is that of the last joint's axis nearest to the joint before.
+    axis. The sign is that of the displacement from a point P of the arm to this centre, or to So
+    if `p_SScm_S` is 0. P is the point of the last joint's axis that is nearest to the joint before.
     """
     R = arm.table[-2:, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(2, 3, 3)
     p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]

@@ -1,4 +1,4 @@
-"""Start, tool, scales and motions of a new station, chosen for an arm and a device."""
+"""Start posture, tool, scales and motions of a new station, chosen for an arm and a device."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _DEFAULT_MASTER_WORKSPACE_HALF_EDGE_M = 0.08  # of the cube around the default s
 _STAND_IN_TOOL_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_BALL_RADIUS_M = 0.05, 0.1, 0.012
-_FREE_ROD_LENGTH_M = 0.05
-_STAND_IN_MASS_AND_MOMENT = _STAND_IN_TOOL_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
+_STAND_IN_FREE_LENGTH_M = 0.05
+_STAND_IN_FIRST_4_OF_PHI = _STAND_IN_TOOL_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
 _SUFFICIENT_POSTURE_SCORE = 1.5  # of a start, at which no further substitute axis is tried
 _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
@@ -40,7 +40,7 @@ SWING_HZ, _MAX_JOINT_SPEED_USE = 1.0, 0.5  # Hz; largest share of the joint spee
 
 @dataclass(frozen=True)
 class StationPlan:
-    """Start, scales and motions of a new station.
+    """Start posture, scales and motions of a new station.
 
     Args:
         swing_amplitude_m: amplitude of the slave in free motion [m].
@@ -87,7 +87,7 @@ def plan_station(
         tool=stand_in if tool is None else Tool(model=str(tool)),
     )
     shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
-    load = shapes.arm.phi_load[:4] - (_STAND_IN_MASS_AND_MOMENT if tool is None else 0.0)
+    load = shapes.arm.phi_load[:4] - (_STAND_IN_FIRST_4_OF_PHI if tool is None else 0.0)
     has_load, own_tool = load[0] > _MIN_TOOL_MASS_KG, False
     p_SScm_S = load[1:] / load[0] if has_load else np.zeros(3)
     tool_axis = start.sensor_axis_along_tool(shapes.arm, p_SScm_S)
@@ -195,7 +195,7 @@ def find_base_plane_height(shapes: PostureShapes) -> float:
     """Return the height z_W of the base plane [m]: the lowest point of shapes fixed to the world.
 
     Without such shapes it is 0, or the first joint's height if that is lower. Below a hanging arm
-    it is 0, or the lowest height of the sensor if that is lower.
+    it is 0, or the sensor's lowest height in random postures if that is lower.
     """
     heights = shapes.points_on_bodies_W(shapes.anchored_slave_bodies())[:, 2]
     is_known = len(heights) > 0 and not shapes.has_sticks
@@ -215,13 +215,13 @@ def _make_stand_in_tool(axis: str, length: float) -> Tool:
 def _stand_in_tool_length_m(shapes: PostureShapes, axis: str) -> float:
     link_bodies = shapes.bodies_welded_to_sensor() - {shapes.tool_body}
     end = start.extent_beyond_sensor(shapes, link_bodies, axis)
-    return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_ROD_LENGTH_M)) / 100.0))
+    return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _STAND_IN_FREE_LENGTH_M)) / 100.0))
 
 
 def _without_weak_torque_limits(
     arm: ArmModel, q: Array, load_share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
-    """Return the arm with infinite limits for weak joints, the names of these joints, and texts.
+    """Return the arm with infinite torque limits for weak joints, their names, and one text each.
 
     A weak joint's torque limit cannot hold the arm at q with `load_share` of its load.
     """

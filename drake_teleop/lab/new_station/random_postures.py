@@ -27,7 +27,7 @@ _SENSOR_RADIUS_RANGE_OVER_REACH, _SENSOR_HEIGHT_RANGE_OVER_REACH = (0.35, 0.85),
 _PREFERRED_RADIUS_OVER_REACH = 0.6
 _PREFERRED_TOOL_HEIGHT_OVER_REACH = 0.25
 _MIN_PREFERRED_SENSOR_HEIGHT_OVER_REACH = -0.4
-_MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
+_MAX_SENSOR_COORDINATE_W_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_END_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 _HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_JOINT_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
@@ -137,7 +137,7 @@ def select_suitable_postures(
         (from_first[:, 2], _SENSOR_HEIGHT_RANGE_OVER_REACH),
     ):
         in_region &= (values / reach > low) & (values / reach < high)
-    in_region &= (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1)
+    in_region &= (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_W_M).all(axis=1)
     points_down = postures.R_WS[:, 2, 2] < -_MIN_COS_TOOL_TILT
     above_plane: Any = (postures.origins[:, raised, 2] > lowest_origin).all(axis=1)
     rows, removed = np.arange(len(radius)), list[tuple[str, int]]()

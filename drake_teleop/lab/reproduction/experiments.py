@@ -61,12 +61,12 @@ class RunsWithAndWithoutContact:
 
     @property
     def in_contact(self) -> NDArray[np.bool_]:
-        """(N,) True where the simulated tool touches."""
+        """(N,) True in true contact and in short gaps, see `is_in_contact`."""
         return is_in_contact(self.touched.result)
 
     @property
     def response_span_s(self) -> tuple[float, float]:
-        """Times [s] of first contact and of the end of the last one's filter response, or inf."""
+        """Times [s] of first contact and of settled filters after the last contact, or inf."""
         times = self.touched.result.t[self.in_contact]
         return (times[0], times[-1] + FILTER_SETTLING_S) if len(times) else (np.inf, np.inf)
 
@@ -97,7 +97,7 @@ def simulate_contact(
     seed = scenario.simulation.seed
     without = replace(scenario, sheet_spring=None, simulation__seed=seed + 1)
     touched = simulate_motion(scenario, estimate, stage("Fig. 8: contact transition"))
-    free = simulate_motion(without, estimate, stage("Fig. 8: the same without contact"))
+    free = simulate_motion(without, estimate, stage("Fig. 8: same motion without contact"))
     return RunsWithAndWithoutContact(touched, free)
 
 

@@ -31,7 +31,6 @@ from drake_teleop.logs.report import PARAMETER_FORMATS
 
 FORCE_Z_INDEX, TORQUE_X_INDEX = 2, 3
 
-
 _FIGURE_TITLES = {
     "fig6": "Fig. 6: scaling and elimination of non-contact forces",
     "fig7": "Fig. 7: scaling and elimination of non-contact torques",
@@ -89,7 +88,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     return [
         _compare_range("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
                        s["free_force.peak_raw_N"], "N", 90, 115),
-        _compare_range("set", "Fig. 6: the same at the master", "about 5.7 N",
+        _compare_range("set", "Fig. 6: peak force at the master, σ = 1", "about 5.7 N",
                        s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
         _compare_range("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
                        s["free_force.half_ratio"], "", 0.48, 0.52),

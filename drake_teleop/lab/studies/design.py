@@ -35,7 +35,7 @@ class Factor:
     vectors: list[list[float]] = plain([], "vectors, instead of numbers")
     low: float | None = plain(None, "start of a range, instead of a list")
     high: float | None = plain(None, "end of the range")
-    levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
+    levels: int = quantity(3, "1", 2, 1000, "number of values from low to high (factorial)")
 
     def level_values(self) -> Sequence[FactorValue]:
         """Return the listed values, or `levels` evenly spaced numbers from `low` to `high`."""
@@ -99,11 +99,11 @@ class Study:
         "all combinations of the values, scrambled Sobol points, or a search for the best point",
     )
     samples: int = quantity(
-        64, "1", 1, 2**20, "points of a Sobol design (a power of two) or of an adaptive design"
+        64, "1", 1, 2**20, "number of points of a Sobol (power of two) or adaptive design"
     )
     objective: str = plain("", "measure whose mean over the repeats an adaptive design minimises")
-    batch: int = quantity(8, "1", 1, 2**10, "points of one batch of an adaptive design")
-    repeats: int = quantity(1, "1", 1, 1e6, "runs of each point, with different seeds")
+    batch: int = quantity(8, "1", 1, 2**10, "number of points in one batch of an adaptive design")
+    repeats: int = quantity(1, "1", 1, 1e6, "number of runs of each point, with different seeds")
     seed: int = quantity(0, "1", 0, 1e9, "seed of the Sobol points and of the first repeat")
     measures: list[str] = plain(default_measures(), "measures of each run")
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "threshold of time_above_force_s")

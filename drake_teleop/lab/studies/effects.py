@@ -299,7 +299,7 @@ def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return means, half widths, `complete`, `front` of points; None without `PARETO_MEASURES`."""
+    """Return a row per point: means, half widths, flags; None without all `PARETO_MEASURES`."""
     import polars as pl
 
     if not set(PARETO_MEASURES) <= set(study.measures) or rows.is_empty():
@@ -316,7 +316,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True (n,) for complete points, rows of minimised `values`, that none dominates."""
+    """Return flags (n,) of complete rows of `values` (minimised) that no complete row dominates."""
     found = complete.copy()
     other = values[complete]
     for index in np.flatnonzero(complete):

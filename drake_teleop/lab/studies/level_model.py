@@ -39,7 +39,7 @@ def missing_value_reasons(
 ) -> list[str]:
     """Return why each level or cell has no value; "" where `compared` is True.
 
-    `points` and `successes`: number of points of each, and of its runs with a value.
+    `points` and `successes`: numbers of points, and of runs with a value, at each level or cell.
     """
     why = np.where(points == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
@@ -104,7 +104,7 @@ class LevelModel:
     Attributes:
         codes: for each factor, the effect codes (levels, k) of its levels, columns of X.
         products: columns of X with products of factors (i, j).
-        failed: True for excluded cells (levels, levels) of factors (i, j); (i, i): for levels.
+        excluded_cells: by factors (i, j), flags (levels, levels); of (i, i) the diagonal counts.
         X: (n, p) design matrix; first column: the mean.
         pseudo_inverse: (p, n) pseudo-inverse of X.
     """
@@ -112,19 +112,19 @@ class LevelModel:
     factors: list[Levels]
     codes: list[Array]
     products: dict[tuple[int, int], slice]
-    failed: dict[tuple[int, int], BooleanArray]
+    excluded_cells: dict[tuple[int, int], BooleanArray]
     X: Array
     pseudo_inverse: Array
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags as `FactorialModel` does, and weights of coefficients in levels' means."""
-        others = sorted(set(itertools.chain(*self.failed)) - set(factors))
+        """Return flags as in `FactorialModel`, and weights from coefficients to levels' means."""
+        others = sorted(set(itertools.chain(*self.excluded_cells)) - set(factors))
         related = [*factors, *others]
         shape = [len(self.factors[factor].names) for factor in related]
         at = dict(zip(related, np.indices(shape).reshape(len(shape), -1), strict=True))
         there = np.ones(math.prod(shape), dtype=bool)
-        for (i, j), failed in self.failed.items():
-            there &= ~failed[at[i], at[j]]
+        for (i, j), excluded in self.excluded_cells.items():
+            there &= ~excluded[at[i], at[j]]
         count = math.prod(shape[: len(factors)])
         rows, columns = largest_complete_block(there.reshape(count, -1))
         terms = self._regressor_rows_of_levels(at).reshape(count, -1, self.X.shape[1])
@@ -144,30 +144,30 @@ class LevelModel:
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
-            over_points = design * self._std_over_residual_std(terms)
+            over_points = design * self._relative_std_of_means(terms)
             halves.append(np.hypot(over_points, self._effects_half_width_over_seeds(table, terms)))
         return effects, halves
 
-    def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
+    def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
         seeds = table.shape[1]
-        each = terms @ self.pseudo_inverse @ table
+        each = weights @ self.pseudo_inverse @ table
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
-        over_points = self._half_width_over_points(table, 1) * self._std_over_residual_std(terms)
+        over_points = self._half_width_over_points(table, 1) * self._relative_std_of_means(weights)
         return each.mean(axis=1), np.hypot(over_points, over_seeds)
 
-    def _regressor_rows_of_levels(self, at: dict[int, NDArray[np.int64]]) -> Array:
-        count = len(next(iter(at.values())))
+    def _regressor_rows_of_levels(self, level_indices: dict[int, NDArray[np.int64]]) -> Array:
+        count = len(next(iter(level_indices.values())))
         terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
         for factor, codes in enumerate(self.codes):
-            if factor in at:
-                terms[:, first : first + codes.shape[1]] = codes[at[factor]]
+            if factor in level_indices:
+                terms[:, first : first + codes.shape[1]] = codes[level_indices[factor]]
             first += codes.shape[1]
         for (i, j), columns in self.products.items():
-            if i in at and j in at:
-                a, b = (self.factors[k].middle_columns[at[k]] for k in (i, j))
+            if i in level_indices and j in level_indices:
+                a, b = (self.factors[k].middle_columns[level_indices[k]] for k in (i, j))
                 terms[:, columns] = _pair_products(a, b)
         return terms
 
@@ -181,8 +181,8 @@ class LevelModel:
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (num_columns * self._degrees_of_freedom), least)
 
-    def _std_over_residual_std(self, terms: Array) -> Array:
-        return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
+    def _relative_std_of_means(self, weights: Array) -> Array:
+        return np.linalg.norm(weights @ self.pseudo_inverse, axis=1)
 
     def _half_width_over_points(self, table: Array, num_intervals: int) -> float:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
@@ -194,7 +194,7 @@ class LevelModel:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
         moved = np.sum((effect_rows @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
-        relative_variance = np.sum(self._std_over_residual_std(effect_rows) ** 2)
+        relative_variance = np.sum(self._relative_std_of_means(effect_rows) ** 2)
         noise = self._residual_variance(apart, seeds - 1) * relative_variance
         deviation = np.sqrt(max(moved - noise, 0.0) / len(effect_rows) / seeds)
         return _student_quantile(len(self.factors), seeds - 1) * float(deviation)

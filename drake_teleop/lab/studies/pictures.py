@@ -64,7 +64,7 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
         for line, measure in zip(grid, measures, strict=True):
             found = effects.main_effects(study, rows, measure)
             for axes, factor in zip(line, factors, strict=True):
-                _draw_levels(axes, found[factor.field])
+                _draw_level_means(axes, found[factor.field])
                 fitted |= found[factor.field].is_fitted
                 reasons |= set(found[factor.field].missing_reasons)
             words = textwrap.wrap(measure.replace("_", "_ "), 18)
@@ -76,22 +76,22 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
     return figure
 
 
-def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
-    place = np.arange(len(found.level_names))
-    bars = np.nan_to_num(found.effect_half_width)
-    axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-    _label_levels(axes, found.level_names)
+def _draw_level_means(axes: Axes, effect: effects.MainEffect) -> None:
+    place = np.arange(len(effect.level_names))
+    bars = np.nan_to_num(effect.effect_half_width)
+    axes.errorbar(place, effect.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
+    _label_levels(axes, effect.level_names)
     axes.set_xlim(-0.5, len(place) - 0.5)
-    for level in place[np.isnan(found.mean)]:
-        bar = _make_hatched_cell(found.missing_reasons[level], (level - 0.5, 0.0))
+    for level in place[np.isnan(effect.mean)]:
+        bar = _make_hatched_cell(effect.missing_reasons[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
-    if np.isnan(found.mean).all():
-        words = TOO_FEW_POINTS if TOO_FEW_POINTS in found.missing_reasons else ""
+    if np.isnan(effect.mean).all():
+        words = TOO_FEW_POINTS if TOO_FEW_POINTS in effect.missing_reasons else ""
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
-    axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
-    axes.set_title(_describe_used_combinations(found), fontsize=7, color=GREY, loc="right")
+    axes.axhline(np.nanmax(effect.mean - effect.effect), color=GREY, lw=0.8, ls=":")
+    axes.set_title(_describe_used_combinations(effect), fontsize=7, color=GREY, loc="right")
 
 
 def _label_levels(axes: Axes, levels: list[str]) -> None:
@@ -101,13 +101,13 @@ def _label_levels(axes: Axes, levels: list[str]) -> None:
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
 
-def _describe_used_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
-    used, unused = found.num_used_combinations, found.num_unused_combinations
+def _describe_used_combinations(means: effects.MainEffect | effects.PairMeans) -> str:
+    used, unused = means.num_used_combinations, means.num_unused_combinations
     return f"over {used} of {used + unused} combinations of the other factors" if unused else ""
 
 
-def _make_hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
-    return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_BY_REASON[why], fc="white", ec=GREY, lw=0)
+def _make_hatched_cell(reason: str, corner: tuple[float, float]) -> Rectangle:
+    return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_BY_REASON[reason], fc="white", ec=GREY, lw=0)
 
 
 def _draw_hatch_legend(figure: Figure, missing_reasons: Iterable[str]) -> None:

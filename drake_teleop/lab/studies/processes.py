@@ -96,7 +96,7 @@ def _joblib_pool(jobs: int) -> Any:
 def _joblib_task(run: RunRows, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
-    return delayed(_run_chunk_with_start_count)(run, chunk, store)
+    return delayed(_run_chunk_and_count_start)(run, chunk, store)
 
 
 def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
@@ -111,7 +111,7 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     return found
 
 
-def _run_chunk_with_start_count(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
+def _run_chunk_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     store.count_start_of_chunk(chunk[0]["run"])
     try:
         return run(chunk)

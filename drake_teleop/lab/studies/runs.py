@@ -43,7 +43,7 @@ _NUM_RUNS_FOR_TIME_ESTIMATE = 16  # latest runs, for the estimate of the remaini
 def run_study(
     study: Study,
     out: Path,
-    work: RunFunction,
+    run_function: RunFunction,
     inputs: dict[str, Any],
     *,
     jobs: int = -1,
@@ -70,7 +70,7 @@ def run_study(
     identity = dataclasses.asdict(study) | inputs | {"design_sha256": digest}
     identity |= {"version": __version__, "single_runs": _NUM_SINGLE_RUNS}  # determines chunks
     schema = _schema_of_run_table(study, first_rows[0])
-    run = partial(_run_chunk, work, [factor.field for factor in study.factors])
+    run = partial(_run_chunk, run_function, [factor.field for factor in study.factors])
     chunks = _split_rows_into_chunks(first_rows)
     chunks = chunks if part is None else part.chunks(chunks)
     total = sum(map(len, chunks)) if part else study.num_points() * study.repeats
@@ -155,14 +155,14 @@ class StudyProgress:
         self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
 
 
-def _run_chunk(work: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:
+def _run_chunk(run_function: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:
     found = []
     with one_blas_thread():
         for row in rows:
             start = time.monotonic()
             values = {name: row[name] for name in names}
             try:
-                measures: dict[str, Any] = work(values, row["seed"])
+                measures: dict[str, Any] = run_function(values, row["seed"])
             except DrakeTeleopError as error:
                 measures = {"error": str(error)}
             except Exception as error:  # other runs must continue

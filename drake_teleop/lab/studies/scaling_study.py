@@ -26,7 +26,6 @@ from drake_teleop.lab.studies.study import LoadStudy, study_command
 if TYPE_CHECKING:
     import polars as pl
 
-
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
 CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
@@ -60,7 +59,7 @@ class ScaleRating:
 def scaling_study_command(
     out: Path, *, quiet: bool = False, progress: bool = True, **options: Any
 ) -> dict[str, Any]:
-    """Run the missing runs of the scaling studies; write results; return those of answer.json.
+    """Run the missing runs of the scaling studies; write results; return the data of answer.json.
 
     The other options are those of `study_command`.
     """
@@ -70,16 +69,16 @@ def scaling_study_command(
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _criterion_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
-    answers = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
+    ratings = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
-        "choice": {selection: _find_best_scales(found) for selection, found in answers.items()},
+        "choice": {selection: _find_best_scales(rating) for selection, rating in ratings.items()},
         "eta": _summarise_measures_by_eta(rows[_ETA_STUDY_NAME]),
     }
     with files.output_folder(out, "answer.json"):
-        files.write_table(out / "answer.csv", _merit_table(answers))
+        files.write_table(out / "answer.csv", _merit_table(ratings))
         files.write_picture(out / "answer.png", draw_task_criteria_over_scales(rows))
-        files.write_picture(out / "choice.png", draw_best_scales(answers, *_sigmas_and_gammas()))
+        files.write_picture(out / "choice.png", draw_best_scales(ratings, *_sigmas_and_gammas()))
         files.write_json(out / "answer.json", summary)
     if not quiet:
         _print_best_scales(summary, out)
@@ -98,7 +97,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     draws = generator.multinomial(count, equal, _NUM_BOOTSTRAP_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
-        np.mean([_means_over_unscaled(tables[task][name], weights) for name in names], axis=0)
+        np.mean([_mean_ratios_to_unscaled(tables[task][name], weights) for name in names], axis=0)
         for task, names in counted.items()
         if names
     ]
@@ -118,7 +117,7 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     return ScaleRating(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
-def _means_over_unscaled(table: Array, weights: Array) -> Array:
+def _mean_ratios_to_unscaled(table: Array, weights: Array) -> Array:
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
@@ -146,41 +145,41 @@ def _criterion_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _find_best_scales(found: ScaleRating) -> dict[str, Any] | None:
-    if not np.isfinite(found.merit).any():
+def _find_best_scales(rating: ScaleRating) -> dict[str, Any] | None:
+    if not np.isfinite(rating.merit).any():
         return None
     sigmas, gammas = _sigmas_and_gammas()
-    s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-    near = np.argwhere(found.best_share >= _MIN_SHARE_OF_DRAWS_AS_BEST)
+    s, g = np.unravel_index(np.nanargmin(rating.merit), rating.merit.shape)
+    near = np.argwhere(rating.best_share >= _MIN_SHARE_OF_DRAWS_AS_BEST)
     return {
         "sigma": sigmas[s],
         "gamma": gammas[g],
-        "merit": found.merit[s, g],
-        "interval": [found.merit_low[s, g], found.merit_high[s, g]],
-        "best_in": found.best_share[s, g],
+        "merit": rating.merit[s, g],
+        "interval": [rating.merit_low[s, g], rating.merit_high[s, g]],
+        "best_in": rating.best_share[s, g],
         "others": [
-            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": found.best_share[i, j]}
+            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": rating.best_share[i, j]}
             for i, j in near
             if (i, j) != (s, g)
         ],
     }
 
 
-def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
+def _merit_table(ratings: dict[str, ScaleRating]) -> pl.DataFrame:
     import polars as pl
 
     sigmas, gammas = _sigmas_and_gammas()
     tables = [
         {
-            "way": [selection] * found.merit.size,
+            "way": [selection] * rating.merit.size,
             "sigma": np.repeat(sigmas, len(gammas)),
             "gamma": np.tile(gammas, len(sigmas)),
-            "merit": found.merit.ravel(),
-            "low": found.merit_low.ravel(),
-            "high": found.merit_high.ravel(),
-            "best_in": found.best_share.ravel(),
+            "merit": rating.merit.ravel(),
+            "low": rating.merit_low.ravel(),
+            "high": rating.merit_high.ravel(),
+            "best_in": rating.best_share.ravel(),
         }
-        for selection, found in answers.items()
+        for selection, rating in ratings.items()
     ]
     return pl.concat(map(pl.DataFrame, tables))
 
@@ -224,9 +223,9 @@ def draw_task_criteria_over_scales(rows: dict[str, pl.DataFrame]) -> Figure:
 
 
 def draw_best_scales(
-    answers: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
+    ratings: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
+    known = np.concatenate([rating.merit[np.isfinite(rating.merit)] for rating in ratings.values()])
     farthest = np.abs(np.log2(known)).max(initial=0.01)
     # The colour scale is symmetric about 1 in ratios; excluded points are grey.
     ends = 2.0**-farthest, 2.0**farthest
@@ -235,17 +234,17 @@ def draw_best_scales(
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(2, 2)
-        for axes, (selection, found) in zip(grid.ravel(), answers.items(), strict=True):
-            drawn = axes.imshow(found.merit, origin="lower", aspect="auto", cmap=cmap, norm=scale)
+        for axes, (selection, rating) in zip(grid.ravel(), ratings.items(), strict=True):
+            drawn = axes.imshow(rating.merit, origin="lower", aspect="auto", cmap=cmap, norm=scale)
             axes.grid(False)
             axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas])
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
             axes.set_xlabel("$\\gamma$")
             axes.set_ylabel("$\\sigma$")
             axes.set_title(f"criteria: {selection}")
-            for i, j in np.ndindex(found.merit.shape):
-                dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
-                axes.text(j, i, _merit_cell_text(found, i, j), color="white" if dark else "black",
+            for i, j in np.ndindex(rating.merit.shape):
+                dark = abs(scale(rating.merit[i, j]) - 0.5) > 0.3
+                axes.text(j, i, _merit_cell_text(rating, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
         bar = figure.colorbar(drawn, ax=grid, label="merit (1: that of sigma = gamma = 1)")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
@@ -256,11 +255,11 @@ def draw_best_scales(
     return figure
 
 
-def _merit_cell_text(found: ScaleRating, i: int, j: int) -> str:
-    if not np.isfinite(found.merit[i, j]):
-        return f"{found.failure_share[i, j]:.0%} fail"
-    best = f"\nbest: {found.best_share[i, j]:.0%}" if found.best_share[i, j] >= 0.005 else ""
-    return f"{found.merit[i, j]:.2f}{best}"
+def _merit_cell_text(rating: ScaleRating, i: int, j: int) -> str:
+    if not np.isfinite(rating.merit[i, j]):
+        return f"{rating.failure_share[i, j]:.0%} fail"
+    best = f"\nbest: {rating.best_share[i, j]:.0%}" if rating.best_share[i, j] >= 0.005 else ""
+    return f"{rating.merit[i, j]:.2f}{best}"
 
 
 def _print_best_scales(summary: dict[str, Any], out: Path) -> None:

@@ -178,7 +178,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Link the result files of all shards in `out` into its table; raise if runs are missing."""
+    """Link the part files of all shards in `out` into `store`; raise if runs are missing."""
     names = (re.fullmatch(r"([1-9]\d*)-of-([1-9]\d*)", p.name) for p in out.glob("shards/*"))
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:

@@ -50,8 +50,8 @@ _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of 
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
 _MIN_WALL_N_M, _MAX_WALL_N_M = 100.0, 60e3  # N/m, range of the leaf's model
 _NUM_TESTED_WALL_STIFFNESSES = 4  # from the softest to the stiffest
-_MAX_DT_S = 2e-3  # longer than the events' period; else tiny steps precede the events
-GIVEN_SETTINGS_NAME = "as given"
+_MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
+USER_SETTINGS_NAME = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
 
 
@@ -81,7 +81,7 @@ class OperatingRange:
 
     @property
     def corners(self) -> list[tuple[str, float]]:
-        """Softest and firmest grip, each at the stiffest, then at the softest wall [N/m]."""
+        """Pairs of softest or firmest grip and wall [N/m]: stiffest wall first, then softest."""
         hands = dict.fromkeys((self.hands[0], self.hands[-1]))
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
@@ -141,7 +141,7 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
         raise DrakeTeleopError(what, where="network", remedy=remedy)
     check_can_press(scenario)
     force_scale = scenario.force_scaling.force_scale
-    simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_DT_S, end_with_task=False)
+    simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
     return replace(
         scenario.without_environment(),
         simulation=simulation,
@@ -162,14 +162,14 @@ class TunedSettings:
     sigma_inertia: float
     low_pass_hz: float
 
-    def passivity(self, stated: OperatingRange) -> PassivityConfig:
+    def passivity(self, operating_range: OperatingRange) -> PassivityConfig:
         """Return the passivity settings; `charged_tdpa` assumes the range's firmest grip."""
-        hand = GRIP_IMPEDANCES[stated.hands[-1]]
+        hand = GRIP_IMPEDANCES[operating_range.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
         return PassivityConfig(method=self.method, charged_tdpa=known)
 
-    def apply(self, base: Scenario, stated: OperatingRange) -> Scenario:
+    def apply(self, base: Scenario, operating_range: OperatingRange) -> Scenario:
         sensor = base.wrist_sensor
         low_pass_hz = sensor.bandwidth_hz if sensor.ideal else self.low_pass_hz
         return replace(
@@ -180,7 +180,7 @@ class TunedSettings:
             force_scaling__sigma_weight=0.0,
             force_scaling__sigma_inertia=self.sigma_inertia,
             force_scaling__gamma=self.gamma,
-            passivity=self.passivity(stated),
+            passivity=self.passivity(operating_range),
         )
 
 
@@ -201,7 +201,7 @@ class StationPressTrial:
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.user_scenario
-        if values["method"] != GIVEN_SETTINGS_NAME:
+        if values["method"] != USER_SETTINGS_NAME:
             scenario = settings_from_values(values).apply(self.base_scenario, self.operating_range)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel, passivity = self.base_scenario.channel, scenario.passivity
@@ -255,8 +255,8 @@ class OneAxisGammaSearch:
         def stability_sign(log_gamma: float) -> float:
             tried, found = dataclasses.replace(settings, gamma=float(np.exp(log_gamma))), []
             for corner in self.operating_range.corners:
-                found.append(self.share_in_one_axis(axis, tried, *corner, seed))
-                if not is_share_accepted(found[-1], MAX_TUNED_FORCE_ERROR):
+                found.append(self.displayed_force_share(axis, tried, *corner, seed))
+                if not is_force_share_accepted(found[-1], MAX_TUNED_FORCE_ERROR):
                     return -1.0
             shares[tried.gamma] = min(found)
             return 1.0
@@ -278,7 +278,7 @@ class OneAxisGammaSearch:
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
         return float(_TESTED_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
-    def share_in_one_axis(
+    def displayed_force_share(
         self, axis: OneAxis, settings: TunedSettings, grip: str, wall: float, seed: int
     ) -> float:
         """Return displayed over scaled contact force in a one-axis run; 0: unstable or noisy."""
@@ -300,7 +300,7 @@ class OneAxisGammaSearch:
         return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 
 
-def is_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
+def is_force_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     return abs(share - 1.0) <= max_error
 
 

@@ -91,19 +91,19 @@ def tune(
     of_trials = {name: getattr(base, name) for name in names}
     own = replace(given, contact_detection=None, **of_trials)
     trial = StationPressTrial(own, base, stated, load.estimate)
-    basis = {
+    inputs = {
         "given": to_commented_yaml(given),
         "base": to_commented_yaml(base),
         "stated": dataclasses.asdict(stated),
         "estimate": load.estimate.tolist(),
     }
-    found = search_settings(trial, make_study_executor(out, basis, jobs, shown))
+    found = search_settings(trial, make_study_executor(out, inputs, jobs, shown))
     tuned = replace(given, channel=base.channel, force_scaling=base.force_scaling)
     tuned = found.settings.apply(tuned, stated)
     summary = _make_tuning_summary(found, tuned, stated, network)
     with files.output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
-        pictures = {"trade_off": draw_detectable_force_over_gamma_margin(found, summary)}
+        pictures = {"trade_off": draw_detectable_force_over_margin(found, summary)}
         package = "drake_teleop.lab.tuning"
         write_report_page_and_pictures(out, package, pictures, summary=summary)
         files.write_json(out / "summary.json", summary)
@@ -136,7 +136,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
-    unscaled = TunedSettings(press_trial.GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
+    unscaled = TunedSettings(press_trial.USER_SETTINGS_NAME, 1.0, 0.0, own)
     given = execute("as_given", _make_press_study(unscaled, ends, [stiffest]), trial)
     unscaled = dataclasses.replace(unscaled, method="ledger")
     quiet = execute("noise", _make_press_study(unscaled, ends, [stiffest]), trial)
@@ -215,11 +215,11 @@ def meets_requirements(
     row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
 ) -> bool:
     """Return whether a run is at rest, quiet and within `max_force_error` of the contact force."""
-    exact = press_trial.is_share_accepted(row["share"], max_force_error)
+    exact = press_trial.is_force_share_accepted(row["share"], max_force_error)
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 
 
-def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
+def make_study_executor(out: Path, inputs: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
     """Return a function that runs a study in a folder of `out` with the study's name."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
@@ -228,7 +228,7 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
             def name_progress(_: str) -> UpdateProgress:
                 return stage(f"Trials {name}")
 
-            found = run_study(study, out / name, work, basis, jobs=jobs, progress=name_progress)
+            found = run_study(study, out / name, work, inputs, jobs=jobs, progress=name_progress)
         for row in found.rows(named=True):
             if row["error"]:
                 raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
@@ -266,19 +266,19 @@ def _make_press_study(
 
 
 def _make_tuning_summary(
-    found: SearchResult, tuned: Scenario, stated: press_trial.OperatingRange, network: str | None
+    result: SearchResult, tuned: Scenario, stated: press_trial.OperatingRange, network: str | None
 ) -> dict[str, Any]:
-    scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
-    failed = [row for row in found.beyond_runs if not meets_requirements(row)]
+    scale, gamma = tuned.force_scaling.force_scale, result.settings.gamma
+    failed = [row for row in result.beyond_runs if not meets_requirements(row)]
     fails_at: dict[str, Any] | None = None
     if failed:
         hand, wall, failing = (failed[0][name] for name in ("hand", "wall", "gamma"))
         fails_at = {"hand": hand, "wall_N_per_m": wall, "gamma_factor": failing / gamma}
-    shares = [row["share"] for row in found.inside_runs]
-    edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
-    holds = all(map(meets_requirements, found.given_runs))
-    worst_given = max(row["threshold_N"] for row in found.given_runs)
-    figures = {
+    shares = [row["share"] for row in result.inside_runs]
+    edge = [row for row in result.inside_runs if row["gamma"] == gamma]  # without margin
+    holds = all(map(meets_requirements, result.given_runs))
+    worst_given = max(row["threshold_N"] for row in result.given_runs)
+    results = {
         "share": min(shares),
         "largest_share": max(shares),
         "threshold_N": max(row["threshold_N"] for row in edge),
@@ -286,11 +286,11 @@ def _make_tuning_summary(
         "rest_force_N": max(row["rest_force_N"] for row in edge),
         "margin": stated.requirements.loop_gain_margin,
         "fails_at": fails_at,
-        "beyond_N_per_m": max(row["wall"] for row in found.beyond_runs),
-        "beyond_gamma_factor": max(row["gamma"] for row in found.beyond_runs) / gamma,
+        "beyond_N_per_m": max(row["wall"] for row in result.beyond_runs),
+        "beyond_gamma_factor": max(row["gamma"] for row in result.beyond_runs) / gamma,
     }
-    settings = dataclasses.asdict(found.settings) | {"sigma_weight": 0.0, "force_scale": scale}
-    about = {
+    settings = dataclasses.asdict(result.settings) | {"sigma_weight": 0.0, "force_scale": scale}
+    stated_data = {
         "hands": list(stated.hands),
         "walls": list(stated.walls),
         "network": network or tuned.channel.network,
@@ -298,39 +298,39 @@ def _make_tuning_summary(
     }
     return {
         "settings": settings,
-        "stated": about,
-        "figures": figures,
-        "sentences": _tuning_result_sentences(found.settings, figures, about, scale),
-        "search": found.searched_settings,
-        "trials": [*found.given_runs, *found.inside_runs, *found.beyond_runs],
+        "stated": stated_data,
+        "figures": results,
+        "sentences": _tuning_result_sentences(result.settings, results, stated_data, scale),
+        "search": result.searched_settings,
+        "trials": [*result.given_runs, *result.inside_runs, *result.beyond_runs],
     }
 
 
 def _tuning_result_sentences(
-    chosen: TunedSettings, figures: dict[str, Any], about: dict[str, Any], scale: float
+    chosen: TunedSettings, results: dict[str, Any], stated: dict[str, Any], force_scale: float
 ) -> list[str]:
-    low, high = (1e-3 * wall for wall in about["walls"])
-    hands = " to ".join(dict.fromkeys((about["hands"][0], about["hands"][-1])))
-    before = figures["given_threshold_N"]
+    low, high = (1e-3 * wall for wall in stated["walls"])
+    hands = " to ".join(dict.fromkeys((stated["hands"][0], stated["hands"][-1])))
+    before = results["given_threshold_N"]
     instead = "the scenario's own settings fail for these hands and walls"
     if before is not None:
         instead = f"with the scenario's own settings it is {before:.2f} N"
     lines = [
         f"Use passivity.method {chosen.method}, gamma {chosen.gamma:.2f}, sigma_weight 0, "
-        f"sigma_inertia {chosen.sigma_inertia:g}, force_scale {scale:.4g}, and a low-pass of "
+        f"sigma_inertia {chosen.sigma_inertia:g}, force_scale {force_scale:.4g}, and a low-pass of "
         f"{chosen.low_pass_hz:g} Hz.",
         f"The station is stable for a {hands} grip at walls of {low:g} to {high:g} kN/m over "
-        f"{about['network']}, also with gamma {figures['margin']:g} times as large.",
-        f"It renders {figures['share']:.2f} to {figures['largest_share']:.2f} of the scaled "
-        f"contact force; above 5 Hz the force at rest has {figures['rest_force_N']:.3f} N rms.",
-        f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
+        f"{stated['network']}, also with gamma {results['margin']:g} times as large.",
+        f"It renders {results['share']:.2f} to {results['largest_share']:.2f} of the scaled "
+        f"contact force; above 5 Hz the force at rest has {results['rest_force_N']:.3f} N rms.",
+        f"The smallest contact force that the operator detects is {results['threshold_N']:.2f} N "
         f"at the tool; {instead}.",
     ]
     last = (
-        f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
-        f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
+        f"No failure was found up to walls of {results['beyond_N_per_m'] / 1e3:g} kN/m, or "
+        f"with gamma {results['beyond_gamma_factor']:.2f} times as large."
     )
-    if fails := figures["fails_at"]:
+    if fails := results["fails_at"]:
         wall, factor = fails["wall_N_per_m"] / 1e3, fails["gamma_factor"]
         last = (
             f"The station fails with a {fails['hand']} grip at a wall of {wall:g} kN/m and gamma "
@@ -339,11 +339,11 @@ def _tuning_result_sentences(
     return [*lines, last]
 
 
-def draw_detectable_force_over_gamma_margin(found: SearchResult, summary: dict[str, Any]) -> Figure:
+def draw_detectable_force_over_margin(result: SearchResult, summary: dict[str, Any]) -> Figure:
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
         axes = figure.subplots()
-        margins, searched = np.geomspace(1.0, 4.0, 50), found.searched_settings
+        margins, searched = np.geomspace(1.0, 4.0, 50), result.searched_settings
         methods = dict.fromkeys(row["method"] for row in searched)
         for colour, method in zip(COLOURS, methods, strict=False):
             rows = [r for r in searched if r["method"] == method and r["gamma_limit"] > 0.0]

@@ -67,12 +67,12 @@ def test_spring_at_the_tool_returns_its_energy():
 
 def test_torque_at_the_tool_works_only_along_rotation():
     result, _ = logged(lambda p: np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.1]))
-    accounts = station_energies(result, SCENARIO)
-    np.testing.assert_allclose(accounts[:, AT_SLAVE, 0], 0.0, atol=1e-12)
-    assert abs(accounts[-1, AT_SLAVE, 1]) > 1e-3
+    energies = station_energies(result, SCENARIO)
+    np.testing.assert_allclose(energies[:, AT_SLAVE, 0], 0.0, atol=1e-12)
+    assert abs(energies[-1, AT_SLAVE, 1]) > 1e-3
     # The channel's sum of one period (0.5 ms) ago, relative to the first row.
-    np.testing.assert_allclose(accounts[:-1, AT_HAND, 1], 2.0 * np.arange(20.0), atol=1e-9)
-    assert np.isnan(accounts[:, AT_MOTOR]).all()
+    np.testing.assert_allclose(energies[:-1, AT_HAND, 1], 2.0 * np.arange(20.0), atol=1e-9)
+    assert np.isnan(energies[:, AT_MOTOR]).all()
 
 
 GRIPPER = np.array([1.2, 0.01, -0.02, 0.06, 0.008, 1e-4, -2e-4, 0.009, 3e-4, 0.005])
@@ -152,10 +152,10 @@ def test_station_with_ledger_creates_no_energy(sigma):
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     result = simulate(station, scenario.simulation, progress=False)
     assert np.abs(result["true_contact_wrench_W"][:, 2]).max() > 30.0, "it should have struck"
-    accounts = (
+    energies = (
         station_energies(result, scenario)
         + sigma * work_of_displayed_load_wrench(result, scenario)[:, None]
     )
     for place in (AT_SLAVE, AT_MOTOR) if sigma == 0.0 else (AT_SLAVE,):
-        created = accounts[:, AT_HAND] + accounts[:, place] + start_energy(scenario)
+        created = energies[:, AT_HAND] + energies[:, place] + start_energy(scenario)
         assert (created.min(axis=0) >= -1e-6).all()

@@ -1,4 +1,4 @@
-"""Covering damping is sufficient and necessary for the hand in simulation."""
+"""Damping for passivity is sufficient and necessary for the hand in simulation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.comparison import one_dof
-from drake_teleop.lab.comparison.one_dof import PERIOD_S, OneDof, covering_damping, run_one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD_S, OneDof, damping_for_passivity, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
@@ -36,9 +36,9 @@ def hand_work(model: OneDof, round_trip: float, frequency: float, damping: float
 @pytest.mark.slow
 @pytest.mark.parametrize("wall", [0.0, 5100.0])
 @pytest.mark.parametrize("round_trip", [0.02, 0.1])
-def test_covering_damping_compensates_the_energy_of_the_delay(wall, round_trip):
+def test_damping_for_passivity_compensates_the_energy_of_the_delay(wall, round_trip):
     model = dataclasses.replace(FIRM, wall_stiffness=wall, sigma=1.0)
-    damping = covering_damping(model, round_trip)
+    damping = damping_for_passivity(model, round_trip)
     # At a wall the worst frequency is nearly 0, which takes too long to simulate.
     worst = one_dof._IMPEDANCE_FREQUENCIES_RAD_S[
         np.argmin(one_dof._displayed_impedance_real_part(model, round_trip))
@@ -52,15 +52,17 @@ def test_covering_damping_compensates_the_energy_of_the_delay(wall, round_trip):
     )
 
 
-def test_covering_damping_in_free_motion_is_proportional_to_sigma():
+def test_damping_for_passivity_in_free_motion_is_proportional_to_sigma():
     free = dataclasses.replace(FIRM, wall_stiffness=0.0)
-    needed = [covering_damping(dataclasses.replace(free, sigma=s), 0.1) for s in (0.0, 0.5, 1.0)]
+    needed = [
+        damping_for_passivity(dataclasses.replace(free, sigma=s), 0.1) for s in (0.0, 0.5, 1.0)
+    ]
     assert needed[0] == 0.0
     assert needed[2] == pytest.approx(2 * needed[1])
 
 
-def test_covering_damping_at_a_wall_is_stiffness_times_delay():
+def test_damping_for_passivity_at_a_wall_is_stiffness_times_delay():
     """Re K e^(-j w R) / (j w) = -K R sin(w R) / (w R), which is -K R at w = 0."""
     model = OneDof(ideal_servo=True, sigma=0.0)
-    needed = covering_damping(model, 0.1)
+    needed = damping_for_passivity(model, 0.1)
     assert needed == pytest.approx(5100 / 17.5 * (0.1 + 1.5 * PERIOD_S), rel=1e-3)
