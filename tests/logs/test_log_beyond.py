@@ -61,7 +61,7 @@ DAMAGED = {
     "objects": (archive(t=np.array([None, {}])), "Object arrays"),
     "73 TiB": (zipped(header((10**13,))), "cannot be read"),
     "no header": (zipped(b"\x93NUMPY\x01\x00\x10\x00{'descr': nonsens"), "cannot be read"),
-    "no array": (zipped(b""), "holds no rows"),
+    "no array": (zipped(b""), "has no rows"),
 }
 
 

@@ -84,7 +84,7 @@ def time_stamps_and_num_episodes(
 ) -> tuple[Array, int]:
     """Return the scaled times (N,) of a table's rows [s], NaN if absent, and number of episodes.
 
-    Whole tables are scaled and joined, so that all their streams keep one clock. With
+    `time.scale` and joining of episodes use the whole table: all its streams keep one clock. With
     `time.rate`, rows without numbers of the stream are gaps, unless other streams fill them.
     """
     if time.column is None:

@@ -92,8 +92,6 @@ def _parse_removed_weight(value: Any) -> Any:
 
 
 Column = str | int
-
-
 Number = Annotated[float, Field(strict=True)]  # rejects true and "1"
 Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
