@@ -13,7 +13,7 @@ from drake_teleop.common.files import write_text
 from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.pictures import VERDICT_WORDS
+from drake_teleop.logs.pictures import TEXT_OF_VERDICT
 from drake_teleop.logs.processing import IdentifiedLog
 
 PARAMETER_FORMATS = (
@@ -49,7 +49,7 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
     for (symbol, index, unit, scale), values, verdict in zip(
         PARAMETER_FORMATS, columns, load.verdicts, strict=True
     ):
-        words, pill = VERDICT_WORDS[verdict], _CSS_CLASS_OF_VERDICT.get(verdict, "")
+        words, pill = TEXT_OF_VERDICT[verdict], _CSS_CLASS_OF_VERDICT.get(verdict, "")
         texts = ("–", "", "")
         if verdict != "not" and np.isfinite(values).all():
             # Two digits of the uncertainty determine the decimals of the value.
@@ -67,7 +67,7 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, with fit.png and knowledge.png from its folder.
+    """Write the HTML report of an identification, including fit.png and knowledge.png beside it.
 
     `alone` is the load of the object alone, if the gripper is known.
     """
