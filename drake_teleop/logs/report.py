@@ -65,11 +65,11 @@ def write_report(
     path: Path,
     found: IdentifiedLog,
     summary: Mapping[str, Any],
-    alone: Identification | None = None,
+    object_load: Identification | None = None,
 ) -> None:
     """Write the HTML report of an identification, including fit.png and knowledge.png beside it.
 
-    `alone` is the load of the object alone, if the gripper is known.
+    `object_load` is the load of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
     text = (
@@ -78,9 +78,9 @@ def write_report(
         " determine have no value."
     )
     tables = [("The load and the sensor's offsets", text, parameter_rows(result))]
-    if alone is not None:
+    if object_load is not None:
         text = "The load minus the given gripper; the uncertainties of both are combined."
-        tables.append(("The object alone", text, parameter_rows(alone)[6:]))
+        tables.append(("The object alone", text, parameter_rows(object_load)[6:]))
     samples = f"{summary['samples']} poses at rest"
     if not log.static:
         samples = (

@@ -151,8 +151,8 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     return result, len(back) + 1
 
 
-def zero_steps_between_episodes(steps: Array, median: float, num_episodes: int) -> Array:
-    error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median)), steps.copy()
+def zero_steps_between_episodes(steps: Array, median_step: float, num_episodes: int) -> Array:
+    error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median_step)), steps.copy()
     inner[np.argsort(error, kind="stable")[: num_episodes - 1]] = 0.0
     return inner
 
