@@ -118,7 +118,7 @@ class Table:
         if numbers.shape[1] != 1:
             column = f"{str(name)!r} of {self.path.name}"
             what = f"{column} has {numbers.shape[1]} numbers per row, not 1"
-            raise DrakeTeleopError(what, where=where, remedy="name a column of numbers")
+            raise DrakeTeleopError(what, where=where, remedy="name a column with 1 number per row")
         return numbers[:, 0]
 
     def check_magnitude(
