@@ -27,7 +27,7 @@ from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.motion_checks import pose_unit_or_frame_finding
-from drake_teleop.logs.check.motion_size import too_little_motion
+from drake_teleop.logs.check.motion_size import explain_lack_of_motion
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     PoseMotion,
@@ -217,7 +217,7 @@ def fit_load_to_posed_log(
     if log.posed is None or log.static or method not in METHODS_WITH_SPLINES or not is_long:
         return None, ()
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)
-    is_delay_unknown = delay == "auto" and too_little_motion(log) is not None
+    is_delay_unknown = delay == "auto" and explain_lack_of_motion(log) is not None
     options = 0.0 if is_delay_unknown else delay, estimate, 0.0, "undetermined"
     found, source = _fit_with_fallback_delay(log, *options)
     source = "undetermined" if is_delay_unknown else source

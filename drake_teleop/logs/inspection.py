@@ -32,7 +32,7 @@ MIN_REPEATED_ROW_SHARE, MIN_REPEATED_BLOCK_ROWS = 0.05, 5
 """Smallest reported share of repeated rows, and smallest number of rows of a reported block."""
 _MIN_FROZEN_ROWS, _MIN_MOTION_SHARE_BESIDE_FROZEN = 50, 0.3
 _MAX_DRAFT_CORRECTIONS = 5  # by the data
-_MIN_DECIMALS = 3  # numbers with a point in a first line that is no header
+_MIN_DATA_DECIMALS = 3  # numbers with a point in a first line that is no header
 _CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _COLUMNS_THAT_MARK_CANONICAL_LOG = {"f_x", "tau_x"}
 _INSPECTED_QUANTITIES = (
@@ -106,7 +106,7 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
     # polars adds a suffix to repeated names.
     names = [name.partition("_duplicated_")[0] for name in table.columns]
     numbers = [name for name in names if is_decimal_number(name)]
-    header = len(numbers) < len(names) and sum("." in name for name in numbers) < _MIN_DECIMALS
+    header = len(numbers) < len(names) and sum("." in name for name in numbers) < _MIN_DATA_DECIMALS
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
@@ -193,7 +193,7 @@ def _inspect_described_log(
         summary["streams"][name] = figures
         findings += more
         if stream.source in unstamped:  # removal would shift the times of the following rows
-            tables[stream.source] = _empty_cells(tables[stream.source], stream.columns, rows)
+            tables[stream.source] = _set_cells_to_nan(tables[stream.source], stream.columns, rows)
             rows = rows[:0]
         bad.setdefault(stream.source, []).append(rows)
     clean = {path: _remove_rows(tables[path], np.concatenate(rows)) for path, rows in bad.items()}
@@ -235,7 +235,7 @@ def _inspect_stream_and_list_bad_rows(
             what = f"has {len(good)} rows, but {len(usable)} times"
             remedy = "name columns of the same length"
             raise DrakeTeleopError(what, where=f"{source}:{name}", remedy=remedy)
-    figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
+    figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _max_run_length(~good)
     if not good.all():
         first = table.line_in_file(int(np.argmin(good)))
         text = f"{at}: {figures['nan_rows']} rows contain NaN or infinity (first in row {first}),"
@@ -248,7 +248,7 @@ def _inspect_stream_and_list_bad_rows(
     if moving:
         findings += _repeated_rows_findings(at, values, repeats, figures.get("rate_hz"), time)
     figures["columns"] = {}
-    frozen = _frozen_spans(values, repeats) if moving else {}
+    frozen = _frozen_row_spans(values, repeats) if moving else {}
     for i, (column, x) in enumerate(zip(_channel_labels(columns, table), values.T, strict=True)):
         finite = x[np.isfinite(x)]
         if not len(finite):
@@ -281,7 +281,7 @@ def _repeated_rows_findings(
     news_after = np.flatnonzero(repeats[:-1] & ~repeats[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    longest = _longest_run(repeats)
+    longest = _max_run_length(repeats)
     enough = repeats.mean() > MIN_REPEATED_ROW_SHARE or longest >= MIN_REPEATED_BLOCK_ROWS
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
@@ -348,7 +348,7 @@ def _channel_labels(columns: Sequence[str], table: Table) -> list[str]:
     return labels
 
 
-def _longest_run(flags: NDArray[np.bool_]) -> int:
+def _max_run_length(flags: NDArray[np.bool_]) -> int:
     return int(np.diff(find_runs_of_true(flags)).max(initial=0))
 
 
@@ -356,12 +356,12 @@ def _count_saturated_samples(x: Array, repeats: NDArray[np.bool_]) -> int:
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~repeats[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
-    inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
+    inside, outside = _max_run_length(held & ends), _max_run_length(held & ~ends)
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
 
 
-def _frozen_spans(values: Array, repeats: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
-    """Return first and last row of the longest frozen part of each channel (N, k) that has one."""
+def _frozen_row_spans(values: Array, repeats: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
+    """Return first and last row of the longest wrongly constant part of each channel (N, k)."""
     found = {}
     for i, x in enumerate(values.T):
         held = np.concatenate([[False], x[1:] == x[:-1]])
@@ -387,7 +387,7 @@ def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:
     return replace(table, columns=whole)
 
 
-def _empty_cells(table: Table, names: Sequence[Any], rows: NDArray[np.intp]) -> Table:
+def _set_cells_to_nan(table: Table, names: Sequence[Any], rows: NDArray[np.intp]) -> Table:
     cells = {str(name): table.numbers_with_nan(name, "").copy() for name in names}
     for column in cells.values():
         column[rows] = np.nan

@@ -40,7 +40,7 @@ _PARAMETER_SYMBOLS = (
 )
 VERDICT_COLOURS = dict(zip(VERDICT_NAMES, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
 _VERDICT_TEXTS = ("identified", "weakly identified", "not identified", "mostly from the prior")
-VERDICT_WORDS = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
+TEXT_OF_VERDICT = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
 _MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
 _MEASURED_CURVE_COLOUR = "#A3AAB5"
@@ -141,7 +141,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
         right.text(share, -0.9, words, fontsize=8, ha="center", va="bottom")
     right.set_title("Standard deviation relative to a typical value", pad=16)
     handles = [
-        Patch(color=VERDICT_COLOURS[verdict], label=VERDICT_WORDS[verdict])
+        Patch(color=VERDICT_COLOURS[verdict], label=TEXT_OF_VERDICT[verdict])
         for verdict in VERDICT_NAMES
         if verdict in result.verdicts
     ]

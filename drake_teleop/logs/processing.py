@@ -40,10 +40,10 @@ from drake_teleop.logs.causes.cause import (
 )
 from drake_teleop.logs.causes.explain import MisfitExplanation
 from drake_teleop.logs.check import against_load, conventions, edits
-from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, lag_findings
+from drake_teleop.logs.check.against_load import MAX_GOOD_UNEXPLAINED, lag_findings
 from drake_teleop.logs.check.conventions import ConventionCheckResult, check_conventions_of_file
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
-from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
+from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, explain_lack_of_motion
 from drake_teleop.logs.check.nonlinear_sensor import error_of_load_by_nonlinear_sensor
 from drake_teleop.logs.check.sensor_filter import sensor_filter_finding
 from drake_teleop.logs.check.wrench_channels import wrench_channel_finding
@@ -53,12 +53,12 @@ from drake_teleop.logs.read.reading import check_path_and_cutoff, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_CAUSES_LIKE_NONLINEAR_SENSOR = (*CAUSES_DETERMINED_AT_REST, "load change", "gain")
+_CAUSES_RESEMBLING_NONLINEAR_SENSOR = (*CAUSES_DETERMINED_AT_REST, "load change", "gain")
 _FINDINGS_PREVENTING_IDENTIFICATION = (
     *("left-handed", "high-pass", "low-pass", "clock rate", "channel sign", "mixed axes"),
     *("dead band", "curvature", "hysteresis"),
 )
-_CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
+_MAX_CHANGE_OF_CONSTANT_CHANNEL = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES, _MIN_CORRECTED_DELAY_S = 10, 1e-4
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
 _MAX_TELEOP_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
@@ -75,7 +75,7 @@ class IdentifiedLog:
         rejected: (N,) True for samples that robust fits reject.
         base_parameters: combinations of offsets and load that the samples determine.
         findings: suspected errors of the log description.
-        causes: effects beside a rigid load with constant offsets that the fit includes.
+        causes: fitted effects besides a rigid load and constant offsets.
         loads: load of each part of the record, if it changes.
         delay_std_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
@@ -111,7 +111,7 @@ class EliminatedLog:
         non_contact: load's wrench V phi.
         contact: contact wrench F_c, Eq. (13).
         scaled: scaled wrench gamma F_c + sigma V phi.
-        gravity_only: wrench without weight and its own offsets; None without orientation.
+        gravity_only: wrench without weight, tared after its removal; None without orientation.
         noise_floor: (6,) noise of `contact` [N, N m].
         causal: wrenches as in a control loop, if requested.
         edge: (N,) True for samples near ends and gaps, excluded from all figures.
@@ -170,20 +170,20 @@ def identify_log(
     options = method, cutoff_hz
     raw, fitted, frame_findings = _read_and_fit_load(path, *options, delay)
     mirrored = _left_handed_pose_finding(raw, fitted)
-    why, too_still = None, None
+    misfit, too_still = None, None
     if mirrored is None:
-        why, too_still = _explain_residual(raw, fitted, frame_findings)
-    if why is not None:
-        fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, why, *options)
-    errors = _findings_that_invalidate_load(raw, fitted, frame_findings, why, too_still, check)
+        misfit, too_still = _explain_residual(raw, fitted, frame_findings)
+    if misfit is not None:
+        fitted, frame_findings = _correct_delay(raw, fitted, frame_findings, misfit, *options)
+    errors = _findings_that_invalidate_load(raw, fitted, frame_findings, misfit, too_still, check)
     errors = errors if mirrored is None else (mirrored,)
     load_errors = np.zeros(10)
-    if not errors and why is not None and _may_sensor_be_nonlinear(raw, why):
+    if not errors and misfit is not None and _may_sensor_be_nonlinear(raw, misfit):
         sensor = error_of_load_by_nonlinear_sensor(fitted.log, fitted.fit.identification)
         load_errors, errors = sensor[0], () if sensor[1] is None else (sensor[1],)
     causes: tuple[Finding, ...] = ()
     result, note = fitted.fit.identification, fitted.fit.note
-    accepted = None if errors else why
+    accepted = None if errors else misfit
     if errors:
         useless = too_still or errors[0].name in _FINDINGS_PREVENTING_IDENTIFICATION
         result = result.with_nothing_identified() if useless else result.with_unidentified_load()
@@ -192,7 +192,7 @@ def identify_log(
     log = replace(fitted.log, notes=(*fitted.log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
-    if not raw.static and not causes and (why is None or why.is_misfit):
+    if not raw.static and not causes and (misfit is None or misfit.is_misfit):
         # Errors of the motion with this share of its variance reduce the load by this share.
         kept = ~fitted.fit.rejected
         share = against_load.unexplained_share(log.wrench[kept], (log.wrench - predicted)[kept])
@@ -207,9 +207,9 @@ def identify_log(
         if accepted and accepted.is_acceleration_missing and not result.identifiable.all():
             findings = (*findings, explained_log.missing_acceleration_finding(accepted))
     corrections = [x for x in causes if x.name not in CAUSES_WITHOUT_CORRECTION]
-    misfit = _unexplained_misfit(why, result, corrections, unexplained)
-    if misfit is not None and (corrections or not findings):
-        findings, causes = (explained_log.misfit_finding(misfit, corrections),), ()
+    open_misfit = _unexplained_misfit(misfit, result, corrections, unexplained)
+    if open_misfit is not None and (corrections or not findings):
+        findings, causes = (explained_log.misfit_finding(open_misfit, corrections),), ()
     mass_message = explained_log.implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
@@ -217,7 +217,7 @@ def identify_log(
         result = result.with_unidentified_load()
     determined = base_parameters(fitted.fit.equations)
     loads = () if accepted is None else accepted.loads
-    if misfit is not None:
+    if open_misfit is not None:
         result, loads = result.with_nothing_identified(), ()
         determined = BaseParameters((), (), (), ())
     return IdentifiedLog(
@@ -242,7 +242,7 @@ def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
         return None
     load, shown = fitted.fit.identification, fitted.log
     residual = contact_wrench(shown.wrench, load.offsets, *shown.motion, load.phi)
-    if against_load.unexplained_share(shown.wrench, residual) < GOOD_UNEXPLAINED:
+    if against_load.unexplained_share(shown.wrench, residual) < MAX_GOOD_UNEXPLAINED:
         return None
     splines = None if fitted.motion is None else fitted.motion.splines
     return left_handed_pose_finding(shown, splines, fitted.delay_s)
@@ -251,67 +251,67 @@ def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
 def _explain_residual(
     log: Log, fitted: LoadFitOfLog, frame_findings: tuple[Finding, ...]
 ) -> tuple[MisfitExplanation | None, str | None]:
-    """Return causes of the residual, or a text if the motion is too small for such causes.
+    """Return causes of the residual, or a text if the motion is too small to separate them.
 
-    Gain errors within the stated ones are no causes.
+    Gain errors within `log.gain_std` are no causes.
     """
-    why = None
+    misfit = None
     if _is_misfit_explainable(log, fitted.motion is not None):
-        why = explained_log.explain_log(log, fitted.delay_s, fitted.motion)
-    if why is not None and why.is_misfit and _clock_rate_causes(why):
-        why = replace(why, causes=())
+        misfit = explained_log.explain_log(log, fitted.delay_s, fitted.motion)
+    if misfit is not None and misfit.is_misfit and _clock_rate_causes(misfit):
+        misfit = replace(misfit, causes=())
     contradicts = fitted.motion is None and log.posed is not None and log.posed.imu is not None
-    if contradicts and not _clock_rate_causes(why):
-        why = _misfit_of_imu_motion(log, fitted.delay_s)  # the load is that of the IMU
-    causes = () if why is None else why.causes
+    if contradicts and not _clock_rate_causes(misfit):
+        misfit = _misfit_of_imu_motion(log, fitted.delay_s)  # the load is that of the IMU
+    causes = () if misfit is None else misfit.causes
     need_motion = any(x.name not in CAUSES_DETERMINED_AT_REST for x in (*frame_findings, *causes))
-    if need_motion and (too_still := too_little_motion(log)) is not None:
+    if need_motion and (too_still := explain_lack_of_motion(log)) is not None:
         return None, too_still
     by_gains = log.gain_std > 0.0 and {x.name for x in causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
-    if why is not None and by_gains and not why.is_acceleration_missing:
-        why = replace(why, causes=(), explained=True, loads=())
-    return why, None
+    if misfit is not None and by_gains and not misfit.is_acceleration_missing:
+        misfit = replace(misfit, causes=(), explained=True, loads=())
+    return misfit, None
 
 
 def _misfit_of_imu_motion(log: Log, delay_s: float) -> MisfitExplanation | None:
     """Return the misfit if the motion of the IMU, without poses, does not explain the wrench."""
     is_short = log.t[-1] - log.t[0] < aligned_log.MIN_SPLINE_RECORD_DURATION_S  # no comparison
-    if is_short or not _is_misfit_explainable(log, by_splines=False):
+    if is_short or not _is_misfit_explainable(log, has_splines=False):
         return None
     log = replace(log, posed=None, R_WS=None, gravity=None, gravity_W=None)
-    why = explained_log.explain_log(log, delay_s, None)
-    if why is None or not (why.is_misfit and why.is_residual_large):
+    misfit = explained_log.explain_log(log, delay_s, None)
+    if misfit is None or not (misfit.is_misfit and misfit.is_residual_large):
         return None
-    useful = not why.causes or any(x.name not in CAUSES_WITHOUT_CORRECTION for x in why.causes)
-    return why if useful and not _clock_rate_causes(why) else None
+    valid = not misfit.causes or any(x.name not in CAUSES_WITHOUT_CORRECTION for x in misfit.causes)
+    return misfit if valid and not _clock_rate_causes(misfit) else None
 
 
-def _may_sensor_be_nonlinear(raw: Log, why: MisfitExplanation) -> bool:
-    similar = all(cause.name in _CAUSES_LIKE_NONLINEAR_SENSOR for cause in why.causes)
-    return similar and not (why.explained or raw.static or why.is_acceleration_missing)
+def _may_sensor_be_nonlinear(raw: Log, misfit: MisfitExplanation) -> bool:
+    similar = all(cause.name in _CAUSES_RESEMBLING_NONLINEAR_SENSOR for cause in misfit.causes)
+    return similar and not (misfit.explained or raw.static or misfit.is_acceleration_missing)
 
 
-def _clock_rate_causes(why: MisfitExplanation | None) -> tuple[Finding, ...]:
-    return () if why is None else tuple(x for x in why.causes if x.name == "clock rate")
+def _clock_rate_causes(misfit: MisfitExplanation | None) -> tuple[Finding, ...]:
+    return () if misfit is None else tuple(x for x in misfit.causes if x.name == "clock rate")
 
 
 def _correct_delay(
     log: Log,
     fitted: LoadFitOfLog,
     frame_findings: tuple[Finding, ...],
-    why: MisfitExplanation,
+    misfit: MisfitExplanation,
     method: str,
     cutoff_hz: float | None,
 ) -> tuple[LoadFitOfLog, tuple[Finding, ...]]:
     source, motion = fitted.delay_source, fitted.motion
     if source != "estimated":
         return fitted, frame_findings
-    delay_s = fitted.delay_s + why.delay_s
-    if why.is_acceleration_missing:  # an acceleration resembles a delay
+    delay_s = fitted.delay_s + misfit.delay_s
+    if misfit.is_acceleration_missing:  # an acceleration resembles a delay
         source, fitted = "undetermined", _fit_load_to_filtered_log(log, method, cutoff_hz, 0.0)
-    elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S and motion is None:
+    elif misfit.causes and abs(misfit.delay_s) > _MIN_CORRECTED_DELAY_S and motion is None:
         fitted = _fit_load_to_filtered_log(log, method, cutoff_hz, delay_s)
-    elif why.causes and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S:
+    elif misfit.causes and abs(misfit.delay_s) > _MIN_CORRECTED_DELAY_S:
         again, frame_findings = aligned_log.fit_load_to_posed_log(log, method, cutoff_hz, delay_s)
         fitted = again or fitted
     return replace(fitted, delay_source=source, motion=motion), frame_findings
@@ -321,7 +321,7 @@ def _findings_that_invalidate_load(
     raw: Log,
     fitted: LoadFitOfLog,
     frame_findings: tuple[Finding, ...],
-    why: MisfitExplanation | None,
+    misfit: MisfitExplanation | None,
     too_still: str | None,
     check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
@@ -329,15 +329,15 @@ def _findings_that_invalidate_load(
     if too_still is not None:
         text = f"payload not identifiable: {too_still}; {MORE_MOTION_REMEDY}"
         errors = (Finding("payload", text),)
-    elif not errors and why is not None and (why.is_misfit or why.causes):
+    elif not errors and misfit is not None and (misfit.is_misfit or misfit.causes):
         found = None if raw.static else sensor_filter_finding(fitted.log, fitted.delay_s)
-        if not raw.static and why.is_misfit:
+        if not raw.static and misfit.is_misfit:
             splines = None if fitted.motion is None else fitted.motion.splines
             found = wrench_channel_finding(fitted.log, splines, fitted.delay_s) or found
         errors = () if found is None else (found,)
-        if not errors and why.is_misfit and why.causes:
+        if not errors and misfit.is_misfit and misfit.causes:
             errors = conventions.motion_findings(check)
-    errors = _clock_rate_causes(why) or errors
+    errors = _clock_rate_causes(misfit) or errors
     if raw.described is not None and raw.estimated:  # otherwise `findings_if_load_is_suspicious`
         errors += tuple(edits.correct_accelerometer_unit(raw.described, fitted.log)[0])
     return errors
@@ -346,33 +346,33 @@ def _findings_that_invalidate_load(
 def _apply_explanation(
     load: Identification,
     raw: Log,
-    why: MisfitExplanation,
+    misfit: MisfitExplanation,
     frame_findings: tuple[Finding, ...],
     note: str,
 ) -> tuple[Identification, tuple[Finding, ...], str]:
-    causes = why.causes
+    causes = misfit.causes
     if frame_findings:
-        causes = explained_log.replace_frame_causes(why, frame_findings[0])
+        causes = explained_log.replace_frame_causes(misfit, frame_findings[0])
     if raw.estimated:
-        note = explained_log.removed_weight_note(why)
-    elif causes and not why.needs_full_gain_matrix:
+        note = explained_log.removed_weight_note(misfit)
+    elif causes and not misfit.needs_full_gain_matrix:
         note = ""
-    return explained_log.apply_explanation_to_load(load, why), causes, note
+    return explained_log.apply_explanation_to_load(load, misfit), causes, note
 
 
 def _unexplained_misfit(
-    why: MisfitExplanation | None,
+    misfit: MisfitExplanation | None,
     load: Identification,
     corrections: list[Finding],
     unexplained: float,
 ) -> MisfitExplanation | None:
-    """Return `why` if neither noise, vibrations nor unknown accelerations explain the residual."""
-    if why is None or not why.is_misfit or why.is_acceleration_missing:
+    """Return `misfit` if causes, noise, vibrations or unknown accelerations do not explain it."""
+    if misfit is None or not misfit.is_misfit or misfit.is_acceleration_missing:
         return None
-    useless = not why.causes and unexplained > 0.5
-    if load.identifiable[6:].any() and not ((corrections and why.is_residual_large) or useless):
+    useless = not misfit.causes and unexplained > 0.5
+    if load.identifiable[6:].any() and not ((corrections and misfit.is_residual_large) or useless):
         return None  # vibrations may leave a large residual
-    return why
+    return misfit
 
 
 def _fit_load_to_filtered_log(
@@ -381,7 +381,7 @@ def _fit_load_to_filtered_log(
     delay_s, source = alignment.choose_delay(log, cutoff_hz, delay)
     log = alignment.remove_delay(log, delay_s)
     known = alignment.is_far_from_gaps(log, cutoff_hz)
-    _require_any_sample(log, known)
+    _require_usable_sample(log, known)
     log = alignment.low_pass_log(log, cutoff_hz).select_rows(known)
     fit = identify_batch(
         log.wrench,
@@ -395,18 +395,18 @@ def _fit_load_to_filtered_log(
     return LoadFitOfLog(log, fit, delay_s, source)
 
 
-def _require_any_sample(log: Log, usable: NDArray[np.bool_]) -> None:
+def _require_usable_sample(log: Log, usable: NDArray[np.bool_]) -> None:
     if not usable.any():
         what = "all samples are near gaps or ends of the record, within the reach of the low-pass"
         raise DrakeTeleopError(what, where=log.source, remedy="raise the cut-off, or avoid gaps")
 
 
-def _is_misfit_explainable(log: Log, by_splines: bool) -> bool:
+def _is_misfit_explainable(log: Log, has_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
-    if log.static or (high - low <= _CONSTANT_CHANNEL_TOLERANCE * np.maximum(high, -low)).any():
+    if log.static or (high - low <= _MAX_CHANGE_OF_CONSTANT_CHANNEL * np.maximum(high, -low)).any():
         return False
     imu = None if log.described is None else log.described.imu
-    if by_splines or (log.described and (imu is None or imu.specific_force is None)):
+    if has_splines or (log.described and (imu is None or imu.specific_force is None)):
         return True
     return bool(5.0 < np.median(np.linalg.norm(log.specific_force, axis=1)) < 20.0)
 
@@ -544,7 +544,9 @@ def eliminate_log(
 def _reject_static_log(found: EliminatedLog) -> None:
     if found.log.static:
         what = "contains only poses at rest (`static`), in which no contact can be detected"
-        raise DrakeTeleopError(what, where=found.log.source, remedy="give a log of a motion")
+        raise DrakeTeleopError(
+            what, where=found.log.source, remedy="give a log that was recorded in motion"
+        )
 
 
 def _read_and_eliminate_log(
@@ -572,7 +574,7 @@ def _read_and_eliminate_log(
         raise DrakeTeleopError(what, where="causal", remedy="remove it")
     known = alignment.is_far_from_gaps(log, cutoff_hz)
     shown, edge = log.select_rows(known), aligned.edge[known]
-    _require_any_sample(log, ~edge)
+    _require_usable_sample(log, ~edge)
     parts = phi_gripper, phi - phi_gripper
     scales = scales | {"gravity": log.gravity}
 
@@ -658,10 +660,10 @@ def _rows_in_tare_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bo
     return rows
 
 
-def _contact_free_rows(log: Log, known: NDArray[np.bool_], length_s: float) -> NDArray[np.bool_]:
-    rows = known & (log.t - log.t[0] < length_s)
-    if (rows == known).all() or rows.sum() < _MIN_TARE_SAMPLES:
-        what = f"the first {length_s:g} s contain {rows.sum()} of {known.sum()} samples"
+def _contact_free_rows(log: Log, usable: NDArray[np.bool_], length_s: float) -> NDArray[np.bool_]:
+    rows = usable & (log.t - log.t[0] < length_s)
+    if (rows == usable).all() or rows.sum() < _MIN_TARE_SAMPLES:
+        what = f"the first {length_s:g} s contain {rows.sum()} of {usable.sum()} samples"
         what += f" ({_MIN_TARE_SAMPLES} or more are required, but not all)"
         remedy = "give another duration of the contact-free start [s]"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
@@ -669,7 +671,7 @@ def _contact_free_rows(log: Log, known: NDArray[np.bool_], length_s: float) -> N
 
 
 def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias as of a point mass, and the names of these."""
+    """Return phi (10,) with undetermined inertias as of a point mass, and their names."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
@@ -678,7 +680,7 @@ def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tu
 
 
 def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
-    """Return notes on unidentified parameters: mass and moments, and inertias."""
+    """Return notes on unidentified parameters of a load, and their effects."""
     named = zip(PARAMETER_NAMES[6:10], load.verdicts[6:10], strict=True)
     moments = [name for name, verdict in named if verdict == "not"]
     return tuple(
@@ -705,7 +707,7 @@ def _check_log_if_contact_is_large(
 
 def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
     what = "the robot has removed the weight, so that sigma_weight has no effect"
-    return DrakeTeleopError(what, where=where, remedy="use sigma alone; it scales the inertia")
+    return DrakeTeleopError(what, where=where, remedy="use sigma alone, which scales the inertia")
 
 
 def _resolve_force_scales(

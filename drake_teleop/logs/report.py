@@ -13,7 +13,7 @@ from drake_teleop.common.files import write_text
 from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.pictures import VERDICT_WORDS
+from drake_teleop.logs.pictures import TEXT_OF_VERDICT
 from drake_teleop.logs.processing import IdentifiedLog
 
 PARAMETER_FORMATS = (
@@ -49,7 +49,7 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
     for (symbol, index, unit, scale), values, verdict in zip(
         PARAMETER_FORMATS, columns, load.verdicts, strict=True
     ):
-        words, pill = VERDICT_WORDS[verdict], _CSS_CLASS_OF_VERDICT.get(verdict, "")
+        words, pill = TEXT_OF_VERDICT[verdict], _CSS_CLASS_OF_VERDICT.get(verdict, "")
         texts = ("–", "", "")
         if verdict != "not" and np.isfinite(values).all():
             # Two digits of the uncertainty determine the decimals of the value.
@@ -65,11 +65,11 @@ def write_report(
     path: Path,
     found: IdentifiedLog,
     summary: Mapping[str, Any],
-    alone: Identification | None = None,
+    object_load: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, with fit.png and knowledge.png from its folder.
+    """Write the HTML report of an identification, including fit.png and knowledge.png beside it.
 
-    `alone` is the load of the object alone, if the gripper is known.
+    `object_load` is the load of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
     text = (
@@ -78,9 +78,9 @@ def write_report(
         " determine have no value."
     )
     tables = [("The load and the sensor's offsets", text, parameter_rows(result))]
-    if alone is not None:
+    if object_load is not None:
         text = "The load minus the given gripper; the uncertainties of both are combined."
-        tables.append(("The object alone", text, parameter_rows(alone)[6:]))
+        tables.append(("The object alone", text, parameter_rows(object_load)[6:]))
     samples = f"{summary['samples']} poses at rest"
     if not log.static:
         samples = (

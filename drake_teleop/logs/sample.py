@@ -26,12 +26,12 @@ TRUE_MASS_KG, TRUE_COM_S = 0.95, np.array([0.004, -0.011, 0.058])
 TRUE_INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])
 """Mass [kg], centre of mass [m] and inertia [kg m^2] of the gripper in S, similar to a Robotiq
 2F-85."""
-FINGERTIP_POSITION_S = np.array([0.0, 0.0, 0.17])
+FINGERTIP_POSITION_S = np.array([0.0, 0.0, 0.17])  # m
 TRUE_SENSOR_OFFSETS = np.array(
     [[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]]
 )
 """(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
-WRENCH_NOISE_STD = np.repeat([0.08, 0.003], 3)
+WRENCH_NOISE_STD = np.repeat([0.08, 0.003], 3)  # N, N m
 POSE_DELAY_S = 0.013
 POSE_CLOCK_OFFSET_S = 48213.4
 """Time of the controller's clock at the sensor's time 0 [s]."""

@@ -64,22 +64,22 @@ def summarize_load(load: Identification) -> dict[str, Any]:
     }
 
 
-def summarize_grasped_object(alone: Identification) -> dict[str, Any]:
-    margin, deviation = identification.consistency_margin(alone)
-    figures = summarize_load(alone)
+def summarize_grasped_object(object_load: Identification) -> dict[str, Any]:
+    margin, deviation = identification.consistency_margin(object_load)
+    figures = summarize_load(object_load)
     for name in ("identifiable", "not_identifiable"):
         figures[name] = [entry for entry in figures[name] if entry in PARAMETER_NAMES[6:]]
     return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
 
 
-def notes_on_grasped_object(alone: Identification) -> list[str]:
-    deviation = float(alone.standard_deviations[6])
-    if alone.mass < identification.MIN_SIGNIFICANT_STDS * deviation < np.inf:
-        excess = f"{alone.mass:.4g} ± {deviation:.2g} kg"
+def notes_on_grasped_object(object_load: Identification) -> list[str]:
+    deviation = float(object_load.standard_deviations[6])
+    if object_load.mass < identification.MIN_SIGNIFICANT_STDS * deviation < np.inf:
+        excess = f"{object_load.mass:.4g} ± {deviation:.2g} kg"
         return [f"no object: the total mass exceeds the gripper's by {excess}"]
-    if not alone.identifiable[6:].all() or alone.physically_consistent:
+    if not object_load.identifiable[6:].all() or object_load.physically_consistent:
         return []
-    margin, deviation = identification.consistency_margin(alone)
+    margin, deviation = identification.consistency_margin(object_load)
     if margin < -identification.MIN_SIGNIFICANT_STDS * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
@@ -139,7 +139,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
 
 
 def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return shares of samples with |F| > `threshold` [N] in tared, weightless, contact wrench."""
+    """Return shares of samples with |F| > `threshold` [N]: tared, without weight, without load."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

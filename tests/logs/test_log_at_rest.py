@@ -15,7 +15,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import aligned_log
 from drake_teleop.logs.check import against_load
 from drake_teleop.logs.check.against_load import LoadFitQuality
-from drake_teleop.logs.check.motion_size import motion_rms, too_little_motion
+from drake_teleop.logs.check.motion_size import explain_lack_of_motion, motion_rms
 from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
 
@@ -73,11 +73,11 @@ def test_noise_of_poses_is_no_motion(tmp_path: Path) -> None:
     still = read_log(written(tmp_path, sway(0.0, 3.0), imu=False))
     rms_m_s2, rms_rad_s = motion_rms(still)
     assert rms_m_s2 < 0.06 and rms_rad_s < 0.02
-    assert "hardly moves" in str(too_little_motion(still))
-    assert too_little_motion(read_log(written(tmp_path, sway(25.0, 0.05), imu=False))) is None
+    assert "hardly moves" in str(explain_lack_of_motion(still))
+    assert explain_lack_of_motion(read_log(written(tmp_path, sway(25.0, 0.05), imu=False))) is None
     moving = read_log(written(tmp_path, sway(60.0, 0.3), imu=False))
     assert motion_rms(moving)[0] == pytest.approx(0.06 * 9.81 / np.sqrt(2) * 1.4, rel=0.3)
-    assert too_little_motion(moving) is None
+    assert explain_lack_of_motion(moving) is None
 
 
 @pytest.mark.quick_cases(1)
@@ -106,7 +106,7 @@ def test_correction_with_an_implausible_mass_is_not_stated() -> None:
     def fit(mass: float) -> Any:
         found = LoadFitQuality(unexplained=0.01, mass=mass)
         edited: Any = None
-        return against_load._edits_with_far_better_fit(lambda _: found, given, [(None, edited)])
+        return against_load._select_far_better_edits(lambda _: found, given, [(None, edited)])
 
     assert fit(1276.0) == []
     assert len(fit(1.5)) == 1

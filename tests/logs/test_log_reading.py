@@ -24,7 +24,7 @@ from drake_teleop.logs.read.canonical import (
     write_log,
 )
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.streams import check_that_no_rows_are_lost
+from drake_teleop.logs.read.streams import check_for_lost_readings
 from drake_teleop.logs.read.tables import Table
 
 T = np.arange(0, 3, 0.002)
@@ -551,7 +551,7 @@ def test_measured_zeros_are_no_lost_readings(kind: str) -> None:
         "contact": np.where(np.sin(40.0 * t)[:, None] > 0.0, 0.0, np.abs(x)),
         "few": np.where(np.isin(np.arange(len(t)), [300, 900])[:, None], 0.0, x + 3.0),
     }[kind]
-    check_that_no_rows_are_lost(values, Table(Path("x.csv"), {}), "force")
+    check_for_lost_readings(values, Table(Path("x.csv"), {}), "force")
 
 
 def test_ur5_gyroscope_agrees_with_the_pose(ur5: Path, tmp_path: Path) -> None:

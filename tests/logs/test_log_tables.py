@@ -94,7 +94,7 @@ def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> No
         ("x.csv", "a,b\n1,2\n3,inf\n", ["b"], ["no finite number"]),
         ("x.csv", "a,b\n1,2\n3,4,5\n", ["b"], ["cannot be read"]),
         ("x.csv", "a,b\n1,2\n", ["a", "b"], ["lists 2 columns, but 1 are needed", "here:"]),
-        ("x.csv", "a,b\n", ["a"], ["holds no rows"]),
+        ("x.csv", "a,b\n", ["a"], ["has no rows"]),
         ("x.csv", "", ["a"], ["cannot be read"]),
         ("x.parquet", "no parquet", ["a"], ["cannot be read", "valid .parquet"]),
         ("x.npz", "no npz", ["a"], ["cannot be read"]),
@@ -417,7 +417,7 @@ def test_empty_array_is_ignored(tmp_path: Path) -> None:
     with pytest.raises(DrakeTeleopError, match="has no column 'none'"):
         table.numbers_with_nan("none", "here")
     np.savez(path, none=np.zeros(0))
-    with pytest.raises(DrakeTeleopError, match="holds no rows"):
+    with pytest.raises(DrakeTeleopError, match="has no rows"):
         read_table(path)
 
 

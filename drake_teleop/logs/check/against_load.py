@@ -23,8 +23,8 @@ from drake_teleop.logs.check import edits
 from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.check.motion_size import (
     MORE_MOTION_REMEDY,
+    explain_lack_of_motion,
     max_cutoff_by_pose_noise,
-    too_little_motion,
 )
 from drake_teleop.logs.read.alignment import (
     MAX_SEARCHED_DELAY_S,
@@ -37,21 +37,21 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-GOOD_UNEXPLAINED = 0.02
+MAX_GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
-VALID_UNEXPLAINED = 0.05
+MAX_VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_MISFIT_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
-_FINDING_NAMES_THAT_CHANGE_SIGN = ("sign", "swapped axes")
-"""Findings with the sign; mirrored axes are a cause that `identify` names."""
+_FINDINGS_NOT_COMBINED_WITH_SIGN = ("sign", "swapped axes")
+"""Sign, and axes: with the opposite sign they are mirrored, a cause that `identify` reports."""
 _KEPT_SHARE_WITHOUT_CONTACT = 0.75  # of a record with contact
 _LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
 
 
 @dataclass(frozen=True)
 class LoadFitQuality:
-    """Quality of a fit; residual (`unexplained`) and noise are shares of the wrench's variance."""
+    """Quality of a load's fit: mass [kg], residual and noise as shares of the wrench's variance."""
 
     unexplained: float
     mass: float
@@ -60,17 +60,17 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        limit = self.max_unexplained_including_noise(GOOD_UNEXPLAINED)
+        limit = self.max_unexplained_including_noise(MAX_GOOD_UNEXPLAINED)
         return self.mass > 0 and self.unexplained < limit
 
-    def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
-        """Return the limit of `unexplained`: noise share plus `share_beside_noise`, but bounded."""
-        return min(share_beside_noise + self.noise_share, MIN_UNDETERMINED_UNEXPLAINED)
+    def max_unexplained_including_noise(self, limit_without_noise: float) -> float:
+        """Return the limit of `unexplained`: `limit_without_noise` plus noise, at most 0.9."""
+        return min(limit_without_noise + self.noise_share, MIN_UNEXPLAINED_OF_UNKNOWN_LOAD)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
-    """Return the quality of a load's fit to the best fitting `kept_share` of a low-passed log."""
-    return _fit_load_to_samples(_low_passed_samples(log), kept_share)
+    """Fit a load to the best `kept_share` of samples of a low-passed log; return the quality."""
+    return _fit_load_to_samples(_low_pass_and_thin_log(log), kept_share)
 
 
 class _LowPassedSamples(NamedTuple):
@@ -83,7 +83,7 @@ class _LowPassedSamples(NamedTuple):
     wrench_noise: Array
 
 
-def _low_passed_samples(log: Log) -> _LowPassedSamples:
+def _low_pass_and_thin_log(log: Log) -> _LowPassedSamples:
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
@@ -148,7 +148,7 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-MIN_UNDETERMINED_UNEXPLAINED = 0.9  # of the variance; above it a load is undetermined
+MIN_UNEXPLAINED_OF_UNKNOWN_LOAD = 0.9  # share of the variance
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
@@ -159,11 +159,11 @@ _MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION = 0.5
 def check_wrench_and_estimate_delay(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], float | None]:
-    """Return findings on wrench, orientation and clocks; motion delay behind the wrench [s]."""
+    """Return findings on wrench, orientation, clocks; and delay of motion behind wrench [s]."""
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
-    too_still = too_little_motion(thin)
+    too_still = explain_lack_of_motion(thin)
     samples_of_edits: dict[int, list[_LowPassedSamples]] = {}  # by identity of the description
 
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFitQuality:
@@ -173,26 +173,26 @@ def check_wrench_and_estimate_delay(
             why = too_still
             if log is None:
                 log = data.read_thinned_log(edited)
-                why = too_little_motion(log)
+                why = explain_lack_of_motion(log)
             if edited is not description and why is not None:
                 raise DrakeTeleopError(why)
             aligned = [remove_delay(log, shift) for shift in {0.0, delay or 0.0}]
-            samples_of_edits[id(edited)] = [_low_passed_samples(each) for each in aligned]
+            samples_of_edits[id(edited)] = [_low_pass_and_thin_log(each) for each in aligned]
         fits = [_fit_load_to_samples(each, kept_share) for each in samples_of_edits[id(edited)]]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fit_edited_description(description)
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * MAX_SEARCHED_DELAY_S
-    tried: list[tuple[Finding | None, Description]] = []
+    candidates: list[tuple[Finding | None, Description]] = []
     if too_still is None and not (given.is_good and inside):
-        tried += _clock_offset_edits(description, thin)
+        candidates += _clock_offset_edits(description, thin)
     if not given.is_good:
-        tried = [*edits.wrench_and_motion_edits(description), *tried]
-    found = _edits_with_far_better_fit(fit_edited_description, given, tried)
+        candidates = [*edits.wrench_and_motion_edits(description), *candidates]
+    found = _select_far_better_edits(fit_edited_description, given, candidates)
     if not found and not given.is_good and not log.static:  # contact may hide what fits
         without_contact = partial(fit_edited_description, kept_share=_KEPT_SHARE_WITHOUT_CONTACT)
-        found = _edits_with_far_better_fit(without_contact, without_contact(description), tried)
+        found = _select_far_better_edits(without_contact, without_contact(description), candidates)
     if not found and given.is_good:
         return lag_findings(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
@@ -212,24 +212,24 @@ def check_wrench_and_estimate_delay(
     return [replace(finding, message=message), *lag_findings(description, delay)], delay
 
 
-def _edits_with_far_better_fit(
+def _select_far_better_edits(
     fit_description: Callable[[Description], LoadFitQuality],
     given: LoadFitQuality,
-    tried: list[tuple[Finding | None, Description]],
+    candidates: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
     positive, negative = [], []
-    for finding, edited in tried:
+    for finding, edited in candidates:
         fit = edits.call_or_none_if_unreadable(fit_description, edited)
         if fit is None or abs(fit.mass) > max(MAX_PLAUSIBLE_MASS_KG, 2.0 * abs(given.mass)):
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif finding is not None and finding.name not in _FINDING_NAMES_THAT_CHANGE_SIGN:
+        elif finding is not None and finding.name not in _FINDINGS_NOT_COMBINED_WITH_SIGN:
             negative.append((fit, *edits.edit_with_opposite_wrench_sign(finding, edited)))
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid = given.max_unexplained_including_noise(VALID_UNEXPLAINED)
+    valid = given.max_unexplained_including_noise(MAX_VALID_UNEXPLAINED)
     n = max(1.0, given.independent_samples)
     least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
     decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_BY_EDIT, least_factor)
@@ -273,14 +273,15 @@ def _payload_or_lag_findings_and_delay(
     load = fit.identification
     finding = undetermined_payload_finding(load, given.unexplained - given.noise_share)
     fitted = np.isfinite(load.standard_deviations[6])
-    if finding and fitted and (why := too_little_motion(log)) is not None:
+    if finding and fitted and (why := explain_lack_of_motion(log)) is not None:
         finding = replace(finding, message=f"payload not identifiable: {why}; {MORE_MOTION_REMEDY}")
     if finding:
         return [finding], None
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise_share:
+    limit = MAX_VALID_UNEXPLAINED + given.noise_share
+    if delay is None or unexplained_share(wrench, residual) > limit:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.
@@ -291,7 +292,7 @@ def _payload_or_lag_findings_and_delay(
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
     """Return a finding if the record does not determine the mass of the load, else None."""
-    if load.verdicts[6] != "not" and unexplained < MIN_UNDETERMINED_UNEXPLAINED:
+    if load.verdicts[6] != "not" and unexplained < MIN_UNEXPLAINED_OF_UNKNOWN_LOAD:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = "no signal of the record depends on its mass"
@@ -339,7 +340,7 @@ def lag_findings(description: Description, delay: float | None) -> list[Finding]
 def clock_drift_finding_and_correction(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], Description]:
-    """Return a finding, if the delay grows steadily, and the corrected description."""
+    """Return a finding if the delay of the motion grows steadily, and the corrected description."""
     name = "imu" if description.pose is None else "pose"
     stream = getattr(description, name)
     if stream is None or description.wrench is None or (description.imu and description.pose):

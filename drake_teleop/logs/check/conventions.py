@@ -17,14 +17,14 @@ from drake_teleop.common.numeric import Array, one_blas_thread, white_noise_devi
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import against_load, edits
-from drake_teleop.logs.check.against_load import GOOD_UNEXPLAINED, LoadFitQuality
+from drake_teleop.logs.check.against_load import MAX_GOOD_UNEXPLAINED, LoadFitQuality
 from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.check.motion_checks import (
     check_imu_against_pose,
     check_imu_signals,
     position_unit_or_origin_findings,
 )
-from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, too_little_motion
+from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, explain_lack_of_motion
 from drake_teleop.logs.read import table_files
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import Description, load_description
@@ -39,7 +39,7 @@ _MIN_WRENCH_RANGE_OVER_MAGNITUDE = 1e-6  # of a live wrench, over the largest re
 
 @dataclass(frozen=True)
 class ConventionCheckResult:
-    """Findings on a description, load fit, IMU mounting, motion delay behind the wrench [s]."""
+    """Findings on a description, load fit, IMU mounting, delay of motion behind the wrench [s]."""
 
     findings: tuple[Finding, ...]
     fit: LoadFitQuality
@@ -61,10 +61,10 @@ def findings_if_load_is_suspicious(
     delay: float | None,
     check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
-    """Return findings, except "lag", unless mass, fit, delay and gravity are plausible.
+    """Return findings, except "lag", if mass, fit, delay [s], gravity or a signal is implausible.
 
-    `predicted` (N, 6) is the wrench by the load. `check` compares the description with the data.
-    Raise DrakeTeleopError if the load is useless and a remedy is known.
+    `predicted` (N, 6) is the wrench of offsets and load; `check` returns the findings. Raise
+    DrakeTeleopError if the load is useless and a remedy is known.
     """
     if _is_wrench_constant(log):
         what = "the wrench is the same in all samples: no load can be identified"
@@ -73,7 +73,7 @@ def findings_if_load_is_suspicious(
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < edits.MIN_LAG_OF_WRONG_CLOCK_S)
-    if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
+    if load.mass > 0 and unexplained < MAX_GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_except_lag(check)) if _has_dead_channel_or_imu_finding(log) else ()
     found = _findings_except_lag(check)
@@ -85,7 +85,7 @@ def findings_if_load_is_suspicious(
             raise DrakeTeleopError(found[-1].message, where=log.source)
         return tuple(found)
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
-    if worthless and (why := too_little_motion(log)) is not None:
+    if worthless and (why := explain_lack_of_motion(log)) is not None:
         raise DrakeTeleopError(why, where=log.source, remedy=MORE_MOTION_REMEDY)
     if found and worthless:
         what = f"the fitted mass is {load.mass:.4g} kg"
@@ -155,7 +155,7 @@ def _check_description(data: LogTables, description: Description) -> ConventionC
     more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more
     mounting = None
-    moves = too_little_motion(data.read_thinned_log(description)) is None
+    moves = explain_lack_of_motion(data.read_thinned_log(description)) is None
     if description.imu and description.pose and moves:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
@@ -171,7 +171,7 @@ def _check_description(data: LogTables, description: Description) -> ConventionC
         findings += position_unit_or_origin_findings(description, data, lag)
     more, delay = against_load.check_wrench_and_estimate_delay(description, data)
     findings = _merge_clock_findings(description, [*findings, *more], mounting, delay)
-    findings += _too_few_or_similar_poses_findings(log)
+    findings += _static_pose_findings(log)
     return ConventionCheckResult(tuple(findings), fit, mounting, delay)
 
 
@@ -190,7 +190,7 @@ def _merge_clock_findings(
     return [finding, *(other for other in found if other.name != "clock")]
 
 
-def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
+def _static_pose_findings(log: Log) -> list[Finding]:
     if not log.static:
         return []
     if len(log) < _MIN_STATIC_POSES_FOR_CHECK:
@@ -212,7 +212,7 @@ def _too_few_or_similar_poses_findings(log: Log) -> list[Finding]:
 
 _WRENCH_FIELDS = ("force", "torque")
 _IMU_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration")
-_MIN_LIVE_CHANNEL_NOISE_OVER_LOG_RANGE = 1e-6
+_MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 
 
 def _dead_or_repeated_channel_findings(
@@ -220,7 +220,7 @@ def _dead_or_repeated_channel_findings(
 ) -> list[Finding]:
     described = getattr(description, stream)
     found: list[Finding] = []
-    named: dict[str, str] = {}
+    used_by: dict[str, str] = {}
     if described is None:
         return found
     table = tables[described.source].rows_with_any_number(described.columns)
@@ -229,7 +229,7 @@ def _dead_or_repeated_channel_findings(
         if quantity is None:
             continue
         where = f"{stream}.{field}"
-        if twice := _repeated_column_findings(where, quantity.columns, named):
+        if twice := _repeated_column_findings(where, quantity.columns, used_by):
             found += twice
             continue
         numbers: dict[str, Array] = {}
@@ -249,11 +249,11 @@ def _dead_or_repeated_channel_findings(
     return found
 
 
-def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
+def _repeated_column_findings(where: str, columns: Any, used_by: dict[str, str]) -> list[Finding]:
     found = []
     for column, times in Counter(map(str, columns)).items():
-        before = where if times > 1 else named.get(column)
-        named[column] = where
+        before = where if times > 1 else used_by.get(column)
+        used_by[column] = where
         if before is not None:
             both = "twice" if before == where else f"in {before}.columns too"
             text = f"{where}.columns names {column!r} {both}: one number cannot be two channels"
@@ -265,6 +265,6 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
 def _dead_channels(numbers: dict[str, Array]) -> list[str]:
     x = np.stack(list(numbers.values()), axis=1)
     spread, noise = np.ptp(x, axis=0), white_noise_deviations(x)
-    if not (noise > _MIN_LIVE_CHANNEL_NOISE_OVER_LOG_RANGE * spread).any():
+    if not (noise > _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE * spread).any():
         return []
     return [name for name, width in zip(numbers, spread, strict=True) if width == 0.0]

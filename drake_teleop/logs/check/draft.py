@@ -32,7 +32,7 @@ _VECTOR_NAME_PATTERNS = {
     "orientation": "q|quat|quaternion|orientation|rotation",
     "position": "p|pos|position|translation|tcp|ee|eef",
 }
-_VECTOR_PAIRS_OF_EACH_INSTRUMENT = (
+_VECTOR_PAIRS_WITH_SHARED_PREFIX = (
     ("force", "torque"),
     ("specific_force", "angular_velocity"),
     ("orientation", "position"),
@@ -119,7 +119,7 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
     """Join drafts of a log description: each stream is from the first draft that contains it."""
     streams: dict[str, Any] = {}
     for draft in drafts:
-        whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
+        whole = {name: stream for name, stream in draft.streams.items() if not _is_unfilled(stream)}
         streams = whole | streams
     streams = streams or drafts[0].streams
     order = ["wrench", "imu", "pose", "static"]
@@ -128,47 +128,47 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
     return Draft(ordered, [*lines], tuple(x for draft in drafts for x in draft.findings))
 
 
-def _is_template(stream: dict[str, Any]) -> bool:
+def _is_unfilled(stream: dict[str, Any]) -> bool:
     groups = [group for group in stream.values() if isinstance(group, dict)]
     columns = [column for group in groups for column in group.get("columns", ())]
     return bool(columns) and set(columns) == {_FILL_IN_TEXT}
 
 
-_NamesAndUnits = dict[str, tuple[str, str]]  # normalized, of each column, from its name
+_NamesAndUnits = dict[str, tuple[str, str]]  # by column: its normalized name, and its unit
 _Columns = dict[str, list[str]]  # names of the columns of each recognized vector
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
     """Return a log description guessed from names and magnitudes of columns."""
-    plain = {name: _normalized_name_and_unit(name) for name in table.columns}
-    found = _find_euler_angles(plain) | _find_pose_vectors(table, plain) | _find_vectors(plain)
-    found |= _find_numbered_or_array_vectors(table, plain) | _find_quaternion(table, plain)
-    ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
+    labels = {name: _normalized_name_and_unit(name) for name in table.columns}
+    found = _find_euler_angles(labels) | _find_pose_vectors(table, labels) | _find_vectors(labels)
+    found |= _find_numbered_or_array_vectors(table, labels) | _find_quaternion(table, labels)
+    ends = [labels[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
         vector_column = next(iter(groups.values()))["columns"][0]
-        return {**file, "time": _draft_time(table, plain, vector_column), **groups}
+        return {**file, "time": _draft_time(table, labels, vector_column), **groups}
 
     pair = {x: found.get(x, [_FILL_IN_TEXT] * 3) for x in ("force", "torque")}
-    both = {kind: _draft_quantity(table, plain, kind, columns) for kind, columns in pair.items()}
+    both = {kind: _draft_quantity(table, labels, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
-    forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
+    forces = [_remove_trailing_number(labels[name][0]) for name in found.get("force", [])[:1]]
     if any(re.search(_BASE_FORCE_PATTERN, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
         draft["wrench"] = wrench
     imu = {
-        kind: _draft_quantity(table, plain, kind, found[kind])
+        kind: _draft_quantity(table, labels, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
         if _count_scalars_per_row(table, found.get(kind, [])) == 3
     }
     if imu:
         draft["imu"] = stream_with_time(**imu)
-    pose = _draft_pose(table, plain, found)
+    pose = _draft_pose(table, labels, found)
     if pose:
         draft["pose"] = stream_with_time(**pose)
     if not draft:
@@ -176,7 +176,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {name for x in groups if isinstance(x, dict) for name in x.get("columns", ())}
     without_time = _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time"))
-    if without_time and table.rows <= _MAX_ROWS_OF_STATIC_LOG and pose and not _is_template(wrench):
+    if without_time and table.rows <= _MAX_ROWS_OF_STATIC_LOG and pose and not _is_unfilled(wrench):
         kept = {name: value for name, value in wrench.items() if name != "time"}
         draft = {"static": {**kept, "orientation": pose["orientation"]}}
     times = {x.get("time", {}).get(k) for x in draft.values() for k in ("column", "nanoseconds")}
@@ -196,31 +196,31 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *([_RAW_ACCELERATION_NOTE] if raw in str(draft.get("imu")) else []),
         *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
-    return Draft(draft, head, tuple(_other_wrench_findings(table, plain, found)))
+    return Draft(draft, head, tuple(_findings_on_other_wrenches(table, labels, found)))
 
 
-def _find_numbered_or_array_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
-    numbered = _find_vectors_in_numbered_columns(plain)
-    return numbered | _find_vectors_in_array_columns(table, plain)
+def _find_numbered_or_array_vectors(table: Table, labels: _NamesAndUnits) -> _Columns:
+    numbered = _find_vectors_in_numbered_columns(labels)
+    return numbered | _find_vectors_in_array_columns(table, labels)
 
 
-def _other_wrench_findings(
-    table: Table, plain: _NamesAndUnits, found: _Columns
+def _findings_on_other_wrenches(
+    table: Table, labels: _NamesAndUnits, found: _Columns
 ) -> Iterator[Finding]:
-    """Yield a finding for each pair of force and torque in the table besides that in `found`."""
+    """Yield a finding for each wrench in the table besides that in `found`."""
     pair = "force", "torque"
     used = {x for names in found.values() for x in names}
     taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
     while taken:
         arrays = {name.partition("[")[0] for name in used}
-        plain = {x: y for x, y in plain.items() if not {x, x.partition("[")[0]} & (used | arrays)}
-        rest = replace(table, columns=ColumnsOnAccess(plain, table.columns.__getitem__))
-        other = _find_vectors(plain) | _find_numbered_or_array_vectors(rest, plain)
+        labels = {x: y for x, y in labels.items() if not {x, x.partition("[")[0]} & (used | arrays)}
+        rest = replace(table, columns=ColumnsOnAccess(labels, table.columns.__getitem__))
+        other = _find_vectors(labels) | _find_numbered_or_array_vectors(rest, labels)
         if any(_count_scalars_per_row(table, other.get(kind, [])) != 3 for kind in pair):
             return
         used = {x for kind in pair for x in other[kind]}
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
-        frame = "base" if re.search(_BASE_FORCE_PATTERN, plain[other["force"][0]][0]) else "sensor"
+        frame = "base" if re.search(_BASE_FORCE_PATTERN, labels[other["force"][0]][0]) else "sensor"
         text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
         yield Finding("other wrench", f"{text}; to use it, set {lines} and wrench.frame: {frame}")
 
@@ -238,45 +238,45 @@ def _remove_trailing_number(name: str) -> str:
     return re.sub(r"_?\d+$", "", name)
 
 
-def _is_not_measured(name: str) -> bool:
+def _is_command_or_estimate(name: str) -> bool:
     return bool(re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name))
 
 
-def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
+def _group_numbered_columns(labels: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
+    for name, (words, _) in labels.items():
         if re.search(pattern, words):
             groups.setdefault(_remove_trailing_number(words), []).append(name)
     return groups
 
 
-def _find_vectors(plain: _NamesAndUnits) -> _Columns:
-    groups = {kind: _group_axes(plain, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
+def _find_vectors(labels: _NamesAndUnits) -> _Columns:
+    groups = {kind: _group_by_vector(labels, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
     found: _Columns = {}
-    for pair in _VECTOR_PAIRS_OF_EACH_INSTRUMENT:
+    for pair in _VECTOR_PAIRS_WITH_SHARED_PREFIX:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
-        shared.sort(key=_is_not_measured)
+        shared.sort(key=_is_command_or_estimate)
         for kind in pair:
             for name in (shared or list(groups[kind]))[:1]:
                 found[kind] = groups[kind][name]
     return found
 
 
-def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
-    """Return columns by vector of a `kind`; incomplete vectors only if none is complete."""
+def _group_by_vector(labels: _NamesAndUnits, kind: str, names: str) -> _Columns:
+    """Return the columns of each vector of a `kind` by prefix; complete ones if there are any."""
     axes = "wxyz" if kind == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
     groups: dict[str, dict[str, str]] = {}
-    for name, (words, _) in plain.items():
+    for name, (words, _) in labels.items():
         if match := re.match(ends, words):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
         elif kind == "position" and words in ("x", "y", "z"):
             groups.setdefault("", {}).setdefault(words, name)
     spelled = "|".join(x for x in names.split("|") if len(x) > 2)
-    threes = {} if groups else _group_numbered_columns(plain, rf"(^|_)({spelled})_?[0-3]$")
+    threes = {} if groups else _group_numbered_columns(labels, rf"(^|_)({spelled})_?[0-3]$")
     if found := {name: group for name, group in threes.items() if len(group) == len(axes) == 3}:
         return found
-    for name, (words, unit) in plain.items() if not groups else ():  # in another language
+    for name, (words, unit) in labels.items() if not groups else ():  # in another language
         match = re.match(r"^(.*?)_?([xyz])$", words)
         if match and known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
@@ -284,9 +284,9 @@ def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
     return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
 
 
-def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
+def _find_euler_angles(labels: _NamesAndUnits) -> _Columns:
     ends: dict[str, dict[str, str]] = {}
-    for name, (words, _) in plain.items():
+    for name, (words, _) in labels.items():
         prefix, _, end = re.sub("theta_(?=[xyz]$)", "r", words).rpartition("_")  # of Kinova
         ends.setdefault(prefix, {}).setdefault(end, name)
     for names, axes in _EULER_ANGLE_NAMES.items():
@@ -297,8 +297,8 @@ def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
     return {}
 
 
-def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
-    groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
+def _find_pose_vectors(table: Table, labels: _NamesAndUnits) -> _Columns:
+    groups = _group_numbered_columns(labels, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in (7, 8)):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
@@ -313,39 +313,39 @@ def _are_unit_quaternions(table: Table, quaternion: list[str]) -> bool:
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_LENGTH_TOLERANCE)
 
 
-def _find_quaternion(table: Table, plain: _NamesAndUnits) -> _Columns:
-    groups = _group_numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
+def _find_quaternion(table: Table, labels: _NamesAndUnits) -> _Columns:
+    groups = _group_numbered_columns(labels, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _are_unit_quaternions(table, group)), None)
     return {"orientation": found} if found else {}
 
 
-def _find_vectors_in_numbered_columns(plain: _NamesAndUnits) -> _Columns:
-    groups = _group_numbered_columns(plain, r"\d$")
+def _find_vectors_in_numbered_columns(labels: _NamesAndUnits) -> _Columns:
+    groups = _group_numbered_columns(labels, r"\d$")
     found: _Columns = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
-        for base in sorted(fit, key=_is_not_measured)[:1]:
+        for base in sorted(fit, key=_is_command_or_estimate)[:1]:
             for kind, places in kinds.items():
                 found[kind] = [groups[base][k] for k in places]
-    by_words = {words: name for name, (words, _) in plain.items()}
+    by_words = {words: name for name, (words, _) in labels.items()}
     if all(word in by_words for word in _MATRIX_ELEMENT_NAMES):
         found["matrix"] = [by_words[word] for word in _MATRIX_ELEMENT_NAMES]
     return found
 
 
-def _find_vectors_in_array_columns(table: Table, plain: _NamesAndUnits) -> _Columns:
+def _find_vectors_in_array_columns(table: Table, labels: _NamesAndUnits) -> _Columns:
     found: _Columns = {}
     arrays = _names_of_array_columns(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
-            words, form = plain[name][0], kind
+            words, form = labels[name][0], kind
             fits = _count_scalars_per_row(table, [name]) == width
             if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
                 words = words[:-5]
-                form = "quaternion_xyzw" if plain[name][0].endswith("xyzw") else kind
+                form = "quaternion_xyzw" if labels[name][0].endswith("xyzw") else kind
             if form not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[form] = [name]
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
@@ -363,7 +363,7 @@ def _count_scalars_per_row(table: Table, columns: list[str]) -> int:
 
 
 def _draft_quantity(
-    table: Table, plain: _NamesAndUnits, kind: str, columns: list[str]
+    table: Table, labels: _NamesAndUnits, kind: str, columns: list[str]
 ) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(columns)}
     if _FILL_IN_TEXT in columns:
@@ -373,7 +373,7 @@ def _draft_quantity(
         is_integer = (np.nan_to_num(x) % 1.0 == 0.0).all()
         if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_OF_RAW_COUNTS:
             group["scale"] = _FILL_IN_TEXT
-    if spelling := plain[columns[0]][1]:
+    if spelling := labels[columns[0]][1]:
         unit = known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
@@ -392,39 +392,39 @@ def _draft_quantity(
     return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 
-def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
+def _draft_pose(table: Table, labels: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
     if _count_scalars_per_row(table, found.get("orientation", [])) == 4:
         orientation = {"columns": found["orientation"], "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
         orientation = {"columns": found[form], "form": form}
     elif euler := next((name for name in found if name in EULER_AXIS_SEQUENCES), None):
-        orientation = _draft_quantity(table, plain, "euler", found[euler])
+        orientation = _draft_quantity(table, labels, "euler", found[euler])
         orientation |= {"form": "euler", "axes": euler}
     elif (name := "rotation_vector") in found:
-        orientation = _draft_quantity(table, plain, name, found[name]) | {"form": name}
+        orientation = _draft_quantity(table, labels, name, found[name]) | {"form": name}
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
     if _count_scalars_per_row(table, found.get("position", [])) == 3:
-        pose["position"] = _draft_quantity(table, plain, "position", found["position"])
+        pose["position"] = _draft_quantity(table, labels, "position", found["position"])
     return pose
 
 
-def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict[str, Any]:
-    named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
-    named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
+def _draft_time(table: Table, labels: _NamesAndUnits, vector_column: str) -> dict[str, Any]:
+    named = [name for name, (words, _) in labels.items() if re.search(_TIME_NAME_PATTERN, words)]
+    named += [name for name, (_, unit) in labels.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
-    named = named or _find_clock_columns(table, plain)
+    named = named or _find_clock_columns(table, labels)
     if not named:
         return {"column": _FILL_IN_TEXT}
     if vector_column in table.columns:
         structure, rows = vector_column.rpartition(".")[0], len(table.columns[vector_column])
         named.sort(key=lambda name: len(table.columns[name]) != rows)
         named.sort(key=lambda name: name.rpartition(".")[0] != structure)
-    unit = known_unit(plain[named[0]][1])
-    start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
-    parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
-    for end in _NANOSECOND_PART_NAME_ENDINGS if start != plain[named[0]][0] else ():
+    unit = known_unit(labels[named[0]][1])
+    start = labels[named[0]][0].removesuffix("s").removesuffix("sec")
+    parts = {words: name for name, (words, _) in labels.items() if words.startswith(start)}
+    for end in _NANOSECOND_PART_NAME_ENDINGS if start != labels[named[0]][0] else ():
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
     if unit not in _ALLOWED_UNITS["time"]:
@@ -435,14 +435,14 @@ def _draft_time(table: Table, plain: _NamesAndUnits, vector_column: str) -> dict
     return {"column": named[0], "unit": unit}
 
 
-def _find_clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
+def _find_clock_columns(table: Table, labels: _NamesAndUnits) -> list[str]:
     def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:
             return False
         steps = np.diff(values.astype(float))
         even = np.ptp(np.quantile(steps, [0.1, 0.9])) < steps.mean()
-        is_counter = re.search(_COUNTER_COLUMN_PATTERN, plain[name][0])
+        is_counter = re.search(_COUNTER_COLUMN_PATTERN, labels[name][0])
         return bool((steps > 0.0).all() and even and not is_counter)
 
-    return [name for name in plain if is_clock(name)]
+    return [name for name in labels if is_clock(name)]

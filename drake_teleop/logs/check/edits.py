@@ -32,8 +32,6 @@ MOTION_FINDINGS = (
 )
 """Errors of the described motion, which resemble causes."""
 MIN_LAG_OF_WRONG_CLOCK_S = 0.05  # filters lag less
-
-
 # Median specific force over gravity of an accelerometer on a moving arm.
 _MIN_MEDIAN_OVER_GRAVITY, _MAX_MEDIAN_OVER_GRAVITY = 0.6, 1.6
 Edit = tuple[Finding, Description]  # a finding, and the corrected description
@@ -210,7 +208,7 @@ class LogTables:
     def start_lag_and_clock_drift_correction(
         self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
     ) -> tuple[float, str, Description]:
-        """Return a stream's lag at its first row [s], corrected lines, and the edited description.
+        """Return a stream's lag at its first row [s], lines that correct it, edited description.
 
         The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row. The
         lag grows by `drift` [s/s].

@@ -12,9 +12,9 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import axis_names_of_rows, rotation_matrices, signed_permutations
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.against_load import (
-    GOOD_UNEXPLAINED,
+    MAX_GOOD_UNEXPLAINED,
+    MAX_VALID_UNEXPLAINED,
     MIN_MISFIT_REDUCTION_BY_EDIT,
-    VALID_UNEXPLAINED,
 )
 from drake_teleop.logs.check.edits import (
     MIN_LAG_OF_WRONG_CLOCK_S,
@@ -208,25 +208,26 @@ def check_imu_against_pose(
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if given.unexplained > GOOD_UNEXPLAINED or given.is_mirrored or given.rotation_angle_deg > 10:
+    is_rotated = given.rotation_angle_deg > 10
+    if given.unexplained > MAX_GOOD_UNEXPLAINED or given.is_mirrored or is_rotated:
         better = [
             (found, finding, edited)
             for finding, edited in orientation_and_gravity_sign_edits(description)
             if (found := call_or_none_if_unreadable(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_MISFIT_REDUCTION_BY_EDIT)
+        limit = min(MAX_VALID_UNEXPLAINED, given.unexplained / MIN_MISFIT_REDUCTION_BY_EDIT)
         if given.is_mirrored:
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
-        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED:
+        elif is_rotated and given.unexplained < MAX_VALID_UNEXPLAINED:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
-            limit = min(VALID_UNEXPLAINED, 1.5 * given.unexplained + 1e-4)
+            limit = min(MAX_VALID_UNEXPLAINED, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0].unexplained, default=None)
         if best and best[0].unexplained < limit:
             given, finding, description = best
             findings.append(finding)
-    if given.unexplained > VALID_UNEXPLAINED and not given.is_mirrored:
+    if given.unexplained > MAX_VALID_UNEXPLAINED and not given.is_mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
@@ -316,7 +317,7 @@ def position_unit_or_origin_findings(
     columns, by_pose = (low_pass(x, sensed.dt, _ACCELERATION_CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     num_samples = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
-    fit = _fit_centred_signals(columns[inner], by_pose[inner], num_samples)
+    fit = _centred_fit_and_deviations(columns[inner], by_pose[inner], num_samples)
     if fit is None or abs(fit[0][0]) <= _MIN_SCALE_OR_SHIFT_OVER_STD * fit[1][0]:
         return []
     x, deviations = fit
@@ -355,7 +356,7 @@ def _position_unit_finding(described: str, scale: float, deviation: float) -> Fi
     return Finding("units", f"{text} their unit is unknown; {remedy}")
 
 
-def _fit_centred_signals(
+def _centred_fit_and_deviations(
     columns: Array, target: Array, num_samples: float
 ) -> tuple[Array, Array] | None:
     if len(columns) == 0:
@@ -395,7 +396,7 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     limit = max(_MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_ratio_std)
     if abs(seen.position_unit_ratio - 1.0) > limit or (seen.is_usable and seen.is_mirrored):
         return None
-    if _may_torque_unit_be_wrong(phi[1:4] / phi[0], frame.p_SoPo_S):
+    if _may_torque_unit_explain_shift(phi[1:4] / phi[0], frame.p_SoPo_S):
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
     texts, lines = [], []
@@ -414,7 +415,7 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     return Finding("pose frame", text)
 
 
-def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
+def _may_torque_unit_explain_shift(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = min(np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS)
     is_usual = _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M

@@ -45,8 +45,8 @@ def max_cutoff_by_pose_noise(log: Log) -> float:
     return max(_MIN_CUTOFF_HZ, float(ratio**0.4))
 
 
-def too_little_motion(log: Log) -> str | None:
-    """Return a text if the motion is too small to separate load and offsets, else None."""
+def explain_lack_of_motion(log: Log) -> str | None:
+    """Return an error text if the motion is too small to separate load and offsets, else None."""
     if log.static:
         return None
     s, omega = motion_rms(log)
@@ -58,15 +58,15 @@ def too_little_motion(log: Log) -> str | None:
 
 @lru_cache(maxsize=1)  # edits of the wrench keep the poses, whose identity is the key
 def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
-    """Return `motion_rms` by covariance of even and odd poses, without noise; None: few poses."""
+    """Return `motion_rms` by covariance of even and odd poses, free of noise; None: few poses."""
     poses = posed.poses.with_continuous_quaternions()
     count = max(1, int(0.5 * _BLOCK_S * poses.rate))
     rows = len(poses.t) // (2 * count) * 2 * count
     if rows < 2 * count * _MIN_BLOCKS:
         return None
     arrays = poses.t, poses.position, poses.quaternion
-    halves = [Poses(*(x[k:rows:2] for x in arrays)) for k in (0, 1)]
-    motions = [_block_motion(half.average_consecutive(count), posed.gravity_W) for half in halves]
+    halves = [Poses(*(x[k:rows:2] for x in arrays)).average_consecutive(count) for k in (0, 1)]
+    motions = [_specific_force_and_omega(half, posed.gravity_W) for half in halves]
     s, omega = (
         np.sqrt(max(0.0, float(((a - a.mean(axis=0)) * (b - b.mean(axis=0))).mean(axis=0).sum())))
         for a, b in zip(*motions, strict=True)
@@ -74,7 +74,7 @@ def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
     return float(s), float(omega)
 
 
-def _block_motion(poses: Poses, gravity_W: Array) -> tuple[Array, Array]:
+def _specific_force_and_omega(poses: Poses, gravity_W: Array) -> tuple[Array, Array]:
     R_WS = rotation_matrices(poses.quaternion, "quaternion_wxyz")
     acceleration = np.gradient(np.gradient(poses.position, poses.t, axis=0), poses.t, axis=0)
     s = np.einsum("nji,nj->ni", R_WS, acceleration - gravity_W)

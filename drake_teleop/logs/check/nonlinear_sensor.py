@@ -13,8 +13,8 @@ from drake_teleop.logs.read.canonical import Log
 _MAX_COMPARED_SAMPLES, _COMPARED_RATE_HZ = 2000, 50.0
 _DEAD_BAND_OVER_LARGEST_WRENCH, _PLAY_OVER_RANGE = 0.05, 0.01
 _LEAST_EXPLAINED_SHARE, _CERTAIN_EXPLAINED_SHARE, _LEAST_RELATIVE_ERROR = 0.12, 0.3, 0.01
-_LARGEST_UNEXPLAINED_SHARE = 0.02
-_MESSAGES = {
+_MAX_UNEXPLAINED_SHARE = 0.02
+_MESSAGE_OF_NONLINEARITY = {
     "dead band": "the sensor shows too little near zero (dead band); turn that off",
     "curvature": "the gain of the sensor depends on the wrench; calibrate the sensor",
     "hysteresis": "the reading depends on the direction of its change (hysteresis); look for"
@@ -27,8 +27,7 @@ def error_of_load_by_nonlinear_sensor(
 ) -> tuple[Array, Finding | None]:
     """Return likely errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
 
-    The errors are 0 if no function of the wrench in each channel explains the residual. The
-    log is without delay.
+    The errors are 0 if no tested nonlinearity explains the residual. The log is without delay.
     """
     step = max(1, round(1.0 / (_COMPARED_RATE_HZ * log.dt)), -(-len(log) // _MAX_COMPARED_SAMPLES))
     few = log.select_rows(slice(None, None, step))
@@ -40,31 +39,31 @@ def error_of_load_by_nonlinear_sensor(
     functions = {
         "dead band": [np.tanh(wrench / dead_band)],
         "curvature": [unit**2, unit**3],
-        "hysteresis": [_play(unit)],
+        "hysteresis": [_hysteresis_by_play(unit)],
     }
     offsets = np.broadcast_to(np.eye(6), (len(V), 6, 6))
     load_columns = np.concatenate([offsets, V], axis=2) / scale[:, None]
     gains = _one_column_per_channel(unit)
     measured = few.wrench / scale
-    residual = _fit(measured, load_columns, gains)[1] + 1e-300
+    residual = _fit_columns(measured, load_columns, gains)[1] + 1e-300
     own = {name: [*map(_one_column_per_channel, x)] for name, x in functions.items()}
-    left = {name: _fit(measured, load_columns, gains, *x)[1] for name, x in own.items()}
+    left = {name: _fit_columns(measured, load_columns, gains, *x)[1] for name, x in own.items()}
     name = min(left, key=lambda x: left[x])
     share = 1.0 - left[name] / residual
     total = float(np.sum((measured - measured.mean(axis=0)) ** 2))
-    large = left[name] > _LARGEST_UNEXPLAINED_SHARE * total
+    large = left[name] > _MAX_UNEXPLAINED_SHARE * total
     if share < _LEAST_EXPLAINED_SHARE or large or load.mass <= 0.0:
         return np.zeros(10), None
     scales = natural_scales(load.phi)[6:]
     if name == "hysteresis":  # its part in phase with the wrench, which no fit shows, is as large
         errors = np.sqrt(share * residual / total) * scales
     else:
-        nonlinear, linear = (_fit(measured, load_columns, *x)[0] for x in (own[name], []))
+        nonlinear, linear = (_fit_columns(measured, load_columns, *x)[0] for x in (own[name], []))
         errors = nonlinear[6:16] - linear[6:16]
     worst = float(np.max(np.abs(errors[:4]) / scales[:4]))
     if share < _CERTAIN_EXPLAINED_SHARE or worst < _LEAST_RELATIVE_ERROR:
         return errors, None
-    text = f"payload not identifiable: {_MESSAGES[name]}"
+    text = f"payload not identifiable: {_MESSAGE_OF_NONLINEARITY[name]}"
     text = f"{text}; error of the load about {100.0 * worst:.2g} %"
     return errors, Finding(name, text, values={"relative_error": worst})
 
@@ -73,15 +72,15 @@ def _one_column_per_channel(x: Array) -> Array:
     return np.asarray(x[:, :, None] * np.eye(6))
 
 
-def _fit(wrench: Array, *columns: Array) -> tuple[Array, float]:
-    """Return the parameters of all columns (N, 6, p), and the squared residual."""
+def _fit_columns(wrench: Array, *columns: Array) -> tuple[Array, float]:
+    """Return least-squares parameters (p,) of `columns` (N, 6, p), and the squared residual."""
     A, b = np.concatenate(columns, axis=2).reshape(wrench.size, -1), wrench.ravel()
     theta = np.linalg.lstsq(A, b, rcond=1e-9)[0]
     return np.asarray(theta), float(np.sum((b - A @ theta) ** 2))
 
 
-def _play(x: Array) -> Array:
-    """Return the lag (N, 6) of a reading behind x (N, 6) with play, divided by half the play."""
+def _hysteresis_by_play(x: Array) -> Array:
+    """Return the error (N, 6) of a reading of x (N, 6) with play, over half the play."""
     out, reading = np.zeros_like(x), x[0]
     for n in range(1, len(x)):
         reading = np.clip(reading, x[n] - _PLAY_OVER_RANGE, x[n] + _PLAY_OVER_RANGE)

@@ -11,8 +11,8 @@ from drake_teleop.logs.read.alignment import mean_time_step, remove_delay
 from drake_teleop.logs.read.canonical import Log
 
 _COMPARED_RATE_HZ, _MAX_MISFIT_RATIO_OF_FILTER = 50.0, 0.25
-_CUTOFFS_HZ = np.geomspace(0.02, 2.0, 25)
-_FINE_CUTOFF_RATIOS = np.geomspace(0.84, 1.2, 9)
+_SEARCHED_CUTOFFS_HZ = np.geomspace(0.02, 2.0, 25)
+_REFINED_CUTOFF_RATIOS = np.geomspace(0.84, 1.2, 9)
 
 
 def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
@@ -27,10 +27,10 @@ def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
         V, wrench = regressor(*few.motion) / scale[:, None], few.wrench / scale
         for is_fine in (False, True):
             best = fitting[min(fitting, key=lambda x: least[x])] if is_fine else 1.0
-            for cutoff in best * (_FINE_CUTOFF_RATIOS if is_fine else _CUTOFFS_HZ):
+            for cutoff in best * (_REFINED_CUTOFF_RATIOS if is_fine else _SEARCHED_CUTOFFS_HZ):
                 decay = np.exp(-2.0 * np.pi * cutoff * t)  # of the start
                 basis = np.linalg.qr(np.stack([np.ones(len(t)), t, decay, t * decay], axis=1))[0]
-                high = _high_passed(V, cutoff, dt)
+                high = _high_pass(V, cutoff, dt)
                 second = lfilter(*butter(2, 2.0 * cutoff * dt), V - V[0], axis=0) + V[0]
                 models = [("none", V), ("high-pass", high), ("low-pass", V - high)]
                 for name, columns in [*models, ("low-pass", second)]:
@@ -48,7 +48,7 @@ def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
     return Finding(name, message, values={"cutoff_hz": fitting[name]})
 
 
-def _high_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
+def _high_pass(x: Array, cutoff_hz: float, dt: float) -> Array:
     from scipy.signal import lfilter
 
     a = np.exp(-2.0 * np.pi * cutoff_hz * dt)

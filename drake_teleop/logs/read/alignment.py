@@ -76,7 +76,7 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
 
 
 def _pad_by_continuation(x: Array, pad: int, length: int) -> Array:
-    """Return rows x (k, N), continued at both ends by `pad` point reflections, (k, length)."""
+    """Return rows x (k, N), extended by odd reflections of `pad` samples and filled to `length`."""
     n, end = x.shape[1], x.shape[1] + 2 * pad
     padded = np.empty((len(x), length))
     padded[:, pad : pad + n] = x
@@ -124,7 +124,7 @@ def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
 
 
 def polynomial_fit_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
-    """Return weights (6, w), which times w <= n samples are coefficients of a fitted polynomial."""
+    """Return the matrix (6, w) from w samples, at most max(n, 9), to polynomial coefficients."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
     half = max(_MIN_SMOOTHER_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
@@ -196,7 +196,7 @@ def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
 
 
 def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) True within `length_s` [s], or a period of the low-pass, of either end."""
+    """Return (N,) True within `length_s` [s] or a low-pass period of an end (a quarter at most)."""
     out = np.zeros(len(log), bool)
     if log.static:
         return out
@@ -214,8 +214,8 @@ _MIN_SAMPLES_FOR_DELAY, _MAX_SAMPLES_FOR_DELAY = 32, 5000
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    It minimizes the log variance of the residual, summed over the wrench channels. Offsets, and
-    phi (10,) if not given, are fitted.
+    The delay minimizes the log variance of the residual, summed over the wrench channels. Offsets,
+    and phi (10,) if not given, are fitted.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_pass_log(log, cutoff)

@@ -39,15 +39,15 @@ def estimate_auto_imu_mounting(description: Description, source: str, read: Read
     mounting = None
     if description.pose is not None:
         alone = read(description.model_copy(update={"imu": None}))
-        at_Io = read(replace_imu_fields(frame=start, position=(0.0, 0.0, 0.0)))
-        mounting = find_mounting(at_Io, alone, has_position=description.pose.position is not None)
+        log_Io = read(replace_imu_fields(frame=start, position=(0.0, 0.0, 0.0)))
+        mounting = find_mounting(log_Io, alone, has_position=description.pose.position is not None)
     if frame == "auto":
         mounting = _require_imu_rotation(mounting, f"{source}:imu.frame")
         frame = tuple(map(tuple, mounting.R_SI.tolist()))
         notes += _imu_rotation_notes(mounting)
     if position == "auto":
-        at_Io = read(replace_imu_fields(frame=frame, position=(0.0, 0.0, 0.0)))
-        lever = _lever_arm_from_pose_or_wrench(mounting, at_Io, f"{source}:imu.position")
+        log_Io = read(replace_imu_fields(frame=frame, position=(0.0, 0.0, 0.0)))
+        lever = _lever_arm_from_pose_or_wrench(mounting, log_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         found = f": {_format_arm_mm(lever)} mm, from the {lever.source}"
         notes.append(_note_on_estimate("imu.position", found, lever.p_SoIo_S))
@@ -85,7 +85,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     std = f"{float(found.deviations_deg.max()):.2g} deg"
     notes = [_note_on_estimate("imu.frame", f": {oblique}, standard deviation {std}", found.R_SI)]
     if not found.is_right_angled:
-        notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
+        notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check imu.frame")
     if abs(found.lag_s) > MIN_WARNED_IMU_LAG_S:
         notes.append(
             f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
@@ -94,12 +94,12 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     return notes
 
 
-def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
+def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, log_Io: Log, where: str) -> LeverArm:
     lever = None
     if mounting is not None and mounting.fits_pose:
         lever = mounting.lever_arm
     if lever is None or not lever.is_determined_by_axis.all():
-        arms = [arm for arm in (lever, lever_arm_from_wrench(at_Io)) if arm is not None]
+        arms = [arm for arm in (lever, lever_arm_from_wrench(log_Io)) if arm is not None]
         lever = max(arms, key=lambda arm: int(arm.is_determined_by_axis.sum()), default=None)
     if lever is None:
         what = (
@@ -177,11 +177,11 @@ def block_means_of_log(log: Log) -> BlockMeans:
         gravity, motion = log.gravity_W, (*log.motion, log.R_WS)
     noise = np.inf if log.is_acceleration_unknown else 0.0
     means = block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged, noise)
-    return replace(means, clock_rate=_clock_rate_extension(log))
+    return replace(means, clock_rate=_clock_rate_extension_name(log))
 
 
-def _clock_rate_extension(log: Log) -> str | None:
-    """Return the extension for signals that depend on the clock; None if they are unknown."""
+def _clock_rate_extension_name(log: Log) -> str | None:
+    """Return the name of the model extension for a wrong clock rate; None if it is unknown."""
     if log.described is None or log.has_calendar_time or log.is_acceleration_unknown:
         return None
     imu = log.described.imu

@@ -33,10 +33,10 @@ _MESSAGES_PER_BLOCK, _RECEPTION_TIME_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
 _MCAP_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
-_TOO_LARGE_MESSAGE = "its uncompressed size is too large (more than 1.5 GB, or 200 times the file)"
-_SPLIT_REMEDY = "cut the bag, or write each topic to its own bag"
-_SHORT_NAMES = "orientation", "position", "force", "torque", "linear_acceleration"
-_SHORT_NAME_OF_FIELD = {x: x for x in (*_SHORT_NAMES, "angular_velocity")}
+_BAG_SIZE_ERROR = "its uncompressed size is too large (more than 1.5 GB, or 200 times the file)"
+_BAG_SIZE_REMEDY = "cut the bag, or write each topic to its own bag"
+_KEPT_FIELD_NAMES = "orientation", "position", "force", "torque", "linear_acceleration"
+_SHORT_NAME_OF_FIELD = {x: x for x in (*_KEPT_FIELD_NAMES, "angular_velocity")}
 _SHORT_NAME_OF_FIELD |= {"rotation": "orientation", "translation": "position"}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
@@ -174,7 +174,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     except DrakeTeleopError:
         raise
     except MemoryError:
-        raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_SPLIT_REMEDY) from None
+        raise DrakeTeleopError(_BAG_SIZE_ERROR, where=str(path), remedy=_BAG_SIZE_REMEDY) from None
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -192,7 +192,7 @@ def _check_unpacked_size(path: Path) -> None:
             total += int.from_bytes(head[25:33], "little") if head[0] == _MCAP_CHUNK_OPCODE else 0
             file.seek(min(length - 24, limit), 1)
             if total > limit:
-                raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_SPLIT_REMEDY)
+                raise DrakeTeleopError(_BAG_SIZE_ERROR, where=str(path), remedy=_BAG_SIZE_REMEDY)
 
 
 @contextmanager

@@ -33,7 +33,7 @@ _COLUMNS_OF_KINEMATIC_FIELD = {
     "orientation": QUATERNION_COLUMNS,
     "position": POSITION_COLUMNS,
 }
-_MAX_REST_SPEED_RAD_S = 0.05  # rad/s
+_MAX_ANGULAR_REST_SPEED_RAD_S = 0.05
 _MIN_ROTATION_BETWEEN_POSES_RAD = np.radians(10.0)
 _VECTOR_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration", "gravity")
 _ROW_SHAPE_OF_FIELD: dict[str, tuple[int, ...]] = {"t": (), "wrench": (6,)}
@@ -60,9 +60,9 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        estimated: "gravity", "weight", if the data determine them.
+        estimated: "gravity", "weight", if they are estimated from the data.
         resolution: quantization step of force and torque, for static poses [N, N m].
-        has_calendar_time: True for time stamps since 1970, whose unit is certain.
+        has_calendar_time: True for time stamps counted from 1970, whose unit is certain.
     """
 
     t: Array
@@ -143,6 +143,7 @@ class Log:
 
     @property
     def motion(self) -> tuple[Array, Array, Array]:
+        """Specific force, angular velocity and angular acceleration (N, 3)."""
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
 
@@ -164,8 +165,8 @@ def write_log(log: Log, path: str | Path) -> None:
 def describe_canonical(path: Path, table: Table) -> Description:
     """Return the description of a canonical table (columns `t`, `f_x` ...).
 
-    Rows with orientation or specific force are static poses unless the sensor rotates: if `t` is
-    absent, or slower than 5 Hz with rotations by more than 10 deg in a fifth of the steps.
+    Rows with orientation or specific force are static poses below 0.05 rad/s (median) if `t` is
+    absent, or slower than 5 Hz with tilts by more than 10 deg in a fifth of the steps.
     """
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"
@@ -208,7 +209,7 @@ def _are_rows_poses_at_rest(table: Table, fields: Container[str]) -> bool:
         return False
     if "angular_velocity" in fields:
         speed = table.finite_numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
-        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED_RAD_S:
+        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_ANGULAR_REST_SPEED_RAD_S:
             return False
     if "t" not in table.columns:
         return True

@@ -84,7 +84,7 @@ def time_stamps_and_num_episodes(
 ) -> tuple[Array, int]:
     """Return the scaled times (N,) of a table's rows [s], NaN if absent, and number of episodes.
 
-    Whole tables are scaled and joined, so that all their streams keep one clock. With
+    `time.scale` and joining of episodes use the whole table: all its streams keep one clock. With
     `time.rate`, rows without numbers of the stream are gaps, unless other streams fill them.
     """
     if time.column is None:
@@ -151,8 +151,8 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     return result, len(back) + 1
 
 
-def zero_steps_between_episodes(steps: Array, median: float, num_episodes: int) -> Array:
-    error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median)), steps.copy()
+def zero_steps_between_episodes(steps: Array, median_step: float, num_episodes: int) -> Array:
+    error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median_step)), steps.copy()
     inner[np.argsort(error, kind="stable")[: num_episodes - 1]] = 0.0
     return inner
 

@@ -57,7 +57,7 @@ class Time(StrictModel):
 
 
 class Orientation(StrictModel):
-    """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
+    """Columns and form of an orientation: R_WS of S, or R_WP of a posed frame P."""
 
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector", "euler"]

@@ -41,15 +41,15 @@ def known_unit(text: str) -> str:
     return _UNIT_OF_SPELLING.get(plain, "")
 
 
-def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> Any:
-    if value in words:
+def _parse_frame(value: Any, *, keywords: tuple[str, ...] = ("sensor", "base")) -> Any:
+    if value in keywords:
         return value
     try:
         matrix = np.asarray(value)
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
-        allowed = f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(words)}"
+        allowed = f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(keywords)}"
         raise ValueError(f"must be {allowed}")
     if not (np.abs(matrix) < 2.0).all() or orthogonality_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
@@ -57,7 +57,7 @@ def _parse_frame(value: Any, *, words: tuple[str, ...] = ("sensor", "base")) -> 
 
 
 def _parse_rotation(value: Any) -> Any:
-    return value if value is None else _parse_frame(value, words=("auto",))
+    return value if value is None else _parse_frame(value, keywords=("auto",))
 
 
 def _parse_position(value: Any) -> Any:
@@ -92,8 +92,6 @@ def _parse_removed_weight(value: Any) -> Any:
 
 
 Column = str | int
-
-
 Number = Annotated[float, Field(strict=True)]  # rejects true and "1"
 Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
@@ -134,7 +132,7 @@ Weight = Annotated[
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_parse_frame)]
 ImuFrame = Annotated[
     Literal["sensor", "base", "auto"] | Rotation,
-    BeforeValidator(partial(_parse_frame, words=("sensor", "base", "auto"))),
+    BeforeValidator(partial(_parse_frame, keywords=("sensor", "base", "auto"))),
 ]
 RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_parse_rotation)]
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
@@ -150,7 +148,7 @@ class StrictModel(BaseModel):
     def _reject_huge_numbers(cls, value: Any) -> Any:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
-                raise ValueError(f"{number:g} exceeds 1e12")
+                raise ValueError(f"{number:g} is outside -1e12 to 1e12: check the number")
         return value
 
 

@@ -24,18 +24,18 @@ SignalPairs = list[tuple[Array, Array]]
 
 
 def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
-    """Return (pose at `t`, IMU at `imu.t`) of specific force and, if `gyroscope`, omega."""
+    """Return pairs of specific force (and omega if `gyroscope`): of pose at `t`, IMU at `imu.t`."""
     signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
     return [(resample(t, pose.t, x), y) for x, y in signals]
 
 
 def lag_of_imu_clock(
-    t: Array, pairs: SignalPairs, t_imu: Array, reach: float, arm_effects: Array
+    t: Array, pairs: SignalPairs, t_imu: Array, max_lag_s: float, arm_effects: Array
 ) -> float:
-    """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
+    """Return the lag of the IMU's clock [s], within +-`max_lag_s`, with the best fit to the pose.
 
-    The axes of the IMU may differ by any affine map. The span of the lever arm's accelerations
-    `arm_effects` (N, k) is removed.
+    The axes of the IMU may differ by any affine map. Components along `arm_effects` (N, k),
+    accelerations by a lever arm, are removed.
     """
     U, singular, _ = np.linalg.svd(arm_effects - arm_effects.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
@@ -50,7 +50,7 @@ def lag_of_imu_clock(
         parts = np.split(moved, len(expected), axis=1)
         return sum(_unexplained_share(y, x) for y, x in zip(expected, parts, strict=True))
 
-    return search_minimum(unexplained_at_shift, 0.01, reach)[0]
+    return search_minimum(unexplained_at_shift, 0.01, max_lag_s)[0]
 
 
 def mid_record_lag_and_clock_drift(
@@ -305,10 +305,10 @@ def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mountin
     the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
-    reach = min(_MAX_IMU_LAG_S, 0.2 * float(stop - start))
+    max_lag_s = min(_MAX_IMU_LAG_S, 0.2 * float(stop - start))
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / imu.dt)
     sensed, smooth = low_pass_log(imu, cutoff), low_pass_log(pose, cutoff)
-    t = times_outside_gaps(start + reach, stop - reach, (imu, pose), cutoff)
+    t = times_outside_gaps(start + max_lag_s, stop - max_lag_s, (imu, pose), cutoff)
     if len(t) < NUM_COMPARED_SAMPLES // 10:
         return None
     # Without a gyroscope both readings contain the angular velocity of the pose.
@@ -323,7 +323,7 @@ def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mountin
     if not gyroscope:
         omega, alpha = (resample(t, pose.t, x) for x in smooth.motion[1:])
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
-    lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
+    lag = lag_of_imu_clock(t, pairs, imu.t, max_lag_s, arm)
     centre = float(t.mean())
     num_independent = 2 * cutoff * float(t[-1] - t[0])
     middle, drift = mid_record_lag_and_clock_drift(t, pairs, imu.t, lag, num_independent)
@@ -331,7 +331,7 @@ def find_mounting(imu: Log, pose: Log, *, has_position: bool = False) -> Mountin
     R, mirrored = _kabsch_rotation_and_is_mirrored(shifted, expected)
 
     # The estimated lag allows the use of more samples.
-    margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
+    margin = min(max_lag_s, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
     t = times_outside_gaps(start + margin, stop - margin, (imu, pose), cutoff)
     pairs = signal_pairs_of_pose_and_imu(t, sensed, smooth, gyroscope)
     pose_omega = resample(t, pose.t, smooth.angular_velocity)

@@ -170,7 +170,7 @@ class _LogReader:
         """Return the vectors (rows, 3) of a quantity such as `wrench.force` [SI]."""
         quantity, where = attrgetter(name)(self.description), f"{self.source}:{name}.columns"
         values = table.finite_numbers(quantity.columns, 3, where, rows)
-        streams.check_that_no_rows_are_lost(values, table, where)
+        streams.check_for_lost_readings(values, table, where)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self.description.unit_in_si(quantity.unit) * np.array(quantity.scale)
         of_table = table_files.note_that_table_needs_description(self.source)

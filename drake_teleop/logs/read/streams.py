@@ -50,7 +50,7 @@ class Stream:
         return mean_time_step(self.t)
 
 
-def check_that_no_rows_are_lost(values: Array, table: Table, where: str) -> None:
+def check_for_lost_readings(values: Array, table: Table, where: str) -> None:
     # Drivers write zeros for lost readings.
     sizes = np.linalg.norm(values, axis=1)
     runs, padded = find_runs_of_true(sizes == 0.0), np.append(sizes, 0.0)

@@ -67,7 +67,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
         columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
         table = columns if isinstance(columns, Table) else Table(path, columns)
     if not table.columns or not all(len(c) for c in table.columns.values()):
-        raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
+        raise DrakeTeleopError("has no rows", where=str(path), remedy="record it again")
     return table
 
 
@@ -248,7 +248,7 @@ def is_decimal_number(cell: str) -> bool:
 def _strip_column_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
-        raise ValueError("two column names differ only in spaces at their ends")
+        raise ValueError("two column names differ only in spaces at their ends; rename one")
     return stripped
 
 
@@ -403,7 +403,7 @@ def _table_reader_of_arrays(read: _ArrayReader) -> _ArrayReader:
 
 
 def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Move the last axis of arrays (k, ..., N > k) to the front if vectors have N numbers."""
+    """Move the last axis of arrays (k, ..., N > k) to the front if 1-D arrays have length N."""
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
 
     def is_transposed(array: NDArray) -> bool:

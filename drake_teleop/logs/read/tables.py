@@ -118,7 +118,7 @@ class Table:
         if numbers.shape[1] != 1:
             column = f"{str(name)!r} of {self.path.name}"
             what = f"{column} has {numbers.shape[1]} numbers per row, not 1"
-            raise DrakeTeleopError(what, where=where, remedy="name a column that has one")
+            raise DrakeTeleopError(what, where=where, remedy="name a column with 1 number per row")
         return numbers[:, 0]
 
     def check_magnitude(
@@ -192,21 +192,21 @@ class ColumnsOnAccess(UserDict[str, Any]):
         return self._read(key)
 
 
-def _column_to_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:
+def _column_to_numbers(column: NDArray, reject: Callable[[int, object], DrakeTeleopError]) -> Array:
     if column.dtype.kind in "fiu":
         return column.astype(float, copy=False)
     if column.dtype.kind in "mM":  # seconds, since 1970 or midnight
         count = column.astype(f"{column.dtype.kind}8[ns]").astype(np.int64)
         return np.where(np.isnat(column), np.nan, count * 1e-9)
     if column.dtype.kind == "c" and len(column):  # float() would drop the imaginary part
-        raise bad(0, column[0])
+        raise reject(0, column[0])
     numbers = np.empty(len(column))
     for row, cell in enumerate(column):
         try:
             number = cell.removesuffix(" sec") if isinstance(cell, str) else cell  # of MATLAB
             numbers[row] = np.nan if cell is None else float(number)
         except (TypeError, ValueError) as error:
-            raise bad(row, cell) from error
+            raise reject(row, cell) from error
         if isinstance(cell, str) and "_" in cell:  # which Python ignores
-            raise bad(row, cell)
+            raise reject(row, cell)
     return numbers
