@@ -85,7 +85,7 @@ def _force_norm(wrench):
 def build_master_side(
     builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
 ) -> Diagram:
-    """Return a master side with exported ports and, if `cross_fade`, a block `CrossFade`."""
+    """Return `master` with the clutch port of `inner_side` and, if `cross_fade`, a `CrossFade`."""
     wrench = master.GetInputPort("wrench_command")
     if cross_fade:
         block = builder.AddNamedSystem("cross_fade", CrossFade(period))
